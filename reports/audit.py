@@ -15,7 +15,7 @@ from dynslam_bench.evaluation.ape import static_camera
 from dynslam_bench.evaluation.protocol import RPESpec
 from dynslam_bench.evaluation.rpe import select_pairs
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.reports.model.published import claimed, published, static_camera_errors
+from dynslam_bench.reports.model.published import claimed, lines_of, published, static_camera_errors
 from dynslam_bench.reports.tables.table import Table, TableCell, number, numbers, texts, to_markdown
 
 OURS = "EMFOA-OFT-SLAM"
@@ -133,7 +133,7 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
     Returns:
         One finding for every number that a check applies to.
     """
-    values = {(c.table, c.system, c.sequence, c.quantity): c for c in claimed().query("kind == 'value'").itertuples()}
+    values = {(c.table, c.system, c.sequence, c.quantity): c for c in lines_of(claimed().query("kind == 'value'"))}
     static = static_camera_errors() | _computed_static_camera(ground_truth or {})
     findings = []
     for key, printed in values.items():
@@ -144,7 +144,7 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
             *_accuracy(values, key),
             *_time(key, printed.value),
         )
-        findings += [Finding(check, *key, printed.value, *outcome) for check, *outcome in checks]
+        findings += [Finding(check, *key, printed.value, *outcome) for check, outcome in checks]
     findings += _improvements(values)
     order = list(CHECKS)
     return AuditReport(tuple(sorted(findings, key=lambda finding: (order.index(finding.check), finding.table))))
@@ -154,30 +154,30 @@ Key = tuple[int, str, str, str]
 """Table, system, sequence and quantity of a printed number."""
 Values = Mapping[Key, Any]
 """Printed numbers as lines of `claimed`."""
-Checked = tuple[str, float, bool, str]
-"""Check, what the number has to be, whether it holds, and why."""
+Checked = tuple[str, tuple[float, bool, str]]
+"""Check; what the number has to be, whether it holds, and why."""
 
 
 def _statistics(values: Values, key: Key) -> Iterator[Checked]:
     """RMSE^2 = mean^2 + StD^2, up to the rounding of all three; hence RMSE >= mean."""
-    *place, quantity = key
+    table, system, sequence, quantity = key
     if not quantity.endswith("_rmse"):
         return
     rmse = values[key]
     metric = quantity.removesuffix("_rmse")
-    mean, std = (values[(*place, f"{metric}_{name}")].value for name in ("mean", "std"))
+    mean, std = (values[table, system, sequence, f"{metric}_{name}"].value for name in ("mean", "std"))
     expected = math.hypot(mean, std)
     rounding = _HALF_DIGIT * 10.0**-rmse.digits
     tolerance = rounding * (1 + (mean + std) / expected)  # of the printed RMSE, and of what follows from the others
     off = rmse.value - expected
-    yield "rmse-identity", expected, abs(off) <= tolerance, f"off by {1000 * off:+.1f} mm"
+    yield "rmse-identity", (expected, abs(off) <= tolerance, f"off by {1000 * off:+.1f} mm")
     possible = rmse.value >= mean - 2 * rounding
-    yield "rmse-at-least-mean", mean, possible, "" if possible else "below the mean"
+    yield "rmse-at-least-mean", (mean, possible, "" if possible else "below the mean")
 
 
 def _improvements(values: Values) -> Iterator[Finding]:
     printed = claimed().query("kind == 'improvement_percent'")
-    for row in printed.itertuples():
+    for row in lines_of(printed):
         baseline, ours = (values[row.table, system, row.sequence, row.quantity].value for system in (row.system, OURS))
         expected = 100 * (baseline - ours) / baseline
         holds = abs(row.value - expected) <= _PERCENT_TOLERANCE
@@ -205,7 +205,7 @@ def _against_static_camera(static: Mapping[tuple[str, str], float], key: Key, pr
     remark = "" if quantity == "ape_rmse" else "held against 1 s; the paper states no delta"
     if quantity == "rpe_rmse" and (sequence, "rpe_1f") in static:
         remark += f" (over 1 frame not moving scores {static[sequence, 'rpe_1f']:.4f})"
-    yield "better-than-not-moving", static[sequence, metric], printed < static[sequence, metric], remark
+    yield "better-than-not-moving", (static[sequence, metric], printed < static[sequence, metric], remark)
 
 
 def _against_published(key: Key, printed: float) -> Iterator[Checked]:
@@ -219,7 +219,7 @@ def _against_published(key: Key, printed: float) -> Iterator[Checked]:
     factor = printed / nearest
     span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     remark = f"{factor:.1f} times what is published ({span} m in {len(values)} tables)"
-    yield "published", nearest, 0.5 <= factor <= 2, remark
+    yield "published", (nearest, 0.5 <= factor <= 2, remark)
 
 
 def _accuracy(values: Values, key: Key) -> Iterator[Checked]:
@@ -227,18 +227,18 @@ def _accuracy(values: Values, key: Key) -> Iterator[Checked]:
     printed = values[key].value
     if quantity == "accuracy_percent":
         expected = 100 - values[table, system, sequence, "error_percent"].value
-        yield "accuracy", expected, abs(printed - expected) < 0.006, "100 - error"
+        yield "accuracy", (expected, abs(printed - expected) < 0.006, "100 - error")
     if quantity == "error_percent":
         expected = 100 * values[1, system, sequence, "ape_std"].value
         same = abs(printed - expected) <= _ERROR_TOLERANCE
         remark = "it is 100 times the StD of Table 1 in metres, which is no accuracy" if same else ""
-        yield "accuracy", expected, not same, remark
+        yield "accuracy", (expected, not same, remark)
 
 
 def _time(key: Key, printed: float) -> Iterator[Checked]:
     if key[3] == "time_ms" and key[1] == OURS:
         remark = "less than the published time of its Mask R-CNN alone (DynaSLAM's: 195 ms)"
-        yield "time", _MASK_RCNN_MS, printed >= _MASK_RCNN_MS, remark
+        yield "time", (_MASK_RCNN_MS, printed >= _MASK_RCNN_MS, remark)
 
 
 def _computed_static_camera(ground_truth: Mapping[str, Trajectory]) -> dict[tuple[str, str], float]:

@@ -9,7 +9,7 @@ from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
 from statistics import geometric_mean, median
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
 from dynslam_bench.core.toml import assignments
@@ -228,7 +228,7 @@ def rank(
         score: Error of a run in metres, or None to leave it out.
     """
     cells: dict[str, dict[str, list[float]]] = {}
-    for key in {*scored, board.reference} - {None}:
+    for key in {*scored} if board.reference is None else {*scored, board.reference}:
         rows = {name: board.cells[key][name].kept for name in board.common if name in board.cells[key]}
         cells[key] = {name: [error for error in map(score, kept) if error is not None] for name, kept in rows.items()}
     static = {name: [board.static_camera[name]] for name in board.common}
@@ -432,7 +432,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     kinds = _KINDS | dict.fromkeys(metrics, "Float64")
     lines = []
     for row in ordered:
-        values = {
+        values: dict[str, Any] = {
             "kind": row.origin,
             "tracker": row.tracker.id,
             "label": labels[row.variant_key],
@@ -446,8 +446,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
         }
         values |= {name: row.metrics.get(name) for name in metrics}
         lines.append([values[name] if name in values else getattr(row, name) for name in kinds])
-    columns_of_values = dict(zip(kinds, zip(*lines, strict=True), strict=True)) if lines else dict.fromkeys(kinds, ())
-    return pd.DataFrame({name: pd.array(columns_of_values[name], dtype=kind) for name, kind in kinds.items()})
+    return pd.DataFrame(lines, columns=list(kinds), dtype=object).astype(kinds)
 
 
 def load_frame(

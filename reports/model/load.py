@@ -1,20 +1,19 @@
 """From results folders to rows: which runs count, scored under one protocol.
 
-Rows of unchanged runs are taken from a table of the store's SQLite index. Many runs are scored by several processes.
+Rows of unchanged runs are taken from the store's SQLite index. Many runs are scored by several processes.
 """
 
 from __future__ import annotations
 
 import os
 import signal
-import sqlite3
 import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from pathlib import Path
@@ -29,7 +28,6 @@ from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
-from dynslam_bench.runs.run_index import folder_state, stamp_if_there
 from dynslam_bench.runs.store import RunStore
 
 T = TypeVar("T")
@@ -41,10 +39,6 @@ MOST_WORKERS = 8
 JOB = 40
 """Runs of one job of a worker, at most."""
 _CODE = ("evaluation", "geometry", "reports/model", "runs")
-_TABLE = (
-    "CREATE TABLE IF NOT EXISTS report_rows "
-    "(protocol TEXT, run_id TEXT, state TEXT, row TEXT, PRIMARY KEY (protocol, run_id))"
-)
 
 
 def no_progress(done: float, total: float | None, what: str) -> None:
@@ -131,9 +125,7 @@ def _without_main() -> Iterator[None]:
 
 
 class RowCache:
-    """Rows of a store's runs under a protocol, which hold as long as their files and the code stay as they are.
-
-    The index may be deleted at any time. Damaged rows, and rows of other runs, count as missing.
+    """Rows of a store's runs under a protocol, kept in the store's index: an unchanged run is not read again.
 
     Args:
         store: The store.
@@ -141,21 +133,20 @@ class RowCache:
     """
 
     def __init__(self, store: RunStore, protocol: Protocol) -> None:
-        self.store, self.protocol, self._protocol_digest = store, protocol, protocol.digest()
-        self._code = digest([dynslam_bench.__version__, package_digest(_CODE)])
-        self._path = store.root / "index" / "runs.sqlite"
-        self._part_states: dict[str, str] = {}
+        self.store, self.protocol = store, protocol
+        self._name = f"report {protocol.digest()}"
+        self._version = digest([dynslam_bench.__version__, package_digest(_CODE)])
 
     def read(self) -> dict[str, RunRow]:
-        """The rows that hold, by run id."""
+        """The rows that hold, by run id; damaged rows, and rows of other runs, count as missing."""
         rows = {}
-        if self.store.ids():
-            query = "SELECT run_id, state, row FROM report_rows WHERE protocol = ?"
-            lines = {line[0]: line for line in self._execute(query, [(self._protocol_digest,)])}
-            for run_id in self.store.ids():
-                row = self._valid(*lines[run_id]) if run_id in lines else None
-                if row is not None:
-                    rows[run_id] = row
+        for run_id, text in self.store.index.read(
+            self._name, self._version, self.store.ids(), check_links=True
+        ).items():
+            with suppress(ValidationError):
+                row = RunRow.model_validate_json(text)
+                if (row.run_id, row.protocol_digest) == (run_id, self.protocol.digest()):
+                    rows[run_id] = row.stored_in(self.store)
         return rows
 
     def take(self, run_ids: Sequence[str]) -> tuple[list[tuple[RunRow, str]], list[str]]:
@@ -168,62 +159,20 @@ class RowCache:
         unreadable = []
         for run_id in run_ids:
             try:
-                run_state = self._folder_state("runs", run_id)  # before anything is read
-                row = make_row(self.store, self.store.read_whole(run_id), self.protocol)
-                rows.append((row, self._state(row, run_state)))
+                record, state = self.store.read_with_state(run_id)
+                rows.append((make_row(self.store, record, self.protocol), state))
             except DynslamError as error:
                 unreadable.append(f"{self.store.folder(run_id)}: {error}")
         return rows, unreadable
 
     def add(self, rows: Iterable[tuple[RunRow, str]]) -> None:
         """Keep rows for later reports, as far as the store can be written."""
-        lines = []
+        entries = []
         for row, state in rows:
             with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
-                lines.append((self._protocol_digest, row.run_id, state, row.model_dump_json(exclude_defaults=True)))
-        if lines:
-            self._execute("INSERT OR REPLACE INTO report_rows VALUES (?, ?, ?, ?)", lines)
-
-    def _execute(self, statement: str, lines: Iterable[tuple[str, ...]]) -> list[tuple[str, str, str]]:
-        """What a statement answers to the last of some values; nothing where the index cannot be used."""
-        answer: list[tuple[str, str, str]] = []
-        if self._path.exists() and not self._path.is_file():  # e.g. a pipe, which blocks
-            return answer
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with closing(sqlite3.connect(self._path)) as index, index:
-                index.execute(_TABLE)
-                for line in lines:
-                    answer = index.execute(statement, line).fetchall()
-        except (OSError, sqlite3.OperationalError):  # read-only, or locked
-            return []
-        except sqlite3.DatabaseError:  # damaged
-            self._path.unlink(missing_ok=True)
-        return answer
-
-    def _valid(self, run_id: str, state: str, text: str) -> RunRow | None:
-        """The row of a line; None if it does not hold or is another run's."""
-        try:
-            row = RunRow.model_validate_json(text)
-            if (row.run_id, row.protocol_digest) != (run_id, self._protocol_digest):
-                return None
-            return row.stored_in(self.store) if state == self._state(row, self._folder_state("runs", run_id)) else None
-        except (ValidationError, DynslamError):  # damaged, or there is a link by now
-            return None
-
-    def _state(self, row: RunRow, run_state: str) -> str:
-        """What a row was taken from: the code, the run's files, its stored errors and the ground truth."""
-        part = row.sequence.part
-        if part not in self._part_states:
-            try:
-                self._part_states[part] = self._folder_state("sequences", part)
-            except DynslamError:  # why the run cannot be evaluated
-                self._part_states[part] = ""
-        scored = stamp_if_there(self.store.metric_file(row.run_id, self._protocol_digest))
-        return digest([self._code, run_state, self._part_states[part], scored])
-
-    def _folder_state(self, kind: str, name: str) -> str:
-        return folder_state(self.store.root / kind / name, self.store.root)
+                entries.append((row.run_id, state, row.model_dump_json(exclude_defaults=True)))
+        if entries:
+            self.store.index.write(self._name, self._version, entries)
 
 
 # -- runs that count
@@ -316,8 +265,8 @@ def _all_rows(
         on_progress(done, total, f"scoring {rows[-1][0].tracker.id} on {rows[-1][0].sequence.id}" if rows else "")
 
     taken: dict[int, list[tuple[RunRow, str]]] = {id(cache): [] for cache in caches}
-    for (cache, _), (rows, unreadable) in zip(jobs, run_jobs(pool, RowCache.take, jobs, on_answer), strict=True):
-        taken[id(cache)] += rows
+    for (cache, _), (new_rows, unreadable) in zip(jobs, run_jobs(pool, RowCache.take, jobs, on_answer), strict=True):
+        taken[id(cache)] += new_rows
         loaded.unreadable += unreadable
     everything = []
     for cache, rows in zip(caches, kept, strict=True):

@@ -5,10 +5,11 @@ They are never mixed with runs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 import pandas as pd
 
@@ -124,14 +125,14 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
     frame = frame[(frame["metric"] == "ate_rmse_m") & frame["sequence"].isin(sequences)]
     cells = [
         ReportedCell(f"{p.system} ({p.source})", p.sequence, p.value, "; ".join(filter(None, (p.alignment, p.remarks))))
-        for p in frame.itertuples()
+        for p in lines_of(frame)
         if scored_as(p.alignment, p.sequence, protocol)
     ]
     if protocol.alignment == "se3" and protocol.truth == "as-is":
         remark = "contradicts itself and what the systems' authors published; see the audit"
         frame = claimed().query("kind == 'value' and quantity == 'ape_rmse'")
         frame = frame[frame["sequence"].isin(sequences)]
-        cells += [ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED) for c in frame.itertuples()]
+        cells += [ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED) for c in lines_of(frame)]
     return cells
 
 
@@ -163,8 +164,13 @@ def records_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedCe
             "; ".join((r.system, r.input, r.alignment, r.hardware, r.source, HOW[r.how])),
             RECORD,
         )
-        for r in frame.itertuples()
+        for r in lines_of(frame)
     ]
+
+
+def lines_of(frame: pd.DataFrame) -> Iterator[Any]:
+    """The lines of a table; attributes are named as its columns."""
+    return iter(frame.itertuples())
 
 
 def _read(name: str) -> pd.DataFrame:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -284,7 +284,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     static_m = static_camera_error(store, record, protocol, evaluation)
     trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
     diagnostics = [] if evaluation is None else evaluation.diagnostics
-    scores: Mapping[str, Any] = dict(
+    scores: dict[str, Any] = dict(
         settings={name: record.settings[name] for name in record.overrides if name in record.settings},
         identity={name: value for name, value in record.identity.items() if name != "settings"},
         timings={name: time for name, time in record.timings.items() if name == "total"},

@@ -1,4 +1,4 @@
-"""Who is ranked: not what is no better than a static camera, real-time runs among themselves, monocular runs by scale."""
+"""Who is ranked: systems that beat a static camera, real-time runs among themselves, monocular runs by scale."""
 
 import json
 

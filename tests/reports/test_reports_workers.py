@@ -36,7 +36,7 @@ def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
     add_run(store, "orb-slam2", "synthetic/sitting_xyz", 7, lost=range(30), status="lost")
     events = []
     build_report(store, tmp_path / "helped", command="c", on_progress=lambda *event: events.append(event))
-    (store.root / "index" / "runs.sqlite").unlink()  # or there would be nothing left to read
+    (store.root / "index.sqlite").unlink()  # or there would be nothing left to read
     monkeypatch.setattr(load, "MANY", 1000)
     build_report(store, tmp_path / "alone", command="c")
     alone, helped = contents(tmp_path / "alone"), contents(tmp_path / "helped")
