@@ -44,8 +44,6 @@ MANY = {
     "backend.keyframes.view_share": 0.98,
 }
 """A keyframe nearly every frame."""
-JUDGED = ("emfoa-oft-no-masks-no-depth-test", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
-"""F judges every frame."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES: dict[str, tuple[str, dict[str, object]]] = {
     "backend.keyframes.redundant_share": ("orb-slam2", MANY),

@@ -159,8 +159,9 @@ def _assumptions(name: str, settings: type[SystemSettings]) -> tuple[str, ...]:
     if not isinstance(defaults, EpipolarTestSettings):
         return (*said, SENSOR)
     said += NOT_STATED
-    if defaults.flow.method == "daisy":
-        said += DENSE if isinstance(defaults.flow, DenseFlowSettings) else [SPARSE]
+    flow: FlowMethodSettings = defaults.flow
+    if flow.method == "daisy":
+        said += DENSE if isinstance(flow, DenseFlowSettings) else [SPARSE]
     if not issubclass(settings, PaperTestSettings):
         said += [SKIPPED, GUARDS]
     if issubclass(settings, DepthTestSettings):
