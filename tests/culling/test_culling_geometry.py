@@ -220,7 +220,9 @@ def test_depth_edges_are_uncertain_and_covariance_is_that_of_the_unprojection() 
     depth = np.full((480, 640), 2.0, np.float32)
     depth[:, 320:] = 3.0
     flat, edge, far = depth_variance(depth, np.array([[100.0, 100], [319, 100], [500, 200]]))
-    np.testing.assert_allclose([flat, far], depth_sigma(np.array([2.0, 3.0])) ** 2)
+    sigma = depth_sigma(np.array([2.0, 3.0]))
+    np.testing.assert_allclose(sigma, 0.0012 + 0.0019 * np.array([1.6, 2.6]) ** 2)  # Nguyen et al. 2012
+    np.testing.assert_allclose([flat, far], sigma**2)
     assert edge > 0.18  # a quarter of the weight lies one metre further
     rng = np.random.default_rng(0)
     xy, z = np.array([[500.0, 100.0]]), np.array([2.5])
