@@ -289,7 +289,7 @@ TARGETS = [
                 )
             ),
         ],
-        (labels.CocoImages, labels._coco_mask, labels._from_runs, labels.decode_runs, labels._check_polygon),
+        (labels.CocoImages, labels._coco_mask, labels._from_runs, labels.decode_runs, labels._polygon),
         mutate_json,
     ),
     Target(
