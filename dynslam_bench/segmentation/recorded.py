@@ -74,7 +74,7 @@ class RecordedSegmenter:
         order = np.argsort(numbers, kind="stable")
         self._tolerance = MAX_DIFFERENCE_S if self.by_stamp else 0.5
         self._keys: NDArray[np.float64] = np.asarray(numbers, np.float64)[order]
-        self._files = [files[i] for i in order]
+        self._files: list[Path] = [files[i] for i in order]
         self._names = read_classes(self.folder / CLASSES_FILE)
 
     def segment(self, frame: Frame) -> Instances:

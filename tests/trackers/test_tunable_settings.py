@@ -50,6 +50,8 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
         "backend.keyframes.established": 5, "backend.keyframes.view_share": 0.5,
     }),
     "epipolar.threshold_px": ("emfoa-oft?masks=vote&depth=none", {}),
+    "epipolar.vote_share": ("emfoa-oft?masks=vote&depth=none", {}),
+    "backend.relocalisation.min_inliers": ("emfoa-oft", {}),
     "epipolar.min_share": ("emfoa-oft-paper?masks=none", {}),
     "free_space.threshold_m": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_sigma": 0.0,

@@ -228,9 +228,11 @@ class FPN(nn.Module):
         super().__init__()
         self.inner_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(width, channels, 1)) for width in stages)
         self.layer_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1)) for _ in stages)
-        for block in (*self.inner_blocks, *self.layer_blocks):
-            nn.init.kaiming_uniform_(block[0].weight, a=1)
-            nn.init.zeros_(block[0].bias)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_uniform_(module.weight, a=1)
+                assert module.bias is not None
+                nn.init.zeros_(module.bias)
 
     def forward(self, stages: list[Tensor]) -> list[Tensor]:
         """C2..C5 to P2..P6."""
@@ -256,8 +258,10 @@ class CFPN(nn.Module):
         self.reduce = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in stages)
         self.smooth = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in stages)
         for reduce, smooth in zip(self.reduce, self.smooth, strict=True):
+            assert isinstance(reduce, nn.Conv2d) and isinstance(smooth, nn.Conv2d)
             nn.init.kaiming_uniform_(reduce.weight, a=1)
             for zero in (reduce.bias, smooth.weight, smooth.bias):
+                assert zero is not None
                 nn.init.zeros_(zero)
 
     def forward(self, stages: list[Tensor], levels: list[Tensor]) -> list[Tensor]:

@@ -82,7 +82,7 @@ class MaskRCNNSegmenter:
                 planes[index], boxes[index], height, width, self.settings.mask_threshold, exact=config.exact_paste
             )
         instances = Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32))
-        return pick(instances, masks.any(axis=(1, 2)))
+        return pick(instances, np.asarray(masks.any(axis=(1, 2))))
 
 
 def paste(

@@ -264,7 +264,7 @@ class StaticMaskRCNN(nn.Module):
 
     def _pooled(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         """RoIAlign ``[K, C, size, size]`` of one image's boxes; see `roi_align`."""
-        return torch.cat([self._pooled_chunk(levels, chunk, size, canonical) for chunk in boxes.split(CHUNK)])
+        return torch.cat([self._pooled_chunk(levels, chunk, size, canonical) for chunk in torch.split(boxes, CHUNK)])
 
     def _pooled_chunk(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         count, channels = len(boxes), levels[0].shape[1]

@@ -54,9 +54,11 @@ class RPNHead(nn.Module):
         self.conv = nn.Sequential(nn.Sequential(nn.Conv2d(config.channels, config.channels, 3, padding=1), nn.ReLU()))
         self.cls_logits = nn.Conv2d(config.channels, count, 1)
         self.bbox_pred = nn.Conv2d(config.channels, 4 * count, 1)
-        for layer in (self.conv[0][0], self.cls_logits, self.bbox_pred):
-            normal(layer.weight, std=0.01)
-            nn.init.zeros_(layer.bias)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                normal(module.weight, std=0.01)
+                assert module.bias is not None
+                nn.init.zeros_(module.bias)
 
     def forward(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Objectness logits ``[B, H W A]`` and codes ``[B, H W A, 4]`` of each level, in the anchors' order."""

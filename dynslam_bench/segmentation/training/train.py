@@ -288,7 +288,7 @@ def draw_curve(table: pd.DataFrame, path: Path, title: str) -> None:
         path: The page; plotly's script lies beside it.
         title: Above it.
     """
-    from plotly.subplots import make_subplots
+    from plotly.subplots import make_subplots  # type: ignore[import-untyped]
 
     figure = make_subplots(cols=2, subplot_titles=("losses", "validation scores"))
     for column, names in enumerate((("loss", *LOSSES), SCORES), start=1):

@@ -161,9 +161,10 @@ def compose(
     masks = _mask_stage(settings, context, filters, deferred=cache is not None)
     if cache is not None:
         extractor = cached["features"] = cached_extractor(extractor, features, cache, context.threads)
-        segmenter = masks and cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
-        if segmenter is not None:
-            cached["segmentation"] = segmenter
+        if masks is not None:
+            segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
+            if segmenter is not None:
+                cached["segmentation"] = segmenter
     return SlamPipeline(
         extractor=extractor,
         masks=masks,
