@@ -266,7 +266,7 @@ TARGETS = [
     ),
     Target(
         "study",
-        lambda data, folder: study_file.read_study(at(folder, "s.toml", data), len),
+        lambda data, folder: study_file.read_study(at(folder, "s.toml", data)),
         _study_texts,
         (study_file.read_study, study_file.make_spec),
     ),
