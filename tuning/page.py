@@ -49,7 +49,9 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
             "seen": splits_seen(tuner.defaults, tuner.design),
         }
     )
-    candidates, trials, settings = _candidates(summary), _trials(tuner, summary), _settings(tuner, summary)
+    candidates, trials = _candidates(summary), _trials(tuner, summary)
+    best = summary.candidates[0].params if summary.candidates else {}
+    settings = settings_table(tuner.space, tuner.base, best, summary.improves)
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
     write_atomic(tuner.folder / PLOTS_FILE, _plots(tuner))
@@ -324,11 +326,6 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings, "coverage", "fps", *names)]
     caption = "Reasons of pruned and failed trials stand behind their state."
     return Table("trials", "All trials", caption + fewer_starts(tuner.design) + _cautions(summary), columns, rows)
-
-
-def _settings(tuner: Tuner, summary: StudySummary) -> Table:
-    chosen = summary.candidates[0].params if summary.candidates else {}
-    return settings_table(tuner.space, tuner.base, chosen, summary.improves)
 
 
 def settings_table(

@@ -353,5 +353,5 @@ def seen_note(splits: PySequence[str]) -> str:
 
 
 def _masks_seen(settings: Settings, instances: Iterable[ProblemInstance]) -> bool:
-    names = [instance.sequence for instance in instances]
+    names = (instance.sequence for instance in instances)
     return any(seen_in_training(source_of_masks(settings, [name]), name) for name in names)

@@ -21,6 +21,7 @@ from dynslam_bench.evaluation import (
 )
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.ape import ate_rmse_m
+from dynslam_bench.evaluation.association import nearest_match
 from dynslam_bench.evaluation.rpe import segment_errors
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.rigs import bonn_as_droid_w, bonn_camera
@@ -158,6 +159,12 @@ def test_poses_outside_and_doubly_claimed_are_told_apart():
     claimed = evaluate(noisy(truth), sparse, wide)
     assert claimed.n_pairs == 50
     assert claimed.association.taken == 50
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_the_tolerance_of_the_nearest_match_is_strict_or_not(strict):
+    matched, _ = nearest_match(np.array([0.0]), np.array([0.5]), 0.5, strict=strict)
+    assert len(matched) == (not strict)
 
 
 def test_coverage_counts_input_frames():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ from dynslam_bench.tuning import StudySpec, Tuner
 from dynslam_bench.tuning.evaluate import Outcome
 from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.splits import Design, design_of
+from dynslam_bench.tuning.storage import open_storage
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 TUNE, HELD_OUT = (
@@ -28,6 +30,9 @@ STARTS_SD = 0.28
 """Standard deviation of the log ratio of two runs in one scene: measured 0.24 to 0.31 for real trackers."""
 SCENES_SD = 0.15
 """How far a setting's effect differs from scene to scene."""
+
+_PATCHING = threading.Lock()
+"""Workers in threads must not restore each other's patches."""
 
 Effect = Callable[[Mapping[str, Any]], float]
 
@@ -65,14 +70,15 @@ class SimulatedTuner(Tuner):
         self, spec: StudySpec, results: Path, *, effect: Effect = nothing, seed: int = 0, in_memory: bool = True
     ) -> None:
         self.effect, self.noise_seed, self.runs = effect, seed, 0
-        with patch(
-            "dynslam_bench.tuning.tuner.design_of", lambda spec, accept: simulated_design(spec.tune, spec.held_out)
+        with (
+            _PATCHING,
+            patch.multiple(
+                "dynslam_bench.tuning.tuner",
+                open_storage=(lambda *_: optuna.storages.InMemoryStorage()) if in_memory else open_storage,
+                design_of=lambda spec, accept: simulated_design(spec.tune, spec.held_out),
+            ),
         ):
-            if not in_memory:
-                super().__init__(spec, results)
-                return
-            with patch("dynslam_bench.tuning.tuner.open_storage", lambda *_: optuna.storages.InMemoryStorage()):
-                super().__init__(spec, results)
+            super().__init__(spec, results)
 
     def evaluate(
         self,
