@@ -328,7 +328,7 @@ REWARDS: dict[str, Callable[[OnlineSample], float]] = {
   reporting a loss never earns more than repeating the last pose, and staying lost never more than recovering.
 - ``neg_pose_error``: minus the causal translational pose error, at most the length of the true path so far (an error of
   100 %). A frame without a tracked pose earns minus that length: no pose, however far it has drifted, earns less, so
-  that getting lost pays nowhere but before the first tracked pose, which begins the episode's frame of reference.
+  that getting lost pays only before the first tracked pose, which begins the episode's frame of reference.
 
 The sum over an episode is not the ATE, which the last step's ``episode_metrics`` give under the protocol.
 """
