@@ -230,7 +230,7 @@ TARGETS = [
             b"trackers = 3\n",
         ],
     ),
-    Target("study", lambda data, folder: study_file.read_study(at(folder, "s.toml", data), len), _study_texts),
+    Target("study", lambda data, folder: study_file.read_study(at(folder, "s.toml", data)), _study_texts),
     Target(
         "COCO annotations",
         _read_coco,
