@@ -156,7 +156,7 @@ def demo_board(store: RunStore) -> Board:
     from dynslam_bench.reports.model.board import make_board
     from dynslam_bench.reports.model.load import load_runs
 
-    return make_board([run.row for run in load_runs([store], get_protocol(PROTOCOL)).runs])
+    return make_board(load_runs([store], get_protocol(PROTOCOL)).rows)
 
 
 def leaderboard_text(board: Board) -> str:
@@ -226,7 +226,7 @@ def tell(rows: Iterable[RunRow], records: Sequence[RunRecord]) -> list[str]:
     errors: dict[str, dict[str, float]] = {}
     for row in rows:
         if row.score_m is not None:
-            errors.setdefault(row.sequence.partition("&")[0].rpartition("/")[2], {})[row.tracker] = row.score_m
+            errors.setdefault(row.sequence.id.partition("&")[0].rpartition("/")[2], {})[row.tracker.id] = row.score_m
     lines = [_sentence(name, e) for name, e in sorted(errors.items(), reverse=True) if STATIC in e]
     return [*lines, *_costs(records), "One run each shows, and proves nothing: `dynslam-bench bench dynamic` repeats."]
 

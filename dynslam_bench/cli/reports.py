@@ -166,7 +166,7 @@ def audit_paper(
     from dynslam_bench.sequences.catalogue import entry_of
 
     truth = {}
-    for name in sorted({claim.sequence for claim in claimed()}):
+    for name in sorted(set(claimed()["sequence"])):
         entry = entry_of(name)
         folder = None if entry is None else entry.find(find_data_root(data_root))
         if folder is not None and (folder / "groundtruth.txt").is_file():

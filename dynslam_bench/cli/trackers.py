@@ -130,7 +130,7 @@ def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
         (name, metric, value, "its spec", "") for name, row in spec.reported.items() for metric, value in row.items()
     ]
     measured = [
-        (p.sequence, p.metric, p.value, p.source, "; ".join(filter(None, (p.alignment, p.remarks))))
+        (p.sequence, p.metric, p.value, p.source, "; ".join(str(text) for text in (p.alignment, p.remarks) if text))
         for p in published().itertuples()
         if p.system in spec.published_as
     ]

@@ -99,7 +99,7 @@ class RunIndex:
             version: Digest of the code that computed them.
             entries: Run, its state before it was read, and the value.
         """
-        rows = [(name, run_id, version, state, value) for run_id, state, value in entries]
+        rows: list[tuple[str, ...]] = [(name, run_id, version, state, value) for run_id, state, value in entries]
         command = "INSERT OR REPLACE INTO computed (name, run_id, version, state, value) VALUES (?, ?, ?, ?, ?)"
         self._change(command, rows)
 

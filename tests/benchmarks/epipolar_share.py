@@ -25,16 +25,14 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 
 from dynslam_bench.envs.slam_env import SlamEnv  # noqa: E402
-from dynslam_bench.runs.frames import (
-    FrameLog,
-    FrameRow,
-)
+from dynslam_bench.runs.frames import FrameLog, FrameRow  # noqa: E402
 from dynslam_bench.trackers import TRACKERS  # noqa: E402
 
 TRACKERS_WITH_F = (
-    "emfoa-oft", "emfoa-oft?depth=none", "emfoa-oft?flow=lucas-kanade", "emfoa-oft?search=patchmatch", "emfoa-oft?search=emfoa-literal",
-    "emfoa-oft?masks=vote&depth=none", "emfoa-oft?masks=vote", "emfoa-oft?masks=none", "emfoa-oft?masks=none&depth=none",
-    "emfoa-oft-paper", "emfoa-oft-paper?flow=sparse", "emfoa-oft-paper?masks=none", "opf-slam", "chen-slam", "blitz-slam",
+    "emfoa-oft", "emfoa-oft?depth=none", "emfoa-oft?flow=lucas-kanade", "emfoa-oft?search=patchmatch",
+    "emfoa-oft?search=emfoa-literal", "emfoa-oft?masks=vote&depth=none", "emfoa-oft?masks=vote",
+    "emfoa-oft?masks=none", "emfoa-oft?masks=none&depth=none", "emfoa-oft-paper",
+    "emfoa-oft-paper?flow=sparse", "emfoa-oft-paper?masks=none", "opf-slam", "chen-slam", "blitz-slam",
     "mor-slam", "sgc-slam", "di-slam", "ds-slam", "sof-slam", "seg-slam",
 )  # fmt: skip
 SEQUENCES = ("synthetic/walking_xyz?scene=100", "synthetic/walking_halfsphere?scene=100")

@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,7 +53,7 @@ def fill(results: Path, records: int) -> None:
                 "run_id": run,
                 "seed": repeat,
                 "coverage": 1 - repeat / 1000,
-                "started": f"2026-01-{1 + number // 86400:02d}T{number // 3600 % 24:02d}:{number // 60 % 60:02d}:00+00:00",
+                "started": (datetime(2026, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=number)).isoformat(),
                 "settings": {f"group_{at % 12}.setting_{at}": 0.5 * at for at in range(SETTINGS)},
                 "tracker": old.tracker.model_copy(update={"id": f"tracker-{tracker}", "label": f"Tracker {tracker}"}),
                 "sequence": old.sequence.model_copy(

@@ -20,7 +20,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "reports")]
 
 from reports_browser import Browser  # noqa: E402
 
-from dynslam_bench.reports import build_report
+from dynslam_bench.reports import build_report  # noqa: E402
 from dynslam_bench.runs import RunStore  # noqa: E402
 
 QUALITY = 82

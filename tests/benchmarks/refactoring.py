@@ -37,8 +37,8 @@ from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 
 RECORDED = Path(__file__).with_suffix(".json")
 TRACKERS = (
-    "orb-slam2", "mask-rcnn", "emfoa-oft", "emfoa-oft?masks=none", "emfoa-oft-paper", "dynaslam", "dynaslam-g", "ds-slam",
-    "dai-slam", "di-slam", "huai-slam", "ngd-slam",
+    "orb-slam2", "mask-rcnn", "emfoa-oft", "emfoa-oft?masks=none", "emfoa-oft-paper", "dynaslam", "dynaslam-g",
+    "ds-slam", "dai-slam", "di-slam", "huai-slam", "ngd-slam",
 )  # fmt: skip
 EXCERPT = ROOT.parent / "shared/data/bonn/rgbd_bonn_crowd"
 SEQUENCES = ("synthetic/walking_xyz?scene=100", "synthetic/sitting_rpy?scene=101", str(EXCERPT))

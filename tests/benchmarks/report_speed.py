@@ -31,7 +31,7 @@ from reports_fake_store import add_run  # noqa: E402
 from dynslam_bench.contracts.tracker import TrackResult  # noqa: E402
 from dynslam_bench.envs.episode import FrameOutcome  # noqa: E402
 from dynslam_bench.evaluation.online import OnlineSample  # noqa: E402
-from dynslam_bench.reports import build_report
+from dynslam_bench.reports import build_report  # noqa: E402
 from dynslam_bench.runs.artifacts import SnapshotWriter  # noqa: E402
 from dynslam_bench.runs.frames import FrameRow, write_csv  # noqa: E402
 from dynslam_bench.runs.store import RUN_FILE, RunStore  # noqa: E402

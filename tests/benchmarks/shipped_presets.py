@@ -2,14 +2,13 @@
 
     python tests/benchmarks/shipped_presets.py [TRACKER ...] [--part rendered bonn fr1] [--results FOLDER]
 
-Both run instance by instance in turn, so that whatever else the machine does slows them alike. Rendered scenes are instances
-that no choice has seen, two start offsets each; the Bonn excerpt has 23 start offsets, others than the choice saw; the
-fr1 excerpts, with nobody in view, have four each, likewise. Masks, where a tracker asks for them, are YOLO's on Bonn
-and the embedded network's elsewhere. Recordings are looked for in ``../shared``; what is not there is named. Ratios
-are preset : default, with 95 % intervals over scenes (over starts where there is one scene). "Not worse" is said where
-the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in anything differ by 0.12 to
-0.27 in the logarithm: a closer margin takes hundreds of runs.
-"""
+Both run instance by instance in turn, so that whatever else the machine does slows them alike. Rendered scenes are
+instances that no choice has seen, two start offsets each; the Bonn excerpt has 23 start offsets, others than the
+choice saw; the fr1 excerpts, with nobody in view, have four each, likewise. Masks, where a tracker asks for them, are
+YOLO's on Bonn and the embedded network's elsewhere. Recordings are looked for in ``../shared``; what is not there is
+named. Ratios are preset : default, with 95 % intervals over scenes (over starts where there is one scene). "Not
+worse" is said where the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in
+anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes hundreds of runs. """
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ class _Stream:
         return self.rr.EncodedImage.columns(blob=values, media_type=["image/jpeg"] * len(values))
 
     def _points(self, shot: Snapshot, *, kept: bool) -> NDArray[np.float32]:
-        points = ((shot.points + 0.5) * self.scale).astype(np.float32)
+        points: NDArray[np.float32] = ((shot.points + 0.5) * self.scale).astype(np.float32)
         return points[shot.kept if kept else ~shot.kept]
 
     def _point_columns(self, values: list[NDArray[np.float32]]) -> Any:

@@ -162,7 +162,7 @@ def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
     monocular = isinstance(settings, EmfoaOftMonoSettings)
     sentences += [NOT_STATED] if monocular else [NOT_STATED, SENSOR]
     if settings.flow.method == "daisy":
-        sentences += DENSE if isinstance(settings.flow, DenseFlowSettings) else [SPARSE]
+        sentences += [SPARSE] if isinstance(settings.flow, FlowSettings) else DENSE
     if not paper:
         sentences += [SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
     if isinstance(settings, DepthTestSettings):
