@@ -127,7 +127,7 @@ def _judge(tuner: Tuner, candidate: Candidate, jobs: int) -> Candidate:
 
 
 def _accuracy_and_speed(outcomes: Outcomes, default: Outcomes) -> dict[str, Ratio]:
-    return {each.name: compared(outcomes, default, objective=each) for each in (ACCURACY, SPEED)}
+    return {objective.name: compared(outcomes, default, objective=objective) for objective in (ACCURACY, SPEED)}
 
 
 def _picks(spec: StudySpec, candidates: Sequence[Candidate], chosen: Candidate | None) -> dict[str, int | None]:

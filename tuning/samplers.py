@@ -37,7 +37,7 @@ def build_sampler(spec: StudySpec) -> StreamedSampler:
 
 
 class StreamedSampler(optuna.samplers.BaseSampler):
-    """Makes a sampler anew for each trial, seeded by the study's seed and the trial's number.
+    """Makes a sampler for each trial, seeded by the study's seed and the trial's number.
 
     Numbers are given out by the storage, so no two workers, and no worker that goes on later, draw from one stream, and
     a study with one worker gives the same trials again.
@@ -115,7 +115,7 @@ def is_feasible(trial: FrozenTrial) -> bool:
     return all(value <= 0 for value in trial.constraints.values())
 
 
-# CMA-ES: Optuna keeps its state in the storage as a pickle, which whoever writes to the storage could replace.
+# CMA-ES: Optuna keeps its state in the storage as a pickle, which anybody who writes to the storage could replace.
 
 _NUMPY = ("numpy._core", "numpy.core")
 _CMA_CLASSES = {
@@ -176,7 +176,7 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
     pull of the best flame in the second (Eq. 17-18). The number of flames falls over the budget (Eq. 11).
 
     Numbers move in the unit interval of their (linear or logarithmic) range; categories are taken from the flame, or
-    drawn anew with the probability that a spiral leaves the interval. Pruned trials with a value count as finished.
+    drawn again with the probability that a spiral leaves the interval. Pruned trials with a value count as finished.
 
     Args:
         seed: Of the random numbers.

@@ -41,8 +41,8 @@ def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[
     every = parameters(settings)
     for pattern in (*spec.include, *spec.exclude):
         if not any(fnmatchcase(parameter.name, pattern) for parameter in every):
-            known = [parameter.name for parameter in every]
-            hint = "it exists, but is not tunable" if pattern in field_names(settings) else did_you_mean(pattern, known)
+            similar = did_you_mean(pattern, [parameter.name for parameter in every])
+            hint = "it exists, but is not tunable" if pattern in field_names(settings) else similar
             raise StudyError(f"'{pattern}' matches no tunable setting", hint)
     chosen = [
         parameter

@@ -178,7 +178,7 @@ def make_spec(values: Any, where: str) -> StudySpec:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
-            known = [*StudySpec.model_fields, *(f"space.{name}" for name in SpaceSpec.model_fields)]
-            raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, known)) from None
+            key_names = [*StudySpec.model_fields, *(f"space.{name}" for name in SpaceSpec.model_fields)]
+            raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, key_names)) from None
         text = first["msg"].removeprefix("Value error, ")
         raise StudyError(f"{where}: {field + ': ' if field else ''}{text}") from None

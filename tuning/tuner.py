@@ -262,7 +262,10 @@ class Tuner:
         violated = violations(self.spec, outcomes, self._reference)
         for name, value in violated.items():
             trial.set_constraint(name, value)
-        parts = [f"{each.what} x {math.exp(value):.3f}" for each, value in zip(self.objectives, result, strict=True)]
+        parts = [
+            f"{objective.what} x {math.exp(value):.3f}"
+            for objective, value in zip(self.objectives, result, strict=True)
+        ]
         broken = [name for name, value in violated.items() if value > 0]
         text = ", ".join(parts) + (f", violates {' and '.join(broken)}" if broken else "")
         return TrialState.COMPLETE, result, text

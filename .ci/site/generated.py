@@ -9,7 +9,7 @@ from dynslam_bench.trackers import TRACKERS
 
 ROOMS = {
     "api": ("Public interface", ["api"]),
-    "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.steering", "core.errors"]),
+    "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.errors"]),
     "sequences": (
         "Sequences and geometry",
         ["sequences", "sequences.synthetic", "geometry.camera", "geometry.trajectory", "geometry.se3"],

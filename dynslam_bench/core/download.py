@@ -219,7 +219,7 @@ class _Partial:
                 raise
             if (error.headers.get("Content-Range") or "").rpartition("/")[2] == str(start):
                 return True
-            self.forget()  # longer than the file on the server, or the server does not say: begin anew
+            self.forget()  # longer than the file on the server, or the server does not say: begin again
             return False
         with response:
             if start and response.status == 206:
@@ -299,7 +299,7 @@ class _Partial:
             "etag": None if etag is None or etag.startswith("W/") else etag,  # a weak one cannot validate a range
             "modified": headers.get("Last-Modified"),
         }
-        with contextlib.suppress(OSError):  # without notes the next call begins anew, which is safe
+        with contextlib.suppress(OSError):  # without notes the next call begins again, which is safe
             self._notes.write_text(json.dumps(notes))
 
 

@@ -83,7 +83,7 @@ def _clear_errors(path: Path) -> Iterator[None]:
 def replace_folder(work: Path, target: Path) -> None:
     """Rename a finished folder to `target`, on the same file system; what `target` held before is deleted.
 
-    At every moment `target` is what it was or what it is to be, whoever else replaces it at the same time (where the
+    At every moment `target` is what it was or what it is to be, even if others replace it at the same time (where the
     system can exchange two names at once: Linux, on its own file systems; elsewhere it is missing for a moment).
 
     Raises:

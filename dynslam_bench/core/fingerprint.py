@@ -145,22 +145,22 @@ def _dependencies(modules: set[str]) -> dict[str, str]:
     Raises:
         OSError: A file cannot be read.
     """
-    found: dict[str, str] = {}
+    digests: dict[str, str] = {}
     waiting = set(modules)
     while waiting:
         top = waiting.pop()
-        if top in found or top == _OWN or top in sys.stdlib_module_names:
+        if top in digests or top == _OWN or top in sys.stdlib_module_names:
             continue
         try:
             places = _folders_of(top)
         except (PluginError, ImportError, ValueError):
             continue
         if any(part in ("site-packages", "dist-packages") for part in places[0].parts):
-            found[top] = distribution_of_module(top)[1]
+            digests[top] = distribution_of_module(top)[1]
         else:
-            found[top] = digest([_whole(place) for place in places])
+            digests[top] = digest([_whole(place) for place in places])
             waiting |= imported_modules(file for place in places for file in _files_of(place))
-    return found
+    return digests
 
 
 def distribution_of_module(module: str) -> tuple[str, str]:
@@ -208,9 +208,9 @@ def _folders_of(top: str) -> list[Path]:
 @cache
 def opencv_version() -> str:
     """Every installed distribution of OpenCV with its version; that of the module for a build of one's own."""
-    found = [f"{name} {number}" for name in OPENCV if (number := distribution_version(name))]
-    if found or find_spec("cv2") is None:
-        return ", ".join(found)
+    versions = [f"{name} {number}" for name in OPENCV if (number := distribution_version(name))]
+    if versions or find_spec("cv2") is None:
+        return ", ".join(versions)
     import cv2
 
     return f"cv2 {cv2.__version__}"
@@ -228,8 +228,8 @@ def distribution_version(name: str) -> str:
 def machine_digest() -> str:
     """Short digest of the machine and the versions that change a stage's result or its cost."""
     versions = {name: distribution_version(name) for name in _STAGES_NEED}
-    found = {"dynslam-bench": release(), "opencv": opencv_version(), **versions}
-    return digest({"node": platform.node(), "cpu": _cpu_model(), "versions": found})
+    software = {"dynslam-bench": release(), "opencv": opencv_version(), **versions}
+    return digest({"node": platform.node(), "cpu": _cpu_model(), "versions": software})
 
 
 def content_digest(*arrays: NDArray[Any]) -> str:
@@ -337,12 +337,12 @@ def _remembered(kind: str, files: list[Path], compute: Callable[[], str]) -> str
         if len(stored) == 64:
             _MEMORY[key] = stored
             return stored
-    found = compute()
+    value = compute()
     if is_settled(newest):
-        _MEMORY[key] = found
+        _MEMORY[key] = value
         with contextlib.suppress(DynslamError):  # a cache that cannot be written costs time only
-            write_atomic(entry, found)
-    return found
+            write_atomic(entry, value)
+    return value
 
 
 def is_settled(newest_ns: int | None) -> bool:
@@ -422,14 +422,14 @@ def this_machine() -> Machine:
 @cache
 def versions() -> dict[str, str]:
     """Versions of Python, of this package and of those that a result depends on; missing ones are left out."""
-    found = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
+    environment = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
     for name in PACKAGES:
         installed = distribution_version(name)
         if installed:
-            found[name] = installed
+            environment[name] = installed
     if opencv_version():
-        found["opencv"] = opencv_version()
-    return found
+        environment["opencv"] = opencv_version()
+    return environment
 
 
 @cache

@@ -94,7 +94,7 @@ def _is_whole(data: bytes) -> bool:
 
     OpenCV fills what is missing of a JPEG, and some versions of it of a PNG; some take the memory that a chunk claims.
     """
-    if data.startswith(b"\xff\xd8\xff"):  # the end marker occurs nowhere within the image data that it ends
+    if data.startswith(b"\xff\xd8\xff"):  # the end marker does not occur within the image data that it ends
         return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda") > 0
     if not data.startswith(_PNG_START):
         return True

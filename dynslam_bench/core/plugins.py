@@ -83,7 +83,7 @@ class Registry(Generic[P]):
 
     def all(self) -> list[Found[P]]:
         """Every available plug-in, sorted by id."""
-        return [found for _, found in sorted(self._discover().items())]
+        return [plugin for _, plugin in sorted(self._discover().items())]
 
     def failures(self) -> list[Failure]:
         """The plug-ins that could not be loaded, with reasons."""
@@ -96,13 +96,13 @@ class Registry(Generic[P]):
         Raises:
             PluginError: Unknown id (with a did-you-mean), or the named object cannot be loaded or is no spec.
         """
-        found = self._discover()
-        if name in found:
-            return found[name].spec
+        plugins = self._discover()
+        if name in plugins:
+            return plugins[name].spec
         if ":" in name:
             return self._not_built_in(self._check(load_object(name), name), name)
         broken = [failure for failure in self._failures if name in failure.source]
-        hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, found)
+        hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, plugins)
         raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
 
     def refresh(self) -> None:
@@ -113,7 +113,7 @@ class Registry(Generic[P]):
     def _discover(self) -> dict[str, Found[P]]:
         if self._found is not None:
             return self._found
-        found: dict[str, Found[P]] = {}
+        plugins: dict[str, Found[P]] = {}
         self._failures = []
 
         def add(load: Callable[[], object], source: str) -> None:
@@ -122,10 +122,10 @@ class Registry(Generic[P]):
             except Exception as error:  # a foreign plug-in may raise anything; the reason is kept
                 self._failures.append(Failure(source, _reason(error)))
                 return
-            if spec.id in found:
-                self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {found[spec.id].source}"))
+            if spec.id in plugins:
+                self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {plugins[spec.id].source}"))
                 return
-            found[spec.id] = Found(spec, source)
+            plugins[spec.id] = Found(spec, source)
 
         for spec in self._builtin():
             add(lambda spec=spec: spec, "built in")  # type: ignore[misc]
@@ -135,13 +135,13 @@ class Registry(Generic[P]):
             distribution = point.dist.name if point.dist else "unknown distribution"
             target = f"{point.module}:{point.attr}"
             add(lambda target=target: load_object(target), f"entry point '{point.name}' of {distribution}")  # type: ignore[misc]
-        self._found = found
-        return found
+        self._found = plugins
+        return plugins
 
     def _not_built_in(self, spec: P, source: str) -> P:
         """Refuse a plug-in under the id of a built-in one: tables could not tell them apart."""
-        known = self._discover().get(spec.id)
-        if known is not None and known.source == "built in" and known.spec != spec:
+        registered = self._discover().get(spec.id)
+        if registered is not None and registered.source == "built in" and registered.spec != spec:
             raise PluginError(f"{source} has the id '{spec.id}', which is built in", "give the plug-in another id")
         return spec
 
@@ -243,7 +243,7 @@ from dynslam_bench.core.plugins import import_module
 try:
     import_module(location)
 except Exception:
-    pass  # whoever asks meets it again, and words it
+    pass  # the caller meets it again and reports it
 os._exit(int(sys.argv[3]))
 """
 
@@ -253,8 +253,8 @@ def check_import(location: str) -> None:
     """Import a plug-in's module in a process of its own, once for every location.
 
     What the import raises is left to the caller's own import; here counts that it comes to an end and that the process
-    lives on: ``sys.exit``, ``os._exit``, a crash of a native library or an endless loop would end, or hang, whoever
-    imports it.
+    lives on: ``sys.exit``, ``os._exit``, a crash of a native library or an endless loop would end, or hang, the
+    importing process.
 
     Args:
         location: Name of a module, or path of a ``.py`` file.

@@ -1,4 +1,4 @@
-"""Read files that somebody else may have written: bounded in size, and one clear error for any fault.
+"""Read files that others may have written: bounded in size, and one clear error for any fault.
 
 Every reader of text, JSON, arrays or bytes uses this module, so that the message is the same everywhere for files that
 are not UTF-8, nested too deeply, too long or not readable.

@@ -161,17 +161,17 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
 
     A field of type `Path` counts as a file, too.
     """
-    found = {}
+    differences = {}
     for name, field, _ in _leaves(type(settings)):
         extra = field.json_schema_extra
         note = extra.get(_NAMES) if isinstance(extra, dict) else None
         value = value_of(settings, name)
         if isinstance(note, dict):
             value = value or os.environ.get(str(note["otherwise"]), "")
-            found[name] = (str(note["kind"]), str(value))
+            differences[name] = (str(note["kind"]), str(value))
         elif isinstance(value, Path):
-            found[name] = ("file", str(value))
-    return {name: each for name, each in found.items() if each[1]}
+            differences[name] = ("file", str(value))
+    return {name: pair for name, pair in differences.items() if pair[1]}
 
 
 def build(cls: type[S], values: Mapping[str, Any] | None = None) -> S:
@@ -198,14 +198,14 @@ def apply_overrides(settings: S, overrides: Mapping[str, Any]) -> S:
         SettingsError: Unknown name (with a did-you-mean), or a value that does not fit.
     """
     values = settings.model_dump()
-    known = {name: field for name, field, _ in _leaves(type(settings))}
+    leaves = {name: field for name, field, _ in _leaves(type(settings))}
     for name, value in overrides.items():
         node, *rest = _walk(values, name.split("."))
-        if name not in known or rest:
-            if any(field.startswith(f"{name}.") for field in known):
+        if name not in leaves or rest:
+            if any(field.startswith(f"{name}.") for field in leaves):
                 raise SettingsError(f"setting '{name}' is a group", f"set one of {name}.*")
-            raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, known))
-        node[name.split(".")[-1]] = _parse(value, known[name].annotation)
+            raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, leaves))
+        node[name.split(".")[-1]] = _parse(value, leaves[name].annotation)
     return build(type(settings), values)
 
 
@@ -415,7 +415,8 @@ def online_parameters(settings: Settings) -> list[Parameter]:
     A parameter is left out where a condition of its (``when``) does not hold, where a group that it lies in is idle
     (`Settings.idle`), or where it or its group has no effect as the rest is set (`Settings.unused`).
     """
-    return [each for each in parameters(type(settings), online_only=True) if not why_idle(settings, each)]
+    online = parameters(type(settings), online_only=True)
+    return [parameter for parameter in online if not why_idle(settings, parameter)]
 
 
 def why_idle(settings: Settings, parameter: Parameter) -> str:

@@ -38,7 +38,7 @@ class Similarity:
 
     @cached_property
     def uncertainty_deg(self) -> float | None:
-        """Standard error of the rotation, see `conditioning`; None where it does not come from enough positions."""
+        """Standard error of the rotation, see `rotation_uncertainty_deg`; None where too few positions determine it."""
         return None if self.fitted is None else rotation_uncertainty_deg(*self.fitted, self.rotation)
 
     @property

@@ -1,6 +1,6 @@
 """The matching cost (Eq. 1) of labels at sparse points, for the processor.
 
-A label is ``(u, v, s, theta)``: displacement in pixels, log2 scale, rotation in radians. It maps the surroundings of a
+A label is ``(u, v, s, theta)``: displacement in pixels, log2 scale, rotation in radians. It maps the neighbourhood of a
 point p by ``p' = p + (u, v) + 2**s R(theta) (q - p)``. The target is sampled at the label's scale and rotation; the
 rotation of the *bins* is applied to the reference descriptor, once for each of the 13 quantised angles.
 

@@ -66,8 +66,8 @@ class LucasKanadeFlow:
         if guess is not None:
             predicted = np.asarray(guess, dtype=np.float32).reshape(-1, 2)
             initial = np.where(usable_points(predicted, target.shape)[:, None], predicted, clean)
-        xy, found, cost = self._follow(reference, target, clean, initial)
-        valid = usable & found & usable_points(xy, target.shape)
+        xy, tracked, cost = self._follow(reference, target, clean, initial)
+        valid = usable & tracked & usable_points(xy, target.shape)
         if self.settings.forward_backward_px > 0:
             back, returned, _ = self._follow(target, reference, np.where(valid[:, None], xy, clean), clean)
             valid &= returned & (np.hypot(*(back - clean).T) <= self.settings.forward_backward_px)
@@ -83,9 +83,9 @@ class LucasKanadeFlow:
             first, second, points, initial.astype(np.float32).copy(), winSize=(side, side), maxLevel=LEVELS - 1,
             criteria=CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=MIN_EIGENVALUE,
         )  # fmt: skip
-        found = np.asarray(status).reshape(-1) > 0
-        cost = np.where(found, np.asarray(error, dtype=np.float32).reshape(-1), 255.0)
-        return np.asarray(xy, dtype=np.float32), found, np.asarray(cost, dtype=np.float32)
+        tracked = np.asarray(status).reshape(-1) > 0
+        cost = np.where(tracked, np.asarray(error, dtype=np.float32).reshape(-1), 255.0)
+        return np.asarray(xy, dtype=np.float32), tracked, np.asarray(cost, dtype=np.float32)
 
 
 class DisFlow(LucasKanadeFlow):

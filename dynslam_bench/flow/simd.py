@@ -76,7 +76,7 @@ FLOAT32X16, UINT16X32 = SimdType("Float32x16", _FLOATS), SimdType("UInt16x32", _
 
 
 class _Arithmetic(AbstractTemplate):
-    def generic(self, arguments: Code, keyhalves: Code) -> Code:
+    def generic(self, arguments: Code, keywords: Code) -> Code:
         return signature(FLOAT32X16, *arguments) if arguments == (FLOAT32X16, FLOAT32X16) else None
 
 

@@ -168,11 +168,11 @@ def _parse(line: dict[str, str]) -> FrameRow:
     if None in line or None in line.values():
         raise ValueError("another number of cells than the heading has")
     cells = {name: text for name, text in line.items() if text}
-    known: dict[str, Any] = {name: cells.pop(name) for name in (*FIXED, _SHARE) if name in cells}
+    fixed: dict[str, Any] = {name: cells.pop(name) for name in (*FIXED, _SHARE) if name in cells}
     stats = {name.removeprefix(_STAT): text for name, text in cells.items() if name.startswith(_STAT)}
     times = {name: text for name, text in cells.items() if name.endswith(_SECONDS) and not name.startswith(_STAT)}
     timings = {name.removesuffix(_SECONDS): text for name, text in times.items()}
-    return _LINE.validate_python(known | {"stats": stats, "timings": timings})
+    return _LINE.validate_python(fixed | {"stats": stats, "timings": timings})
 
 
 @dataclass

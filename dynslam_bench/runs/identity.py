@@ -105,7 +105,8 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     part = part_of(sequence, spec.offset)
     installed = versions()  # another version of what computes with the run's data may give other bits
     libraries = [*LIBRARIES, *({"gtsam"} & {str(value) for value in flatten(settings).values()})]
-    dataset = next((each.spec for each in DATASETS.all() if each.spec.id == spec.sequence.partition("/")[0]), None)
+    datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
+    dataset = datasets.get(spec.sequence.partition("/")[0])
     sequence_plugin = "" if dataset is None else plugin_digest(dataset.entry_point)
     identity = {
         "scheme": IDENTITY_SCHEME,
@@ -196,10 +197,10 @@ def _files_digest(tracker: TrackerSpec, settings: Settings) -> str:
 
 
 def _check_degradation(strengths: dict[str, float]) -> None:
-    known = set(Degradation.__dataclass_fields__) - {"seed"}
-    unknown = sorted(set(strengths) - known)
+    fields = set(Degradation.__dataclass_fields__) - {"seed"}
+    unknown = sorted(set(strengths) - fields)
     if unknown:
-        raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], known))
+        raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], fields))
     Degradation(seed=0, **strengths)
 
 

@@ -139,17 +139,17 @@ def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name
 def _identity(
     file: Path, tracker: str, which: str, sequence: Sequence, timestamps: str | Path | None, topic: str | None
 ) -> dict[str, Any]:
-    seen = part_of(sequence)
+    part = part_of(sequence)
     return {
         "kind": "imported",
         "tracker": tracker,
         "which": which,
         "file": digest_of(file),
-        "sequence": seen.id,
-        "content": seen.content,
-        "frames": [seen.start, seen.stop],
+        "sequence": part.id,
+        "content": part.content,
+        "frames": [part.start, part.stop],
         "offset": 0,
-        "stride": seen.stride,
+        "stride": part.stride,
         **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
         **({} if topic is None else {"topic": topic}),
     }

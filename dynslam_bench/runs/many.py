@@ -302,10 +302,10 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
 
 def _statuses(retry: Collection[str]) -> set[str]:
     wanted = {retry} if isinstance(retry, str) else set(retry)
-    known = {"ok", "lost", *FAILED}
-    unknown = sorted(wanted - known - {"failed"})
+    outcomes = {"ok", "lost", *FAILED}
+    unknown = sorted(wanted - outcomes - {"failed"})
     if unknown:
-        raise RunError(f"unknown status '{unknown[0]}' to retry", "known: failed, " + ", ".join(sorted(known)))
+        raise RunError(f"unknown status '{unknown[0]}' to retry", "known: failed, " + ", ".join(sorted(outcomes)))
     return (wanted - {"failed"}) | (set(FAILED) if "failed" in wanted else set())
 
 

@@ -119,13 +119,13 @@ def run_one(
 
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
     """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
-    seen, stamps = part_of(sequence, offset), sequence.timestamps
+    input_part, stamps = part_of(sequence, offset), sequence.timestamps
     return SequenceInfo(
         id=sequence.id,
         content=content,
         part=part,
-        block=seen.block,
-        noise=seen.noise,
+        block=input_part.block,
+        noise=input_part.noise,
         frames=len(sequence),
         duration_s=float(stamps[-1] - stamps[0]),
         fps=sequence.fps,

@@ -82,7 +82,7 @@ class RunIndex:
         }
 
     def _select(self, condition: str, arguments: tuple[str, ...]) -> list[tuple[Any, Any, Any]]:
-        with contextlib.suppress(sqlite3.Error), self._opened(anew=False) as connection:
+        with contextlib.suppress(sqlite3.Error), self._opened(create=False) as connection:
             return connection.execute(
                 f"SELECT run_id, state, value FROM computed WHERE {condition}", arguments
             ).fetchall()
@@ -110,14 +110,14 @@ class RunIndex:
 
     def names(self) -> set[str]:
         """Names of the values that are kept."""
-        with contextlib.suppress(sqlite3.Error), self._opened(anew=False) as connection:
+        with contextlib.suppress(sqlite3.Error), self._opened(create=False) as connection:
             return {str(name) for (name,) in connection.execute("SELECT DISTINCT name FROM computed")}
         return set()
 
     def _change(self, command: str, rows: list[tuple[str, ...]]) -> None:
         for _ in range(2):
             try:
-                with self._opened(anew=True) as connection, connection:
+                with self._opened(create=True) as connection, connection:
                     connection.executemany(command, rows)
                 return
             except (sqlite3.OperationalError, UnicodeEncodeError):  # it cannot be written, or a value not be encoded
@@ -127,18 +127,18 @@ class RunIndex:
                     self.path.unlink()
 
     @contextlib.contextmanager
-    def _opened(self, *, anew: bool) -> Iterator[sqlite3.Connection]:
+    def _opened(self, *, create: bool) -> Iterator[sqlite3.Connection]:
         """The database; no link is followed, and no pipe is opened.
 
         Raises:
             sqlite3.OperationalError: It is not there, or cannot be opened.
         """
         is_there = self.path.exists() or self.path.is_symlink()
-        if (is_there and (self.path.is_symlink() or not self.path.is_file())) or not (is_there or anew):
+        if (is_there and (self.path.is_symlink() or not self.path.is_file())) or not (is_there or create):
             raise sqlite3.OperationalError(f"{self.path} is no database")
         with contextlib.closing(sqlite3.connect(self.path, timeout=_LOCKED_S)) as connection:
             connection.execute("PRAGMA synchronous = OFF")  # a power cut costs an index, which is made again
-            if anew:
+            if create:
                 connection.execute(_TABLE)
             yield connection
 
@@ -158,10 +158,10 @@ def _part_of(state: str) -> str:
 def file_stamp(file: str | Path) -> str:
     """Time (nanoseconds) and size (bytes) of a file; ``-`` where there is none."""
     try:
-        found = os.stat(file)  # noqa: PTH116 - a hundred thousand of them: pathlib takes twice as long
+        status = os.stat(file)  # noqa: PTH116 - a hundred thousand of them: pathlib takes twice as long
     except OSError:
         return "-"
-    return f"{found.st_mtime_ns},{found.st_size}"
+    return f"{status.st_mtime_ns},{status.st_size}"
 
 
 def check_plain(folder: Path, root: Path) -> None:

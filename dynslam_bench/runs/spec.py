@@ -140,8 +140,8 @@ def absolute_target(tracker: str) -> str:
 def _absolute_folder(sequence: str) -> str:
     if sequence.startswith((".", "~", os.sep)):
         return str(Path(sequence).expanduser().absolute())
-    known = sequence.startswith("synthetic/") or entry_of(sequence) is not None
-    return str(Path(sequence).absolute()) if not known and Path(sequence).is_dir() else sequence
+    catalogued = sequence.startswith("synthetic/") or entry_of(sequence) is not None
+    return str(Path(sequence).absolute()) if not catalogued and Path(sequence).is_dir() else sequence
 
 
 def place_of(sequence: str) -> str:

@@ -278,15 +278,15 @@ class RunStore:
         Raises:
             RunError: No run, or more than one, begins so.
         """
-        known = self.ids()
+        run_ids = self.ids()
         if prefix == "latest" and (self.root / "latest").exists():
             return (self.root / "latest").resolve().name
-        matching = [run_id for run_id in known if run_id.startswith(prefix)] if prefix else []
+        matching = [run_id for run_id in run_ids if run_id.startswith(prefix)] if prefix else []
         if len(matching) == 1:
             return matching[0]
         if matching:
             raise RunError(f"{len(matching)} runs begin with '{prefix}'", ", ".join(matching[:5]))
-        hint = did_you_mean(prefix, known) if known else f"there are no runs in {self.root}"
+        hint = did_you_mean(prefix, run_ids) if run_ids else f"there are no runs in {self.root}"
         raise RunError(f"there is no run '{prefix}'", hint)
 
     def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
@@ -537,7 +537,7 @@ def rescore(
     ended = [record for record in records if record.status != "stopped"]
     reasons = tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)
     names = store.index.names()
-    chosen = [known for known in PROTOCOLS.values() if known.id == DEFAULT_PROTOCOL or _metrics_of(known) in names]
+    chosen = [option for option in PROTOCOLS.values() if option.id == DEFAULT_PROTOCOL or _metrics_of(option) in names]
     chosen = chosen if protocol is None else [get_protocol(protocol)]
     outcomes: list[Rescored] = []
     for current in chosen:

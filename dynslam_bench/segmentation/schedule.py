@@ -137,15 +137,15 @@ class MissedDetections:
         predicted = [np.asarray(track.box + track.velocity * frames, np.float32) for track in self._tracks]
         matches = dict(associate(predicted, [track.name for track in self._tracks], detections))
         height, width = detections.masks.shape[1:]
-        seen: list[_Track] = []
+        tracks: list[_Track] = []
         bridged: list[_Track] = []
         for index, track in enumerate(self._tracks):
             if index in matches:
                 _update_track(track, detections, matches[index], frames)
-                seen.append(track)
+                tracks.append(track)
             elif self._bridge(track, predicted[index], height, width):
                 bridged.append(track)
-        self._tracks = seen + bridged
+        self._tracks = tracks + bridged
         for new in sorted(set(range(len(detections))) - set(matches.values())):
             self._tracks.append(
                 _Track(detections.boxes[new], detections.masks[new], detections.class_names[new],

@@ -51,7 +51,7 @@ AROUND = 10
 WIDEN = 2.0
 """Factor on the search windows: the RANSAC pose rests on few matches."""
 ROUNDS = 6
-"""Matching and fitting are repeated up to so often: a small patch predicts only its own surroundings well."""
+"""Matching and fitting are repeated up to so often: a small patch predicts only its own neighbourhood well."""
 
 INNER_SHARE = 0.85
 """Share of the matches, those nearest their median in the image, that have to determine the pose by themselves."""

@@ -215,7 +215,7 @@ class MapFit:
         return int(np.count_nonzero(self.inliers))
 
     def refit(self, observations: Observations, camera: Camera) -> MapFit:
-        """The pose fitted anew to the same matches, the features of which have moved a little."""
+        """The pose fitted again to the same matches, the features of which have moved a little."""
         return replace(self, estimate=solve(camera, observations, self.matches, self.estimate.T_cam_world))
 
 
@@ -251,7 +251,7 @@ def track_local_map(
 
 
 class LocalMap:
-    """The keyframes and points that a frame is matched with; computed anew after a keyframe or at another place.
+    """The keyframes and points that a frame is matched with; computed again after a keyframe or at another place.
 
     Without loop closing that is the whole map. With loop closing it ends where the covisibility graph does: what was
     left long ago is left to the loop closer. If its points were matched by projection, the pose would jump there, and
@@ -296,7 +296,7 @@ def weakly_connected(world: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> 
     """Slots of the keyframes made `gap` before or after one, or longer, that are not strongly covisible with it.
 
     Strong covisibility counts directly or over one third keyframe. After a loop that was closed inaccurately, a second
-    visit is connected with the first by fewer points and drifts beside it: such a place may be recognised anew.
+    visit is connected with the first by fewer points and drifts beside it: such a place may be recognised again.
     Keyframes of other submaps always may.
     """
     near, shared = world.covisible(keyframe)

@@ -40,7 +40,7 @@ class Variant(Record):
 
 
 class Row(Record):
-    """A tracker once more, with settings of its own: a yardstick beside the systems.
+    """A tracker once more, with settings of its own: a reference beside the systems.
 
     Attributes:
         tracker: One of the suite's trackers.
@@ -148,7 +148,7 @@ class Suite(Record):
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
         chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
-        known = {name: set(field_names(TRACKERS.get(name).settings)) for name in chosen}
+        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in chosen}
         named = {*self.tracker_settings, *(row.tracker for row in self.rows)}
         strangers = sorted(named - {*self.trackers, *self.optional})
         if strangers:
@@ -159,7 +159,7 @@ class Suite(Record):
         rows: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
         rows += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
         common = {
-            tracker: {name: value for name, value in self.settings.items() if name in known[tracker]}
+            tracker: {name: value for name, value in self.settings.items() if name in field_sets[tracker]}
             | self.tracker_settings.get(tracker, {})
             for tracker in chosen
         }

@@ -70,7 +70,7 @@ class TrackerRegistry(Registry[TrackerSpec]):
         Raises:
             PluginError: Unknown id (with a did-you-mean), an empty value, or the named object is no spec.
         """
-        specs = {found.spec.id: found.spec for found in self.all()}
+        specs = {plugin.spec.id: plugin.spec for plugin in self.all()}
         prefix, separator, value = name.partition(":")
         if name in specs or not separator or prefix not in specs or not specs[prefix].parameter:
             return super().get(name)

@@ -8,7 +8,7 @@ choice saw; the fr1 excerpts, with nobody in view, have four each, likewise. Mas
 YOLO's on Bonn and the embedded network's elsewhere. Recordings are looked for in ``../shared``; what is not there is
 named. Ratios are preset : default, with 95 % intervals over scenes (over starts where there is one scene). "Not
 worse" is said where the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in
-anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes hundreds of runs. """
+anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes hundreds of runs."""
 
 from __future__ import annotations
 

@@ -11,14 +11,18 @@ import pytest
 
 from dynslam_bench.cli import demo
 from dynslam_bench.cli.demo import PROBE_FRAMES, PROBE_S, compiled_ahead, estimate, measure, tell
+from dynslam_bench.core.records import digest
 from dynslam_bench.reports.model.row import RunRow
 
 
 def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene=100&frames=100") -> RunRow:
-    return RunRow(
-        run_id=f"{tracker}{sequence}", kind="run here", tracker=tracker, label=tracker, sequence=sequence,
-        protocol_id="p", protocol_digest="d", hold_last_pose_ate_m=ate_m,
-    )  # fmt: skip
+    return RunRow.model_validate({
+        "run_id": digest([tracker, sequence], 16), "status": "ok", "n_frames": 100, "n_tracked": 100, "coverage": 1.0,
+        "tracker": {"id": tracker, "label": tracker},
+        "sequence": {"id": sequence, "part": "0" * 16, "frames": 100, "duration_s": 3, "fps": 30, "ground_truth": True,
+                     "block": "0" * 16},
+        "protocol_id": "p", "protocol_digest": "d", "hold_last_pose_ate_m": ate_m,
+    })  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.training.prepared import PreparedImages
 from dynslam_bench.sequences import archives
-from dynslam_bench.sequences.readers import images as reader
+from dynslam_bench.sequences.readers import recorded as reader
 from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png
 from dynslam_bench.trackers.adapters import orbslam3 as vocabulary
 

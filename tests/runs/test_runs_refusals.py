@@ -31,7 +31,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple
         "no folder": (f"recorded:{tmp_path}/none", r"recorded masks .*none does not exist"),
         "too few masks": (f"recorded:{tmp_path}/masks", r"has none for 40 of 60 frames of '.*', the first is frame 20"),
         "oracle": ("oracle", r"has no exact masks"),
-        "auto": ("auto", r"no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH.*needs none"),
+        "auto": ("auto", r"no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH"),
         "plugin": ("plugin:mine", r"unknown segmenter 'mine'"),
     }
 

@@ -41,7 +41,9 @@ def construct(filter_class):
     """A filter with default settings, by the types of its parameters."""
     hints = typing.get_type_hints(filter_class.__init__)
     parameters = list(inspect.signature(filter_class).parameters.values())
+    bound = typing.get_args(getattr(filter_class, "__orig_bases__", [None])[0])  # the settings of a `Rule[...]`
     needed = [hints[p.name] for p in parameters if p.default is p.empty]
+    needed = [bound[0] if isinstance(kind, typing.TypeVar) else kind for kind in needed]
     assert all(issubclass(kind, Settings) for kind in needed), needed
     return filter_class(*[kind() for kind in needed])
 

@@ -53,8 +53,7 @@ def test_cached_runs_have_the_same_bits_and_load_no_network(
 
 EXTRACTOR = """
 import numpy as np
-from dynslam_bench.features.keypoints import Keypoints
-from dynslam_bench.features.registry import FeatureSpec
+from dynslam_bench.contracts import FeatureSpec, Keypoints
 
 class Mine:
     def extract(self, gray):

@@ -62,6 +62,10 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "free_space.min_votes": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
     }),
+    "motion.enabled": ("emfoa-oft?masks=none", {}),
+    "free_space.enabled": ("emfoa-oft?masks=none", {
+        **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
+    }),
     "multiview.tau_m": ("dynaslam-g", {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
@@ -79,7 +83,6 @@ JUDGED = ("emfoa-oft?masks=none&depth=none", {"epipolar.min_parallax_px": 0.0, "
 """F judges every frame."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES |= {
-    "backend.keyframes.redundant_share": ("orb-slam2", MANY),
     "backend.mapping.neighbours": ("orb-slam2", MANY),
     "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
     "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
@@ -98,7 +101,7 @@ SHOWN_ALONE = frozenset({
     "epipolar.confidence", "free_space.max_age_s", "correlation.largest", "moving_vote.corners",
     "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
     "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
-    "backend.keyframes.max_gap", "backend.bundle_adjustment.window",
+    "backend.keyframes.max_gap", "backend.keyframes.redundant_share", "backend.bundle_adjustment.window",
     *(f"backend.relocalisation.{name}" for name in ("candidates", "iterations", "max_distance")),
 })  # fmt: skip
 """Settings that change nothing on these few frames: they act in long maps, at long ages, or when lost."""

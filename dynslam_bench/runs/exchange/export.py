@@ -115,10 +115,10 @@ def _check_target(target: Path) -> None:
 
 def _trajectory(store: RunStore, record: RunRecord, which: Which | None) -> tuple[Which, Trajectory]:
     wanted: tuple[Which, ...] = ("final", "online") if which is None else (which,)
-    for each in wanted:
-        found = store.trajectory(record.run_id, each)
-        if found is not None:
-            return each, found
+    for kind in wanted:
+        trajectory = store.trajectory(record.run_id, kind)
+        if trajectory is not None:
+            return kind, trajectory
     raise RunError(f"run {record.run_id} has no {' and no '.join(wanted)} trajectory", record.describe())
 
 
@@ -271,12 +271,12 @@ def stated_provenance(file: Path) -> str:
     if not beside.is_file():
         return ""
     try:
-        found = Provenance.read(beside)
-        files = [file] if file.is_file() else [file / name for name in found.files if Path(name).name == name]
-        intact = bool(files) and all(found.files.get(path.name) == digest_of(path) for path in files)
+        provenance = Provenance.read(beside)
+        files = [file] if file.is_file() else [file / name for name in provenance.files if Path(name).name == name]
+        intact = bool(files) and all(provenance.files.get(path.name) == digest_of(path) for path in files)
     except (DynslamError, OSError, ValueError):  # ValueError: a name with a null byte
         return ""
-    return found.describe() if intact else ""
+    return provenance.describe() if intact else ""
 
 
 def digest_of(path: Path) -> str:
@@ -315,5 +315,5 @@ def open_stored(record: RunRecord, data_root: str | Path | None = None, camera: 
 
 def image_names(sequence: Sequence) -> list[str]:
     """The colour image of every frame, relative to the sequence's folder; TUM's way of naming where it has no files."""
-    known: dict[float, str] = getattr(sequence, "colour_files", {})
-    return [known.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]
+    colour_files: dict[float, str] = getattr(sequence, "colour_files", {})
+    return [colour_files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]

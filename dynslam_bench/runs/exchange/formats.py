@@ -96,10 +96,10 @@ def read_pose_table(path: Path) -> Trajectory:
         )
     picked = [[row[at] for at in order] for row in rows]
     stamps, values = nanoseconds([row[0] for row in picked], path), floats([row[1:] for row in picked], path)
-    found = camera_truth(stamps, values, np.eye(4), str(path))
-    if found is None:
+    camera_poses = camera_truth(stamps, values, np.eye(4), str(path))
+    if camera_poses is None:
         raise TrajectoryError(f"none of the {len(rows)} rows of {path} holds a rotation")
-    return found
+    return camera_poses
 
 
 def write_euroc(path: Path, trajectory: Trajectory) -> None:
@@ -186,7 +186,7 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         TrajectoryError: A line is malformed, an image has no stamp, or there is no image.
     """
     path = folder / IMAGES if folder.is_dir() else folder
-    found: dict[float, NDArray[np.float64]] = {}
+    poses_by_stamp: dict[float, NDArray[np.float64]] = {}
     held = False
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
         if line.startswith("#"):
@@ -202,19 +202,19 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         if not np.isfinite(values).all() or not np.any(values[:4]):
             raise TrajectoryError(f"{path} line {number} holds no pose")
         name = parts[9].strip()
-        found[_stamp(name, stamps, path)] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
-    if not found:
+        poses_by_stamp[_stamp(name, stamps, path)] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
+    if not poses_by_stamp:
         raise TrajectoryError(f"{path} names no image")
-    order = sorted(found)
-    return Trajectory(np.array(order), se3.inverse(np.array([found[stamp] for stamp in order])))
+    order = sorted(poses_by_stamp)
+    return Trajectory(np.array(order), se3.inverse(np.array([poses_by_stamp[stamp] for stamp in order])))
 
 
 def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
     if stamps is not None:
-        known = stamps.get(name, stamps.get(Path(name).name))
-        if known is None:
+        stamp = stamps.get(name, stamps.get(Path(name).name))
+        if stamp is None:
             raise TrajectoryError(f"{path} names the image '{name[:100]}', which the list of stamps does not")
-        return known
+        return stamp
     stem = Path(name).stem
     if "." not in stem or not is_number(stem) or not np.isfinite(float(stem)):
         raise TrajectoryError(
@@ -240,10 +240,10 @@ def read_bag_trajectory(path: Path, topic: str | None = None) -> Trajectory:
         DynslamError: `rosbags` is missing, the bag is damaged, or the topic is not the only one and was not named.
     """
     stamps, rows = read_bag_poses(path, topic)
-    found = camera_truth(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
-    if found is None:
+    camera_poses = camera_truth(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
+    if camera_poses is None:
         raise TrajectoryError(f"{path} holds no pose", "name its topic with --topic")
-    return found
+    return camera_poses
 
 
 def write_bag(folder: Path, trajectories: Mapping[str, Trajectory], frame_id: str = "world") -> None:

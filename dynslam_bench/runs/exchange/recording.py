@@ -259,9 +259,9 @@ def write_stored(
     def frames() -> Iterator[RecordedFrame]:
         for index in range(len(sequence)):
             frame, row = sequence[index], rows.get(index)
-            known = ("", None) if row is None else (str(row.state), row.pose_error_trans_m)
+            state = ("", None) if row is None else (str(row.state), row.pose_error_trans_m)
             pose = _pose_at(online, frame.timestamp)
-            yield RecordedFrame(index, frame.timestamp, encode(frame.rgb), pose, shots.get(index), *known)
+            yield RecordedFrame(index, frame.timestamp, encode(frame.rgb), pose, shots.get(index), *state)
 
     cloud = read_ply(folder / "map.ply") if (folder / "map.ply").is_file() else None
     truth = aligned_truth(sequence.ground_truth, trajectory)[0]

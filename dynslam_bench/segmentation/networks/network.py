@@ -71,9 +71,9 @@ class MaskRCNN(nn.Module):
         levels, mask_levels = self.backbone(x.contiguous(memory_format=torch.channels_last))
         height, width = int(x.shape[2]), int(x.shape[3])
         proposals = self.rpn(levels, height, width, [size])[0][0]
-        found = self.roi_heads.detect(levels[:4], mask_levels, proposals, height, size, score=score, iou=iou)
-        back = found.boxes.new_tensor([image.shape[2] / size[1], image.shape[1] / size[0]]).repeat(2)
-        return Detections(found.boxes * back, found.labels, found.scores, found.masks)
+        detections = self.roi_heads.detect(levels[:4], mask_levels, proposals, height, size, score=score, iou=iou)
+        back = detections.boxes.new_tensor([image.shape[2] / size[1], image.shape[1] / size[0]]).repeat(2)
+        return Detections(detections.boxes * back, detections.labels, detections.scores, detections.masks)
 
     def losses(
         self,

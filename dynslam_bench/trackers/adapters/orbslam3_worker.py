@@ -44,7 +44,7 @@ class Worker:
     def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
         """One frame; without depth in monocular mode."""
         if self._final is not None:
-            raise RuntimeError("finalize() has stopped ORB-SLAM3's threads: only reset() begins anew")
+            raise RuntimeError("finalize() has stopped ORB-SLAM3's threads: only reset() starts again")
         start = time.perf_counter()
         image = np.ascontiguousarray(rgb)
         if self._monocular:

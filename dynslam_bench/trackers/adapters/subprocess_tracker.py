@@ -43,8 +43,8 @@ def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[
     """
     state = answer.get("state")
     if not isinstance(state, str) or state not in get_args(TrackingState):
-        known = ", ".join(get_args(TrackingState))
-        raise TrackerError(f"{who}: answered state {str(state)[:80]!r}", f"known: {known}")
+        states = ", ".join(get_args(TrackingState))
+        raise TrackerError(f"{who}: answered state {str(state)[:80]!r}", f"known: {states}")
     pose = _pose(answer.get("T_world_cam"), who)
     if pose is None and state == "ok":
         raise TrackerError(f"{who}: answered state 'ok' without T_world_cam")

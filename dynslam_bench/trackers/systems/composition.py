@@ -11,7 +11,7 @@ from pydantic import Field
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.settings import Settings, tunable
+from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.guard import GuardSettings
 from dynslam_bench.culling.settings import Unmatched
 from dynslam_bench.features.settings import FeatureSettings
@@ -93,8 +93,8 @@ class MonocularSemanticSettings(MonocularSystemSettings, SemanticSystemSettings)
 class PublishedFlowSettings(FlowMethodSettings):
     """Lucas-Kanade as published systems use it: none of their sources names a forward-backward check."""
 
-    method: Literal["daisy", "lucas-kanade", "dis"] = tunable(
-        "lucas-kanade", meaning="which flow; the published one is Lucas-Kanade"
+    method: Literal["daisy", "lucas-kanade", "dis"] = Field(
+        "lucas-kanade", description="which flow; the published one is Lucas-Kanade"
     )
     forward_backward_px: float = Field(
         0.0, ge=0.0, le=100.0, description="largest forward-backward error in pixels; 0, no check, as published"

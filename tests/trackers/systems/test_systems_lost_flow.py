@@ -10,6 +10,7 @@ from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.flow.opencv import LEVELS
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.pipeline import SlamPipeline
@@ -137,7 +138,7 @@ def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> 
         grid,
         grid.copy(),
         winSize=(settings.window_px,) * 2,
-        maxLevel=settings.levels - 1,
+        maxLevel=LEVELS - 1,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=1e-4,
