@@ -435,6 +435,8 @@ def why_unused(settings: Settings, name: str) -> str:
     for part in name.split("."):
         if reason := node.idle or node.unused.get(part, ""):
             return reason
+        if part != "enabled" and not getattr(node, "enabled", True):
+            return f"{type(node).__name__} is not enabled"
         node = getattr(node, part)
     return ""
 

@@ -13,7 +13,7 @@ from dynslam_bench.slam import map_files
 from dynslam_bench.slam.atlas import open_atlas, packed, unpacked
 from dynslam_bench.slam.map_files import HEADER, MapFeatures, MapHeader, described
 
-from .records import rezipped
+from .mutate import mutate_zip
 from .target import Target, at
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
@@ -80,6 +80,6 @@ TARGETS = [
         _read,
         _seeds,
         (map_files.read_map, map_files._faults, map_files._contents, map_files._references, unpacked),
-        rezipped,
+        mutate_zip,
     )
 ]
