@@ -78,7 +78,7 @@ def _read_index(data: bytes | None, folder: Path) -> None:
     assert [row["run_id"] for row in rows] == [RUN] and len(unreadable) == 1
     assert store.score(store.read(RUN)).run_id == RUN
     loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
-    assert [run.row.run_id for run in loaded.runs] == [RUN] and len(loaded.unreadable) == 1
+    assert [row.run_id for row in loaded.rows] == [RUN] and len(loaded.unreadable) == 1
 
 
 @cache

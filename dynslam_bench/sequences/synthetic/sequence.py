@@ -75,7 +75,7 @@ def is_intact_png(data: bytes, size: tuple[int, int] | None = None, modes: tuple
     try:
         with Image.open(BytesIO(data), formats=["PNG"]) as image:
             image.verify()
-    except (OSError, SyntaxError, ValueError, struct.error):  # what Pillow raises over damaged files
+    except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError):  # Pillow's, if damaged
         return False
     return data.endswith(_END) and size in (None, image.size) and (not modes or image.mode in modes)
 
