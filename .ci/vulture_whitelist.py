@@ -7,19 +7,16 @@ relative_to_first  # on a Trajectory, for users who compare with systems that st
 of_classes  # on Instances, for authors of filters and segmenters
 action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
-BoxFilter  # a rejection rule for systems of one's own, held to its paper by tests/culling
-emfoa_minimise  # the paper's optimiser for any function (docs/flow.md), measured on benchmark functions
-hamming  # features.matching: the reference in numpy that the kernel is held against
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
-TensorBoard  # tuning.callbacks: for studies of one's own (docs/tuning.md)
-compile_kernels  # cli.kernels: .ci/run calls it, before the tests
+
+compile_kernels  # cli.demo: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
+
+_restore_optimizer  # tuning.samplers: Optuna calls it, in place of its own
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry
 build_daisy  # flow.registry
-build_lucas_kanade  # flow.registry
-build_dis  # flow.registry
 build_recorded  # segmentation.registry
 build_onnx  # segmentation.registry
 build_embedded  # segmentation.registry
@@ -35,9 +32,35 @@ OrbSlam3  # trackers.adapters.specs
 OrbSlam3Monocular  # trackers.adapters.specs
 Replay  # trackers.adapters.specs
 build_masks_only  # trackers.systems.dynaslam: a variant's spec
-build_object_mode  # trackers.systems.emfoa_oft: a variant's spec
+build_geometry_only  # trackers.systems.dynaslam: a variant's spec
+build_vote  # trackers.systems.emfoa_oft: a variant's spec
+BoxDepthFilter  # trackers.systems: a system names its rules
+BoxEpipolarFilter  # trackers.systems: a system names its rules
+ClassRuleFilter  # trackers.systems: a system names its rules
+CorrelationFilter  # trackers.systems: a system names its rules
+DepthBlockFilter  # trackers.systems: a system names its rules
+DepthRansacFilter  # trackers.systems: a system names its rules
+EpipolarFilter  # trackers.systems: a system names its rules
+FreeSpaceFilter  # trackers.systems: a system names its rules
+MovingVoteFilter  # trackers.systems: a system names its rules
+MultiViewFilter  # trackers.systems: a system names its rules
+ReseedingFilter  # trackers.systems: a system names its rules
+ResidualFilter  # trackers.systems: a system names its rules
+RigidMotionFilter  # trackers.systems: a system names its rules
+SemanticFilter  # trackers.systems: a system names its rules
+TemplateFilter  # trackers.systems: a system names its rules
+box_depth  # trackers.systems: a system names the settings of its rules
+depth_blocks  # trackers.systems: a system names the settings of its rules
+depth_ransac  # trackers.systems: a system names the settings of its rules
+free_space  # trackers.systems: a system names the settings of its rules
+moving_vote  # trackers.systems: a system names the settings of its rules
+multiview  # trackers.systems: a system names the settings of its rules
+reseeding  # trackers.systems: a system names the settings of its rules
 
 # called by a library
+as_json  # options of verbs: the callback of --json switches the output
+help_all  # the same: the callback of --help-all writes the help
+__dir__  # the interpreter: dir(dynslam_bench)
 __getattr__  # Python asks it for names of a package that are loaded late
 action_space  # gymnasium.Env
 observation_space  # gymnasium.Env
@@ -45,16 +68,16 @@ infer_relative_search_space  # optuna.samplers.BaseSampler
 sample_relative  # optuna.samplers.BaseSampler
 default_factory  # pydantic.fields.FieldInfo
 writeable  # numpy.ndarray.flags
-_LanesModel  # numba registers it by its decorator
-_WordsModel  # numba registers it by its decorator
+_SimdModel  # numba registers it by its decorator
 keywords  # numba: a signature of a typing template
 muted_rows  # reports/html/templates/report.html.j2
 mtime_ns  # core.fingerprint: part of the key of the cached function
-modified_ns  # trackers.adapters.vocabulary: part of the key of the cached function
+modified_ns  # trackers.adapters.orbslam3: part of the key of the cached function
 
 # fields of records and results: written for those who read the files
 descriptor_bytes  # FeatureSpec
 median_dt_s  # evaluation
+n_ground_truth  # evaluation
 hole_at_s  # evaluation
 n_initialising  # run.json
 n_dropped  # run.json
@@ -79,7 +102,6 @@ reward_m  # a column of frames.csv
 _.append_logs  # Optuna calls it: a backend of its journal
 _.tempdir  # tempfile reads it: where a run's temporary files go
 _.row_poses  # rendered sequences: the exact pose of every row
-_.bytes_in_files  # on a map's TableSpace: what of it lies in files (tests/benchmarks/backend_territory.py)
 pytest_addoption  # pytest calls it
 pytest_collection_modifyitems  # pytest calls it
 _.runtest  # pytest calls it

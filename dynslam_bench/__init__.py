@@ -1,30 +1,48 @@
 """dynslam-bench: benchmark and tune visual SLAM in dynamic scenes through Gymnasium environments.
 
-The rooms: `core`, `geometry`, `contracts`, `sequences`, `evaluation`, `features`, `segmentation`, `flow`, `culling`,
-`slam`, `trackers`, `envs`, `runs`, `suites`, `reports`, `testing`, `tuning`, `cli`. Importing this package loads none
-of them.
+The public interface is `run`, `bench`, `tune`, `report`, `load`, `sequence` and `trackers`, see `dynslam_bench.api`:
+
+    import dynslam_bench as db
+    db.run("emfoa-oft", "synthetic/walking_xyz?scene=100", frames=(0, 60)).metrics
+
+Importing this package loads none of its subpackages.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from .core import moved
+if TYPE_CHECKING:
+    from dynslam_bench import trackers
+    from dynslam_bench.api import bench, load, report, run, sequence, tune
 
 __version__: str
+__all__ = ["bench", "load", "report", "run", "sequence", "trackers", "tune"]
 
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.py").is_file():
     # In a bare checkout `envs/`, `tuning/` and `reports/` lie beside this package instead of inside it.
     __path__.append(str(_checkout))
 del _checkout
-moved.install()
 
 
-def __getattr__(name: str) -> str:
-    """``__version__``, looked up when somebody asks for it: that takes longer than all else here."""
+def __getattr__(name: str) -> Any:
+    """The names of the public interface and ``__version__``, loaded on first use."""
     if name == "__version__":
-        from .core.version import version
+        from dynslam_bench.core.version import version
 
         return version()
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return (
+        import_module("dynslam_bench.trackers")
+        if name == "trackers"
+        else getattr(import_module("dynslam_bench.api"), name)
+    )
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

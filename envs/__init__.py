@@ -6,20 +6,22 @@ worker processes write ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequ
 
 from __future__ import annotations
 
-from dynslam_bench.contracts.checks import TrackerContractError
+import gymnasium as gym
 
-from .control import ActionMap
-from .degrade_frames import Degradation, DegradeFrames
-from .device import resolve_device
-from .drop_frames import DropFrames
-from .observation import STATS_LAYOUT
-from .record_timings import RecordTimings
-from .record_trajectory import RecordTrajectory
-from .registration import GENERIC_ID, env_id, register_envs
-from .reward import REWARDS
-from .sequence_sampler import SequenceSampler
-from .slam_env import SlamEnv
-from .small_images import SmallImages
+from dynslam_bench.contracts.checks import TrackerContractError
+from dynslam_bench.envs.arguments import resolve_device
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.envs.spaces import REWARDS, STATS_LAYOUT, ActionMap
+from dynslam_bench.envs.wrappers import (
+    Degradation,
+    DegradeFrames,
+    DropFrames,
+    RecordTimings,
+    RecordTrajectory,
+    SequenceSampler,
+    SmallImages,
+)
+from dynslam_bench.sequences.catalogue import sequence_ids
 
 __all__ = [
     "GENERIC_ID",
@@ -39,5 +41,29 @@ __all__ = [
     "register_envs",
     "resolve_device",
 ]
+
+GENERIC_ID = "dynslam/Sequence-v0"
+
+
+def env_id(sequence: str) -> str:
+    """The environment id of a listed sequence, e.g. ``dynslam/tum-fr3-walking_xyz-v0``."""
+    return f"dynslam/{sequence.replace('/', '-')}-v0"
+
+
+def register_envs() -> list[str]:
+    """Register all environments that are not registered yet; calling it again changes nothing.
+
+    Every id makes a `SlamEnv`; the generic one needs ``sequence=``. There is no ``max_episode_steps``: the sequence
+    ends the episode.
+
+    Returns:
+        All ids, the generic one first.
+    """
+    ids: dict[str, dict[str, str]] = {GENERIC_ID: {}} | {env_id(name): {"sequence": name} for name in sequence_ids()}
+    for name, kwargs in ids.items():
+        if name not in gym.registry:
+            gym.register(id=name, entry_point="dynslam_bench.envs:SlamEnv", kwargs=kwargs)
+    return list(ids)
+
 
 register_envs()

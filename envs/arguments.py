@@ -1,14 +1,30 @@
-"""What an environment's arguments may be, as far as nothing has to be looked up for it."""
+"""The arguments of an environment: the sequence and its part, the device, and the names of modes."""
 
 from __future__ import annotations
 
-from dynslam_bench.core.errors import SettingsError
+import re
+from collections.abc import Sequence as PySequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
+from dynslam_bench.core.errors import SequenceError, SettingsError
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import refuse_close
+from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
+from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences.view import SequenceView
 
 RENDER_MODES = ("rgb_array",)
+Frames = PySequence[int | None] | str | None
+"""Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
 
 
 def check_arguments(render_mode: str | None, observation: str, lost_after: int | None, threads: int) -> None:
-    """Refuse what no environment can be made with.
+    """Refuse arguments with which no environment can be made.
 
     Raises:
         SettingsError: Names the first such argument and its value.
@@ -21,3 +37,115 @@ def check_arguments(render_mode: str | None, observation: str, lost_after: int |
         raise SettingsError(f"lost_after is {lost_after}", "give a number of frames >= 1, or None")
     if threads < 1:
         raise SettingsError(f"threads is {threads}", "give a number >= 1")
+
+
+def open_frames(
+    sequence: str | Sequence,
+    data_root: str | Path | None,
+    camera: str | Path | None,
+    frames: Frames,
+    stride: int,
+    preprocessing: PreprocessingSettings | None = None,
+) -> Sequence:
+    """The sequence, preprocessed and cut to the chosen frames.
+
+    Args:
+        sequence: An id, a folder, or a sequence object.
+        data_root: Folder of the sequences.
+        camera: Camera of a folder that does not name its own.
+        frames: Part of the sequence.
+        stride: Take every so many frames.
+        preprocessing: Applied to every frame.
+
+    Raises:
+        SequenceError: Unknown, missing or damaged sequence, or no frames are left.
+    """
+    if frames is not None and not isinstance(frames, str):
+        if len(frames) != 2:
+            raise SequenceError(f"frames {list(frames)} has {len(frames)} entries", "give (start, stop)")
+        frames = (int(frames[0] or 0), frames[1])
+    start, stop = parse_frames(frames)
+    if isinstance(sequence, str | Path):
+        return open_sequence(
+            sequence,
+            data_root=data_root,
+            camera=camera,
+            frames=(start, stop),
+            stride=stride,
+            preprocessing=preprocessing,
+        )
+    if stride < 1:
+        raise SequenceError(f"stride is {stride}, expected at least 1")
+    if preprocessing is not None and preprocessing.changes_images:
+        from dynslam_bench.sequences.preprocessing import Preprocessed
+
+        sequence = cast("Sequence", Preprocessed(sequence, preprocessing))
+    if (start, stop, stride) == (0, None, 1):
+        return sequence
+    return cast("Sequence", SequenceView(sequence, start, stop, stride))
+
+
+def check_frames(sequence: Sequence) -> None:
+    """Refuse a sequence that is too short for an episode, or whose stamps do not tell its frames or true poses apart.
+
+    Raises:
+        SequenceError: It has fewer than two frames, stamps that do not increase, or two frames or true poses less than
+            1 us apart.
+    """
+    if len(sequence) < 2:
+        raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more")
+    stamps = np.asarray(sequence.timestamps, dtype=np.float64)
+    wrong = np.flatnonzero(~(np.diff(stamps) > 0))
+    if len(wrong):
+        at = int(wrong[0]) + 1
+        raise SequenceError(
+            f"'{sequence.id}' has {len(wrong)} of {len(stamps)} stamps that are not later than the one before, first "
+            f"that of frame {at}: {stamps[at]} after {stamps[at - 1]} s",
+            "each frame has a stamp of its own, in seconds, ascending",
+        )
+    refuse_close(timestamps_ns(sequence), f"frames of '{sequence.id}'", SequenceError)
+    if sequence.ground_truth is not None:
+        refuse_close(sequence.ground_truth.timestamps_ns, f"ground truth of '{sequence.id}'", SequenceError)
+
+
+def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
+    """The group ``preprocessing`` of a tracker's settings; None for trackers without one."""
+    group = getattr(settings, "preprocessing", None)
+    return group if isinstance(group, PreprocessingSettings) else None
+
+
+def check_same_size(old: Camera, new: Camera) -> None:
+    """Refuse images that do not fit an observation space.
+
+    Raises:
+        SequenceError: Carries both sizes.
+    """
+    if (old.width, old.height) != (new.width, new.height):
+        raise SequenceError(
+            f"images of {new.width}x{new.height} do not fit the observation space of {old.width}x{old.height}"
+        )
+
+
+def resolve_device(name: str = "auto") -> str:
+    """``cpu`` or ``cuda:N`` for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+
+    ``auto`` is the first CUDA device, or the CPU where there is none. Torch is imported only if a driver is present.
+
+    Raises:
+        SettingsError: The name is not understood, or the machine has no such device.
+    """
+    if name == "cpu":
+        return "cpu"
+    if name != "auto" and not re.fullmatch(r"cuda(:\d+)?", name):
+        raise SettingsError(f"unknown device '{name}'", "write auto, cpu, cuda or cuda:N")
+    count = 0
+    if any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")):
+        import torch
+
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "auto":
+        return "cuda:0" if count else "cpu"
+    index = int(name.partition(":")[2] or 0)
+    if index >= count:
+        raise SettingsError(f"device '{name}' was asked for, this machine has {count} CUDA devices", "use --device cpu")
+    return f"cuda:{index}"

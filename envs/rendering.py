@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.envs.episode import Episode
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.geometry import se3
-
-from .episode import Episode
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -60,7 +59,7 @@ class Canvas:
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
         """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
         picture = self.picture(frame, result)
-        path = beside_truth(episode, self._truth)
+        path = align_to_truth(episode, self._truth)
         body = np.concatenate([picture, self._plan.draw(episode, path)], axis=1)
         return np.concatenate([body, self._strip(result, episode, path.ate_m, body.shape[1])], axis=0)
 
@@ -142,7 +141,7 @@ def main_plane(positions: Array) -> Plane:
 
 
 @dataclass(frozen=True)
-class PathBesideTruth:
+class AlignedPath:
     """Estimated centres ``[N, 3]`` in the truth's frame, the pieces without a gap, and the ATE where it is known."""
 
     centres: Array
@@ -155,21 +154,21 @@ class _Plan:
 
     def __init__(self, truth: dict[int, Array]) -> None:
         self._truth = {index: pose[:3, 3] for index, pose in sorted(truth.items())}
-        places = np.array(list(self._truth.values())).reshape(-1, 3)
-        self._plane = main_plane(places)
-        self._known = self._plane(places)
+        positions = np.array(list(self._truth.values())).reshape(-1, 3)
+        self._plane = main_plane(positions)
+        self._truth_path = self._plane(positions)
 
-    def draw(self, episode: Episode, path: PathBesideTruth) -> Image:
+    def draw(self, episode: Episode, path: AlignedPath) -> Image:
         plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
         estimate = self._plane(path.centres)
         to_pixel, metres_a_pixel = self._view(estimate)
         _grid(plot, to_pixel, metres_a_pixel)
-        if len(self._known) > 1:
-            _polyline(plot, to_pixel(self._known), TRUTH_AHEAD, 1)
+        if len(self._truth_path) > 1:
+            _polyline(plot, to_pixel(self._truth_path), TRUTH_AHEAD, 1)
         now = episode.outcomes[-1].index
-        seen = self._known[: sum(index <= now for index in self._truth)]
-        if len(seen) > 1:
-            _polyline(plot, to_pixel(seen), TRUTH, 2)
+        passed = self._truth_path[: sum(index <= now for index in self._truth)]
+        if len(passed) > 1:
+            _polyline(plot, to_pixel(passed), TRUTH, 2)
         for piece in path.pieces:
             _polyline(plot, to_pixel(estimate[piece]), ESTIMATE, 2)
         if len(estimate):
@@ -181,7 +180,7 @@ class _Plan:
         return plot
 
     def _view(self, estimate: Array) -> tuple[_ToPixel, float]:
-        points = np.concatenate([self._known, estimate, np.zeros((1, 2))])
+        points = np.concatenate([self._truth_path, estimate, np.zeros((1, 2))])
         low, high = points.min(axis=0), points.max(axis=0)
         extent = max(float((high - low).max()), 0.1)
         metres_a_pixel = extent / (HEIGHT - 120)
@@ -201,14 +200,14 @@ def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
     """Ground truth of the frames, in the frame of the first of them."""
     errors = OnlineError(sequence.ground_truth)
     poses = {i: errors.truth_at(float(stamp)) for i, stamp in enumerate(sequence.timestamps)}
-    known = {i: pose for i, pose in poses.items() if pose is not None}
-    if not known:
+    defined = {i: pose for i, pose in poses.items() if pose is not None}
+    if not defined:
         return {}
-    origin = se3.inverse(known[min(known)])
-    return {i: origin @ pose for i, pose in known.items()}
+    origin = se3.inverse(defined[min(defined)])
+    return {i: origin @ pose for i, pose in defined.items()}
 
 
-def beside_truth(episode: Episode, truth: dict[int, Array]) -> PathBesideTruth:
+def align_to_truth(episode: Episode, truth: dict[int, Array]) -> AlignedPath:
     """The estimate in the truth's frame.
 
     They are joined at the first frame that has both, and aligned by least squares over all frames so far (as for the
@@ -216,7 +215,7 @@ def beside_truth(episode: Episode, truth: dict[int, Array]) -> PathBesideTruth:
     """
     tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
     if not tracked:
-        return PathBesideTruth(np.zeros((0, 3)), [])
+        return AlignedPath(np.zeros((0, 3)), [])
     poses = np.array([pose for _, pose in tracked])
     both = [row for row, (index, _) in enumerate(tracked) if index in truth]
     true = np.array([truth[tracked[row][0]] for row in both])
@@ -230,7 +229,7 @@ def beside_truth(episode: Episode, truth: dict[int, Array]) -> PathBesideTruth:
         placed = se3.inverse(poses[0]) @ poses
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
     bounds = [0, *breaks.tolist(), len(placed)]
-    return PathBesideTruth(placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m)
+    return AlignedPath(placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m)
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -18,33 +19,35 @@ from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
-from dynslam_bench.core.settings import Settings, apply_overrides
-from dynslam_bench.core.steering import Steerable
-from dynslam_bench.evaluation.online import OnlineError
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
-
-from .arguments import RENDER_MODES, check_arguments
-from .control import ActionMap
-from .copying import deep_copy
-from .device import resolve_device
-from .episode import Episode, FrameOutcome
-from .info import frame_info
-from .metrics import episode_metrics
-from .observation import (
+from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
+from dynslam_bench.envs.arguments import (
+    RENDER_MODES,
+    Frames,
+    check_arguments,
+    check_frames,
+    check_same_size,
+    open_frames,
+    preprocessing_of,
+    resolve_device,
+)
+from dynslam_bench.envs.episode import Episode, FrameOutcome, FrameTransform, episode_metrics, frame_info, track_one
+from dynslam_bench.envs.spaces import (
+    ActionMap,
     ObservationContext,
     ObservationKind,
+    RewardKind,
+    reward_named,
     rgbd_observation,
     rgbd_space,
     stats_observation,
     stats_space,
 )
-from .one_frame import FrameTransform, track_one
-from .reward import RewardKind, reward_named
-from .source import Frames, check_frames, check_same_size, open_frames, preprocessing_of
+from dynslam_bench.evaluation.online import OnlineError
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.segmentation.build_segmenter import segmentation_source
+from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -55,7 +58,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     **Action.** ``Discrete(1)`` without `control` (pure evaluation); otherwise ``Box(-1, 1, (k,))`` over the named
     online settings (see `ActionMap`), in force from the frame of the step on; an episode begins with `settings`.
-    The tracker then needs the method of `core.steering.Steerable`, ``configure(settings)``: it takes the complete
+    The tracker then needs the method of `core.settings.Reconfigurable`, ``configure(settings)``: it takes the complete
     settings, of which only online fields differ from those it was built with, and ``reset`` brings those back.
 
     **Observation.** ``stats``: float32 ``[24]`` (see `observation.STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
@@ -63,7 +66,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `reward.REWARDS`). Frames without a tracked pose, and
     all remaining ones when `lost_after` ends an episode, cost twice the true motion (``neg_rpe``: not having moved, and
-    having to catch up), or the length of the true way so far (``neg_pose_error``).
+    having to catch up), or the length of the true path so far (``neg_pose_error``).
 
     **Info**: ``frame_index``, ``timestamp``, ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the
     tracker's diagnostics); ``pose`` float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames;
@@ -81,7 +84,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         sequence: Id, path of a folder in TUM layout, or an opened sequence.
         tracker: Id, ``id:value``, ``module:Attr``, ``file.py:Attr``, or a spec.
         settings: Overrides of the tracker's settings by dotted name, or its complete settings.
-        control: Dotted names of the online settings that actions steer.
+        control: Dotted names of the online settings that actions change.
         observation: ``stats`` or ``rgbd``.
         reward: ``neg_rpe`` or ``neg_pose_error``.
         protocol: Id of the protocol of the episode's metrics; its tolerance also joins frames and ground truth.
@@ -94,7 +97,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         camera: Name or file of the camera for folders that do not say theirs; None to read it from the folder.
         threads: Threads that the tracker may use.
         cache: Whether features and network masks come from the stage cache where they are stored; poses and reported
-            stage times are the same either way, and `stats` says what came from it (``cached_stages``).
+            stage times are the same either way, and `stats` says which came from it (``cached_stages``).
 
     Raises:
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
@@ -149,11 +152,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._final: Trajectory | None = None
         self._canvas: Any = None
 
-    # -- what users and runs look at -------------------------------------------------------------------------------
-
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Dotted names of the steered settings, in the order of the action's coordinates."""
+        """Dotted names of the controlled settings, in the order of the action's coordinates."""
         return self._actions.names
 
     @property
@@ -206,8 +207,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             raise TrackerError(f"tracker '{self.tracker_spec.id}' {why}")
         with tracker_code():
             save(Path(path), made_by)
-
-    # -- Gymnasium -------------------------------------------------------------------------------------------------
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode and track frame 0.
@@ -308,7 +307,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if not self.episode.outcomes:
             raise DynslamError("render() was called before reset()")
         if self._canvas is None:
-            from .rendering import Canvas
+            from dynslam_bench.envs.rendering import Canvas
 
             self._canvas = Canvas(self.sequence, self.tracker_spec.label)
         image: NDArray[np.uint8] = self._canvas.draw(self.frame, self.result, self.episode)
@@ -322,9 +321,27 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             with tracker_code():
                 close()
 
-    __deepcopy__ = deep_copy
+    def __deepcopy__(self, memo: dict[int, Any]) -> SlamEnv:
+        """An independent copy at the same frame of the episode, with a tracker of its own.
 
-    # -- inside ----------------------------------------------------------------------------------------------------
+        The sequence, the specs and the settings are shared: they are never changed.
+
+        Raises:
+            TrackerError: The tracker cannot be copied, e.g. because it is an external program.
+        """
+        parts = dict(vars(self), _canvas=None)
+        for name in ("sequence", "_source", "tracker_spec", "protocol", "settings"):
+            memo[id(parts[name])] = parts[name]
+        copied = memo[id(self)] = object.__new__(type(self))
+        try:
+            deepcopy(self._tracker, memo)
+        except Exception as error:
+            raise TrackerError(
+                f"tracker '{self.tracker_spec.id}' cannot be copied in mid-episode: {type(error).__name__}: {error}",
+                "make a second environment, or give the tracker a __deepcopy__",
+            ) from error
+        vars(copied).update(deepcopy(parts, memo))
+        return copied
 
     def _use_settings(self, settings: Mapping[str, Any] | Settings | None) -> None:
         if isinstance(settings, Settings):
@@ -364,7 +381,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 check_same_size(camera, self.sequence.camera)
 
     def _ready_tracker(self) -> Tracker:
-        """The tracker for the current settings and sequence; built anew only if one of them changed."""
+        """The tracker for the current settings and sequence; rebuilt only if one of them changed."""
         key = (self.settings, self.sequence)
         if self._tracker is None or self._tracker_key != key:
             self.close()
@@ -379,9 +396,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             with tracker_code():
                 self._tracker = build_tracker(self.tracker_spec, self.settings, context)
             self._tracker_key = key
-            if self._actions.parameters and not isinstance(self._tracker, Steerable):
+            if self._actions.parameters and not isinstance(self._tracker, Reconfigurable):
                 raise TrackerError(
-                    f"tracker '{self.tracker_spec.id}' cannot be steered in mid-episode",
+                    f"tracker '{self.tracker_spec.id}' cannot change its settings in mid-episode",
                     "it has no configure(settings) method: leave control empty",
                 )
         return self._tracker
@@ -396,12 +413,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _track_next(self, tracker: Tracker) -> None:
         index = self.episode.next_index
         self._final = None
-        done = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
-        frame, result = self.frame, self.result = done.frame, done.result
+        frame, result, timings = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
+        self.frame, self.result = frame, result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose, pose is not None)
         reward = self._reward(error)
-        timings = done.timings
         self.episode.add(FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error, reward))
 
     def _observe(self) -> Any:
@@ -409,6 +425,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         here = outcomes[-1].T_world_cam
         before = outcomes[-2].T_world_cam if len(outcomes) > 1 else None
         motion = se3.inverse(before) @ here if here is not None and before is not None else None
+        context = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
         make = stats_observation if self._observation == "stats" else rgbd_observation
-        seen = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
-        return make(self.frame, self.result, seen)
+        return make(self.frame, self.result, context)

@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+import dynslam_bench as db
 from dynslam_bench.contracts import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
-from dynslam_bench.runs import RunSpec, RunStore, run_many, score
+from dynslam_bench.geometry.trajectory_files import write_tum
 
 FPS, FX, DEPTH_M, STEP_PX = 30.0, 300.0, 2.0, 3
 CAMERA = f"""width = 320
@@ -49,11 +49,9 @@ def write_recording(folder: Path, frames: int) -> None:
 
 def main(folder: str = "my_recording", results: str = "results", frames: int = 60) -> None:
     write_recording(Path(folder), frames)
-    trackers = ["never-move", "orb-slam2"]
-    records = run_many([RunSpec(tracker=name, sequence=folder) for name in trackers], results=results, jobs=2)
-    for record in records:
-        metrics = score(RunStore(results), record).metrics
-        print(f"{record.tracker.id:12} {record.status}: ATE {1000 * metrics['ate_rmse_m']:.1f} mm")
+    for tracker in ("never-move", "orb-slam2"):
+        run = db.run(tracker, folder, results=results)
+        print(f"{tracker:12} {run.status}: ATE {1000 * run.metrics['ate_rmse_m']:.1f} mm")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""PPO steers a tracker's settings at every frame: stable-baselines3, extra [rl].
+"""PPO changes a tracker's settings at every frame: stable-baselines3, extra [rl].
 
     pip install stable-baselines3
     python examples/ppo.py [STEPS]
 
-It trains in rendered rooms and is judged in one that it has not seen, beside the settings as they are. The default of
+It trains on rendered scenes and is evaluated on another one, beside the default settings. The default of
 2000 steps shows that everything works and no more: an agent that is worth its frames takes far longer.
 """
 
@@ -41,15 +41,16 @@ def earned(env: gym.Env, policy) -> float:
     return total
 
 
-def main(steps: str | int = 2000, frames: int = 60, rooms: int = 4) -> None:
-    train = [f"synthetic/sitting_xyz?scene={room}" for room in range(rooms)]
+def main(steps: str | int = 2000, frames: int = 60, scenes: int = 4) -> None:
+    train = [f"synthetic/sitting_xyz?scene={scene}" for scene in range(scenes)]
     env = Monitor(SequenceSampler(make(train[0], frames), train))
     agent = PPO("MlpPolicy", env, n_steps=min(256, int(steps)), batch_size=min(64, int(steps)), seed=0, device="cpu")
     agent.learn(int(steps))
 
-    unseen = make("synthetic/sitting_xyz?scene=100", frames)
-    print(f"settings as they are: {earned(unseen, lambda _: unseen.unwrapped.neutral_action):.4f} m")
-    print(f"after {steps} steps:     {earned(unseen, lambda seen: agent.predict(seen, deterministic=True)[0]):.4f} m")
+    held_out = make("synthetic/sitting_xyz?scene=100", frames)
+    print(f"default settings:   {earned(held_out, lambda _: held_out.unwrapped.neutral_action):.4f} m")
+    learned = earned(held_out, lambda observation: agent.predict(observation, deterministic=True)[0])
+    print(f"after {steps} steps:     {learned:.4f} m")
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ import sys
 
 import optuna
 
-from dynslam_bench.tuning import Block, Outcome, Study
+from dynslam_bench.tuning import Outcome, ProblemInstance, Study
 
 
 def error_and_time(run: Outcome) -> float:
-    """What a run costs: a number above 0, compared with the default's on the same block; less is better."""
+    """What a run costs: a number above 0, compared with the default's on the same instance; less is better."""
     return run.ate_m * run.processor_s**0.1
 
 
@@ -21,7 +21,7 @@ def main(results: str = "results", frames: int = 20) -> None:
     study = Study(
         name="in-python", tracker="constant-velocity", results=results, trials=4, pilot=False, recorded=(),
         tune=[
-            Block("synthetic/walking_xyz?scene=0", frames=(0, frames)),
+            ProblemInstance("synthetic/walking_xyz?scene=0", frames=(0, frames)),
             f"synthetic/sitting_xyz?scene=1-2&frames={frames}",
         ],
         held_out=[f"synthetic/walking_xyz?scene=100-102&frames={frames}"],

@@ -5,13 +5,10 @@
 figures are made of.
 """
 
-from .build_report import ReportPaths, build_report
-from .compare_runs import Comparison, compare
-from .model.board import Board, make_board
-from .model.load import load_board, load_frame
-from .model.report_data import ReportData
-from .model.row import RunRow
-from .publish import Site, publish
+from dynslam_bench.reports.build_report import ReportPaths, Site, build_report, publish
+from dynslam_bench.reports.compare_runs import Comparison, compare
+from dynslam_bench.reports.model.board import Board, load_board, load_frame, make_board
+from dynslam_bench.reports.model.row import ReportData, RunRow
 
 __all__ = [
     "Board",

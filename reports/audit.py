@@ -1,25 +1,22 @@
 """An audit of the paper's own Tables 1 to 3: what can be true of them by arithmetic alone.
 
-Nothing is run. The printed numbers are held against identities that every such table obeys, against the numbers that
-the compared systems' authors published, and against a static camera.
+Nothing is run. The printed numbers are compared with identities that every such table obeys, with the numbers that the
+compared systems' authors published, and with a static camera.
 """
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
+from typing import Any
 
-from dynslam_bench.evaluation.never_move import never_move
-from dynslam_bench.evaluation.pairs import select_pairs
+from dynslam_bench.evaluation.ape import static_camera
 from dynslam_bench.evaluation.protocol import RPESpec
+from dynslam_bench.evaluation.rpe import select_pairs
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .model.published import Claimed, claimed, published
-from .tables.table import Column, Table, TableCell, to_markdown
+from dynslam_bench.reports.model.published import claimed, lines_of, published, static_camera_errors
+from dynslam_bench.reports.tables.table import Table, TableCell, number, numbers, texts, to_markdown
 
 OURS = "EMFOA-OFT-SLAM"
 _HALF_DIGIT = 0.5
@@ -87,16 +84,10 @@ class AuditReport:
     def summary(self) -> Table:
         """How many numbers pass each check."""
         rows = [
-            [
-                TableCell(check),
-                TableCell(meaning),
-                TableCell(str(len(self.of(check))), value=len(self.of(check))),
-                TableCell(str(len(self.failed(check))), value=len(self.failed(check))),
-            ]
+            [TableCell(check), TableCell(meaning), number(len(self.of(check))), number(len(self.failed(check)))]
             for check, meaning in CHECKS.items()
         ]
-        columns = [Column("check", numeric=False), Column("what has to hold", numeric=False), Column("numbers"),
-                   Column("fail")]  # fmt: skip
+        columns = [*texts("check", "what has to hold"), *numbers("numbers", "fail")]
         caption = (
             "Claimed by the paper, audited by arithmetic; no system was run for it. "
             f"{sum(not f.holds for f in self.findings)} of {len(self.findings)} findings do not hold, so none of the "
@@ -110,20 +101,19 @@ class AuditReport:
         rows = [
             [
                 TableCell(finding.check),
-                TableCell(str(finding.table), value=finding.table),
+                number(finding.table),
                 TableCell(finding.system),
                 TableCell(finding.sequence),
                 TableCell(finding.quantity),
-                TableCell(f"{finding.printed:.4f}", value=finding.printed),
-                TableCell(f"{finding.expected:.4f}", value=finding.expected),
+                number(finding.printed, ".4f"),
+                number(finding.expected, ".4f"),
                 TableCell(finding.remark),
             ]
             for finding in shown
         ]
         columns = [
-            Column("check", numeric=False), Column("table"), Column("system", numeric=False),
-            Column("sequence", numeric=False), Column("quantity", numeric=False), Column("printed"),
-            Column("held against"), Column("remark", numeric=False),
+            *texts("check"), *numbers("table"), *texts("system", "sequence", "quantity"),
+            *numbers("printed", "held against"), *texts("remark"),
         ]  # fmt: skip
         what = "Numbers that do not hold" if failed_only else "All findings"
         return Table("audit_findings", what, "Metres, percent or milliseconds, as printed.", columns, rows)
@@ -143,140 +133,120 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
     Returns:
         One finding for every number that a check applies to.
     """
-    values = {(c.table, c.system, c.sequence, c.quantity): c for c in claimed() if c.kind == "value"}
-    findings: list[Finding] = []
-    for (table, system, sequence, quantity), rmse in values.items():
-        if quantity.endswith("_rmse"):
-            findings += _statistics(values, table, system, sequence, quantity, rmse)
-    findings += [_improvement(values, printed) for printed in claimed() if printed.kind == "improvement_percent"]
-    still = _stored_never_move() | _computed_never_move(ground_truth or {})
-    for key, rmse in values.items():
-        findings += _against_not_moving(still, *key, rmse)
-        findings += _against_published(*key, rmse)
-        findings += _accuracy(values, *key, rmse)
-        findings += _time(*key, rmse)
+    values = {(c.table, c.system, c.sequence, c.quantity): c for c in lines_of(claimed().query("kind == 'value'"))}
+    static = static_camera_errors() | _computed_static_camera(ground_truth or {})
+    findings = []
+    for key, printed in values.items():
+        checks = (
+            *_statistics(values, key),
+            *_against_static_camera(static, key, printed.value),
+            *_against_published(key, printed.value),
+            *_accuracy(values, key),
+            *_time(key, printed.value),
+        )
+        findings += [Finding(check, *key, printed.value, *outcome) for check, outcome in checks]
+    findings += _improvements(values)
     order = list(CHECKS)
     return AuditReport(tuple(sorted(findings, key=lambda finding: (order.index(finding.check), finding.table))))
 
 
-Values = Mapping[tuple[int, str, str, str], Claimed]
+Key = tuple[int, str, str, str]
+"""Table, system, sequence and quantity of a printed number."""
+Values = Mapping[Key, Any]
+"""Printed numbers as lines of `claimed`."""
+Checked = tuple[str, tuple[float, bool, str]]
+"""Check; what the number has to be, whether it holds, and why."""
 
 
-def _statistics(values: Values, table: int, system: str, sequence: str, quantity: str, rmse: Claimed) -> list[Finding]:
+def _statistics(values: Values, key: Key) -> Iterator[Checked]:
+    """RMSE^2 = mean^2 + StD^2, up to the rounding of all three; hence RMSE >= mean."""
+    table, system, sequence, quantity = key
+    if not quantity.endswith("_rmse"):
+        return
+    rmse = values[key]
     metric = quantity.removesuffix("_rmse")
-    mean = values[table, system, sequence, f"{metric}_mean"].value
-    std = values[table, system, sequence, f"{metric}_std"].value
+    mean, std = (values[table, system, sequence, f"{metric}_{name}"].value for name in ("mean", "std"))
     expected = math.hypot(mean, std)
     rounding = _HALF_DIGIT * 10.0**-rmse.digits
     tolerance = rounding * (1 + (mean + std) / expected)  # of the printed RMSE, and of what follows from the others
     off = rmse.value - expected
+    yield "rmse-identity", (expected, abs(off) <= tolerance, f"off by {1000 * off:+.1f} mm")
     possible = rmse.value >= mean - 2 * rounding
-    return [
-        Finding(
-            "rmse-identity", table, system, sequence, quantity, rmse.value, expected, abs(off) <= tolerance,
-            f"off by {1000 * off:+.1f} mm",
-        ),
-        Finding(
-            "rmse-at-least-mean", table, system, sequence, quantity, rmse.value, mean, possible,
-            "" if possible else "below the mean",
-        ),
-    ]  # fmt: skip
+    yield "rmse-at-least-mean", (mean, possible, "" if possible else "below the mean")
 
 
-def _improvement(values: Values, printed: Claimed) -> Finding:
-    baseline = values[printed.table, printed.system, printed.sequence, printed.quantity].value
-    ours = values[printed.table, OURS, printed.sequence, printed.quantity].value
-    expected = 100 * (baseline - ours) / baseline
-    holds = abs(printed.value - expected) <= _PERCENT_TOLERANCE
-    remark = ""
-    if not holds:
-        repeated = [
-            other
-            for other in claimed()
-            if other.kind == printed.kind
-            and (other.table, other.system, other.quantity) == (printed.table, printed.system, printed.quantity)
-            and other.sequence != printed.sequence
-            and abs(other.value - printed.value) <= _PERCENT_TOLERANCE
+def _improvements(values: Values) -> Iterator[Finding]:
+    printed = claimed().query("kind == 'improvement_percent'")
+    for row in lines_of(printed):
+        baseline, ours = (values[row.table, system, row.sequence, row.quantity].value for system in (row.system, OURS))
+        expected = 100 * (baseline - ours) / baseline
+        holds = abs(row.value - expected) <= _PERCENT_TOLERANCE
+        same = printed[
+            (printed["table"] == row.table)
+            & (printed["system"] == row.system)
+            & (printed["quantity"] == row.quantity)
+            & (printed["sequence"] != row.sequence)
+            & ((printed["value"] - row.value).abs() <= _PERCENT_TOLERANCE)
         ]
-        remark = f"repeats the column of {repeated[0].sequence}" if repeated else "does not follow from the table"
-    return Finding(
-        "improvement", printed.table, printed.system, printed.sequence, printed.quantity, printed.value, expected,
-        holds, remark,
-    )  # fmt: skip
+        repeated = (
+            f"repeats the column of {same['sequence'].iloc[0]}" if len(same) else "does not follow from the table"
+        )
+        yield Finding(
+            "improvement", row.table, row.system, row.sequence, row.quantity, row.value, expected, holds,
+            "" if holds else repeated,
+        )  # fmt: skip
 
 
-def _against_not_moving(
-    still: Mapping[tuple[str, str], float], table: int, system: str, sequence: str, quantity: str, printed: Claimed
-) -> list[Finding]:
-    reference = {"ape_rmse": "ape_rmse", "rpe_rmse": "rpe_1s"}.get(quantity)
-    if reference is None or (sequence, reference) not in still:
-        return []
-    expected = still[sequence, reference]
+def _against_static_camera(static: Mapping[tuple[str, str], float], key: Key, printed: float) -> Iterator[Checked]:
+    _, _, sequence, quantity = key
+    metric = {"ape_rmse": "ape_rmse", "rpe_rmse": "rpe_1s"}.get(quantity, "")
+    if (sequence, metric) not in static:
+        return
     remark = "" if quantity == "ape_rmse" else "held against 1 s; the paper states no delta"
-    if quantity == "rpe_rmse" and (sequence, "rpe_1f") in still:
-        remark += f" (over 1 frame not moving scores {still[sequence, 'rpe_1f']:.4f})"
-    return [
-        Finding(
-            "better-than-not-moving", table, system, sequence, quantity, printed.value, expected,
-            printed.value < expected, remark,
-        )
-    ]  # fmt: skip
+    if quantity == "rpe_rmse" and (sequence, "rpe_1f") in static:
+        remark += f" (over 1 frame not moving scores {static[sequence, 'rpe_1f']:.4f})"
+    yield "better-than-not-moving", (static[sequence, metric], printed < static[sequence, metric], remark)
 
 
-def _against_published(table: int, system: str, sequence: str, quantity: str, printed: Claimed) -> list[Finding]:
-    if quantity != "ape_rmse":
-        return []
-    known = [p for p in published() if p.system == system and p.sequence == sequence and p.metric == "ate_rmse_m"]
-    if not known:
-        return []
-    low, high = min(p.value for p in known), max(p.value for p in known)
-    nearest = min(max(printed.value, low), high)
-    factor = printed.value / nearest
+def _against_published(key: Key, printed: float) -> Iterator[Checked]:
+    _, system, sequence, quantity = key
+    frame = published().query("metric == 'ate_rmse_m'")
+    values = frame[(frame["system"] == system) & (frame["sequence"] == sequence)]["value"]
+    if quantity != "ape_rmse" or values.empty:
+        return
+    low, high = float(values.min()), float(values.max())
+    nearest = min(max(printed, low), high)
+    factor = printed / nearest
     span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
-    return [
-        Finding(
-            "published", table, system, sequence, quantity, printed.value, nearest, 0.5 <= factor <= 2,
-            f"{factor:.1f} times what is published ({span} m in {len(known)} tables)",
-        )
-    ]  # fmt: skip
+    remark = f"{factor:.1f} times what is published ({span} m in {len(values)} tables)"
+    yield "published", (nearest, 0.5 <= factor <= 2, remark)
 
 
-def _accuracy(values: Values, table: int, system: str, sequence: str, quantity: str, printed: Claimed) -> list[Finding]:
+def _accuracy(values: Values, key: Key) -> Iterator[Checked]:
+    table, system, sequence, quantity = key
+    printed = values[key].value
     if quantity == "accuracy_percent":
         expected = 100 - values[table, system, sequence, "error_percent"].value
-        holds = abs(printed.value - expected) < 0.006
-        return [Finding("accuracy", table, system, sequence, quantity, printed.value, expected, holds, "100 - error")]
+        yield "accuracy", (expected, abs(printed - expected) < 0.006, "100 - error")
     if quantity == "error_percent":
         expected = 100 * values[1, system, sequence, "ape_std"].value
-        same = abs(printed.value - expected) <= _ERROR_TOLERANCE
+        same = abs(printed - expected) <= _ERROR_TOLERANCE
         remark = "it is 100 times the StD of Table 1 in metres, which is no accuracy" if same else ""
-        return [Finding("accuracy", table, system, sequence, quantity, printed.value, expected, not same, remark)]
-    return []
+        yield "accuracy", (expected, not same, remark)
 
 
-def _time(table: int, system: str, sequence: str, quantity: str, printed: Claimed) -> list[Finding]:
-    if quantity != "time_ms" or system != OURS:
-        return []
-    return [
-        Finding(
-            "time", table, system, sequence, quantity, printed.value, _MASK_RCNN_MS, printed.value >= _MASK_RCNN_MS,
-            "less than the published time of its Mask R-CNN alone (DynaSLAM's: 195 ms)",
-        )
-    ]  # fmt: skip
+def _time(key: Key, printed: float) -> Iterator[Checked]:
+    if key[3] == "time_ms" and key[1] == OURS:
+        remark = "less than the published time of its Mask R-CNN alone (DynaSLAM's: 195 ms)"
+        yield "time", (_MASK_RCNN_MS, printed >= _MASK_RCNN_MS, remark)
 
 
-@cache
-def _stored_never_move() -> dict[tuple[str, str], float]:
-    text = (files("dynslam_bench.reports.model") / "data" / "never_move.csv").read_text(encoding="utf-8")
-    return {(line["sequence"], line["metric"]): float(line["value"]) for line in csv.DictReader(text.splitlines())}
-
-
-def _computed_never_move(ground_truth: Mapping[str, Trajectory]) -> dict[tuple[str, str], float]:
-    found: dict[tuple[str, str], float] = {}
+def _computed_static_camera(ground_truth: Mapping[str, Trajectory]) -> dict[tuple[str, str], float]:
+    errors: dict[tuple[str, str], float] = {}
     for sequence, truth in ground_truth.items():
-        found[sequence, "ape_rmse"] = never_move(truth)["constant_rmse_m"]
+        errors[sequence, "ape_rmse"] = static_camera(truth)["constant_rmse_m"]
         pairs = select_pairs(truth.timestamps, truth.T_world_cam, RPESpec(delta=1, unit="s", max_pairs=0))
         if len(pairs):
             moved = truth.positions[pairs[:, 1]] - truth.positions[pairs[:, 0]]
-            found[sequence, "rpe_1s"] = float(math.sqrt((moved**2).sum(axis=1).mean()))
-    return found
+            errors[sequence, "rpe_1s"] = float(math.sqrt((moved**2).sum(axis=1).mean()))
+    return errors

@@ -2,7 +2,7 @@
 
 `Study` is all of it from Python: run, pilot, screen, finish, and a stored one as a pandas frame. Its steps by
 themselves: `read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on
-held-out blocks, `write_page` shows it all. `search_space` and `suggest` serve studies of your own.
+held-out instances, `write_page` shows it all. `search_space` and `suggest` serve studies of your own.
 """
 
 from __future__ import annotations
@@ -10,38 +10,37 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .blocks import Block, parse_blocks
-    from .emfoa_sampler import EmfoaSampler
-    from .evaluate import Outcome
-    from .final_runs import finish
-    from .page import write_page
-    from .presets import read_preset_text
-    from .python_study import Study
-    from .space import search_space, suggest
-    from .starting import pilot_of, run_study, screen_study
-    from .study import StudyEvent, Tuner
-    from .study_file import SpaceSpec, StudySpec, read_study
-    from .summary import StudySummary
+    from dynslam_bench.tuning.evaluate import Outcome
+    from dynslam_bench.tuning.final_runs import finish
+    from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
+    from dynslam_bench.tuning.page import write_page
+    from dynslam_bench.tuning.presets import read_preset_text
+    from dynslam_bench.tuning.samplers import EmfoaSampler
+    from dynslam_bench.tuning.space import search_space, suggest
+    from dynslam_bench.tuning.study import Study, pilot_of, run_study, screen_study
+    from dynslam_bench.tuning.study_file import SpaceSpec, StudySpec, read_study
+    from dynslam_bench.tuning.summary import StudySummary
+    from dynslam_bench.tuning.tuner import StudyEvent, Tuner
 
 _HOMES = {
-    "blocks": ("Block", "parse_blocks"),
-    "emfoa_sampler": ("EmfoaSampler",),
+    "instances": ("ProblemInstance", "parse_instances"),
+    "samplers": ("EmfoaSampler",),
     "evaluate": ("Outcome",),
     "final_runs": ("finish",),
     "page": ("write_page",),
     "presets": ("read_preset_text",),
-    "python_study": ("Study",),
+    "study": ("Study", "pilot_of", "run_study", "screen_study"),
     "space": ("search_space", "suggest"),
-    "starting": ("pilot_of", "run_study", "screen_study"),
-    "study": ("StudyEvent", "Tuner"),
+    "_": (),
+    "tuner": ("StudyEvent", "Tuner"),
     "study_file": ("SpaceSpec", "StudySpec", "read_study"),
     "summary": ("StudySummary",),
 }
 
 __all__ = [
-    "Block",
     "EmfoaSampler",
     "Outcome",
+    "ProblemInstance",
     "SpaceSpec",
     "Study",
     "StudyEvent",
@@ -49,7 +48,7 @@ __all__ = [
     "StudySummary",
     "Tuner",
     "finish",
-    "parse_blocks",
+    "parse_instances",
     "pilot_of",
     "read_preset_text",
     "read_study",

@@ -1,14 +1,15 @@
-"""Before a study: what its blocks could show at all, and what it would take to show more.
+"""Before a study: what its instances could show at all, and what it would take to show more.
 
-How far two configurations differ on one block is mostly chaos: the same settings, begun a frame later, come out
-otherwise. The pilot measures that spread with a few changed settings, and works out the smallest effect that the study
-could tell from nothing (one-sided 2.5 %, with 80 % of the studies finding it).
+How far two configurations differ on one instance is mostly chance: a start one frame later changes the result. The
+pilot measures that spread with a few changed settings, and computes the smallest effect that the study could tell from
+nothing (one-sided 2.5 %, with 80 % of the studies finding it).
 """
 
 from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -19,11 +20,10 @@ from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Parameter, Scalar
-
-from .blocks import Block, scenes
-from .evaluate import BlockFailedError
-from .objectives import Objective, Outcomes
-from .screening_plan import live, stepped, toward
+from dynslam_bench.tuning.evaluate import InstanceFailedError
+from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.objectives import Objective, Outcomes
+from dynslam_bench.tuning.screening import live, stepped, toward
 
 EFFECTS = (0.05, 0.10, 0.20)
 """Gains, as shares, of which the pilot says what they would take."""
@@ -46,18 +46,18 @@ class Need(Record):
     Attributes:
         effect: The gain, as a share.
         scenes: Different scenes, each with as many starts as in the pilot.
-        blocks: Runs of one configuration on them.
+        instances: Runs of one configuration on them.
         minutes: Wall-clock time of those, at the pilot's seconds a run and its jobs.
     """
 
     effect: float
     scenes: int
-    blocks: int
+    instances: int
     minutes: float
 
 
 class Pilot(Record):
-    """What a pilot found; all spreads are of natural logarithms of ratios.
+    """The result of a pilot; all spreads are of natural logarithms of ratios.
 
     Attributes:
         objective: What the ratio is one of.
@@ -66,7 +66,7 @@ class Pilot(Record):
         within: Standard deviation between starts of one scene.
         between: Standard deviation between scenes, that within taken off.
         run_s: Seconds of one run.
-        detectable: Smallest gain, as a share, that all blocks of the split could tell from nothing.
+        detectable: Smallest gain, as a share, that all instances of the split could tell from nothing.
         needs: What `EFFECTS` would take.
     """
 
@@ -99,16 +99,18 @@ class Pilot(Record):
     def way_out(self) -> str:
         """What a gain of a fifth would take."""
         need = self.needs[-1]
-        return f"{100 * need.effect:.0f} % would take {need.scenes} scenes ({need.blocks} runs, {need.minutes:.0f} min)"
+        return (
+            f"{100 * need.effect:.0f} % would take {need.scenes} scenes ({need.instances} runs, {need.minutes:.0f} min)"
+        )
 
 
-def spread(logs: Mapping[Block, float]) -> tuple[float, float]:
+def spread(logs: Mapping[ProblemInstance, float]) -> tuple[float, float]:
     """Standard deviations of one configuration's log ratios: between starts of a scene, and between scenes.
 
     One-way analysis of variance; the scenes' part is free of that of the starts, and 0 where it would be negative. With
     one start a scene the two cannot be told apart, and all counts as between scenes.
     """
-    groups = [np.array([logs[block] for block in blocks]) for blocks in scenes(logs).values()]
+    groups = [np.array([logs[instance] for instance in instances]) for instances in scenes(logs).values()]
     counts = np.array([len(group) for group in groups])
     inside = sum(float(((group - group.mean()) ** 2).sum()) for group in groups)
     free = int((counts - 1).sum())
@@ -128,16 +130,9 @@ def detectable(within: float, between: float, count: int, starts: float) -> floa
 
 
 def scenes_needed(effect: float, within: float, between: float, starts: float) -> int:
-    """How many scenes tell a gain from nothing."""
-    low, high = 1, 2
-    while detectable(within, between, high, starts) > effect:
-        low, high = high, 2 * high
-        if high > _MOST_SCENES:
-            return high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if detectable(within, between, middle, starts) <= effect else (middle, high)
-    return high
+    """The fewest scenes that tell a gain from nothing, at most `_MOST_SCENES`."""
+    counts = range(2, _MOST_SCENES)
+    return 2 + bisect_left(counts, True, key=lambda count: detectable(within, between, count, starts) <= effect)
 
 
 def judge_pilot(
@@ -147,17 +142,17 @@ def judge_pilot(
     *,
     run_s: float,
     jobs: int = 1,
-    split: Sequence[Block] | None = None,
+    split: Sequence[ProblemInstance] | None = None,
 ) -> Pilot:
     """Make a pilot's numbers of its runs.
 
     Args:
         objective: Whose ratios are looked at.
         default: The default settings' outcomes.
-        changed: Outcomes of changed settings, on blocks that the default ran on.
+        changed: Outcomes of changed settings, on instances that the default ran on.
         run_s: Seconds of one run.
         jobs: Runs at a time.
-        split: Blocks that the study would judge on; those of the pilot if None.
+        split: Instances that the study would judge on; those of the pilot if None.
 
     Raises:
         StudyError: Too few scenes to tell a spread, or the changed settings changed nothing.
@@ -169,15 +164,14 @@ def judge_pilot(
             f"a pilot over {count} scene{'s' * (count != 1)} says nothing, it takes {FEWEST}",
             'name more scenes, e.g. "synthetic/walking_xyz?scene=0-5&frames=80&offsets=0-2"',
         )
-    found = np.array([spread(logs) for logs in pairs])
-    within, between = (float(value) for value in np.sqrt((found**2).mean(axis=0)))
+    within, between = np.sqrt(np.square([spread(logs) for logs in pairs]).mean(axis=0)).tolist()
     judged = scenes(split if split is not None else list(pairs[0]))
     starts = sum(map(len, judged.values())) / len(judged)
     needs = []
     for effect in EFFECTS:
-        needed = scenes_needed(effect, within, between, starts)
-        blocks = math.ceil(needed * starts)
-        needs.append(Need(effect=effect, scenes=needed, blocks=blocks, minutes=math.ceil(blocks / jobs) * run_s / 60))
+        count = scenes_needed(effect, within, between, starts)
+        runs = math.ceil(count * starts)
+        needs.append(Need(effect=effect, scenes=count, instances=runs, minutes=math.ceil(runs / jobs) * run_s / 60))
     return Pilot(
         objective=objective.what, scenes=len(judged), starts=round(starts, 2), within=within,
         between=between, run_s=run_s, detectable=detectable(within, between, len(judged), starts), needs=needs,
@@ -197,39 +191,39 @@ def refuse_hopeless(pilot: Pilot) -> None:
 def run_pilot(
     space: Sequence[Parameter],
     base: Mapping[str, Any],
-    run: Callable[[Mapping[str, Any], Sequence[Block]], Outcomes],
-    blocks: Sequence[Block],
+    run: Callable[[Mapping[str, Any], Sequence[ProblemInstance]], Outcomes],
+    instances: Sequence[ProblemInstance],
     objective: Objective,
     *,
     seed: int = 0,
     jobs: int = 1,
-    split: Sequence[Block] | None = None,
+    split: Sequence[ProblemInstance] | None = None,
 ) -> Pilot:
     """Run the default and a few changed settings, and judge what they say.
 
     Args:
         space: The study's settings.
         base: Default value of every setting, dotted name to value.
-        run: Gives the outcomes of values of the space on blocks, `jobs` at a time.
-        blocks: What the study tunes on; `some_of` them are run.
+        run: Gives the outcomes of values of the space on instances, `jobs` at a time.
+        instances: What the study tunes on; `some_of` them are run.
         objective: See `judge_pilot`, as `split` is.
         seed: Of the changes.
         jobs: Runs at a time.
-        split: Blocks that the study would judge on.
+        split: Instances that the study would judge on.
 
     Raises:
         StudyError: See `judge_pilot`.
     """
-    chosen = some_of(blocks)
+    chosen = some_of(instances)
     try:
         default = run({}, chosen)
-    except BlockFailedError as error:
+    except InstanceFailedError as error:
         raise StudyError(f"the default settings fail: {error.args[0]}", "a study needs a default that runs") from error
     began, changed, reason = time.perf_counter(), [], ""
     for number in range(CONFIGURATIONS):
         try:
             changed.append(run(small_change(space, base, stream(seed, "pilot", number)), chosen))
-        except BlockFailedError as error:
+        except InstanceFailedError as error:
             reason = str(error.args[0])
     if not changed:
         raise StudyError(f"no pilot: all settings tried near the default fail: {reason}", "narrow the space")
@@ -237,25 +231,25 @@ def run_pilot(
     return judge_pilot(objective, default, changed, run_s=run_s, jobs=jobs, split=split)
 
 
-def some_of(blocks: Sequence[Block]) -> list[Block]:
+def some_of(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
     """The first starts of the first scenes: `PILOT_STARTS` of `PILOT_SCENES` at most."""
-    groups = list(scenes(blocks).values())[:PILOT_SCENES]
-    return [block for group in groups for block in group[:PILOT_STARTS]]
+    groups = list(scenes(instances).values())[:PILOT_SCENES]
+    return [instance for group in groups for instance in group[:PILOT_STARTS]]
 
 
 def small_change(space: Sequence[Parameter], base: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Scalar]:
-    """Settings near the default: numbers part of the way to drawn ones; choices too where there are no numbers."""
+    """Settings near the default: numbers moved toward drawn ones; choices too where there are no numbers."""
     usable = live(space, base)
-    found = {each.name: toward(each, base[each.name], rng) for each in usable}
-    if all(found[each.name] == base[each.name] for each in usable):
-        found = {each.name: stepped(each, base[each.name], rng) for each in usable}
-    return found
+    changed = {parameter.name: toward(parameter, base[parameter.name], rng) for parameter in usable}
+    if any(changed[name] != base[name] for name in changed):
+        return changed
+    return {parameter.name: stepped(parameter, base[parameter.name], rng) for parameter in usable}
 
 
-def _paired(objective: Objective, outcomes: Outcomes, default: Outcomes) -> dict[Block, float]:
-    """Log ratio on each block that both ran."""
+def _paired(objective: Objective, outcomes: Outcomes, default: Outcomes) -> dict[ProblemInstance, float]:
+    """Log ratio on each instance that both ran."""
     return {
-        block: math.log(objective.cost(outcome) / objective.cost(default[block]))
-        for block, outcome in outcomes.items()
-        if block in default
+        instance: math.log(objective.cost(outcome) / objective.cost(default[instance]))
+        for instance, outcome in outcomes.items()
+        if instance in default
     }

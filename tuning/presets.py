@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
+import json
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.reading import read_text
 from dynslam_bench.core.records import write_atomic
-
-from .preset import preset_text
-from .seen import seen_note
-from .storage import study_folder
-from .study import Tuner
-from .study_file import StudySpec
-from .summary import StudySummary, worth
-from .trials import best_trials
+from dynslam_bench.tuning.splits import seen_note
+from dynslam_bench.tuning.storage import study_folder
+from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.summary import StudySummary, worth
+from dynslam_bench.tuning.trials import best_trials
+from dynslam_bench.tuning.tuner import Tuner
 
 
 def write_presets(tuner: Tuner, summary: StudySummary) -> None:
     """Write every pick as a preset: tuned settings alone, with what they are worth and where that was seen."""
     spec = tuner.spec
     for name, number in summary.picks.items():
-        candidate = next((each for each in summary.candidates if each.trial == number), None)
-        found = summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes)
+        candidate = next((one for one in summary.candidates if one.trial == number), None)
+        remark = summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes)
         text = preset_text(
             {} if candidate is None else candidate.params,
             spec.tracker,
-            " ".join(filter(None, (found, seen_note(summary.seen)))),
+            " ".join(filter(None, (remark, seen_note(summary.seen)))),
             fixed=spec.space.fixed,
             tuned_on=[*summary.tune, *summary.confirm],
             judged_on=[*summary.held_out, *summary.recorded] if candidate is not None else (),
@@ -54,8 +56,70 @@ def read_preset_text(spec: StudySpec, results: Path | str = "results", pick: str
         return read_text(folder / f"{pick}.toml", kind=StudyError)
     if pick != "best":
         raise StudyError(f"study '{spec.name}' is not finished: no presets yet", "dynslam-bench tune run STUDY.toml")
-    found = best_trials(Tuner(spec, results, reading=True).study, 1)
-    if not found:
+    best = best_trials(Tuner(spec, results, reading=True).study, 1)
+    if not best:
         raise StudyError(f"study '{spec.name}' has no finished trial", "dynslam-bench tune run STUDY.toml")
-    remark = f"Trial {found[0].number}, the best so far; not judged on blocks that no trial has seen."
-    return preset_text(found[0].params, spec.tracker, remark, fixed=spec.space.fixed)
+    remark = f"Trial {best[0].number}, the best so far; not judged on instances that no trial has seen."
+    return preset_text(best[0].params, spec.tracker, remark, fixed=spec.space.fixed)
+
+
+# The text of a preset.
+
+
+def preset_text(
+    tuned: Mapping[str, Any],
+    tracker: str,
+    remark: str,
+    *,
+    fixed: Mapping[str, Any] | None = None,
+    tuned_on: Sequence[str] = (),
+    judged_on: Sequence[str] = (),
+) -> str:
+    """TOML text of tuned settings, dotted name to value, grouped into tables.
+
+    What a study had fixed, for example the source of its masks, is only a comment, so that the preset runs wherever
+    the tracker does.
+
+    Args:
+        tuned: The tuned settings; empty for the default.
+        tracker: For which tracker.
+        remark: A line on what they are worth.
+        fixed: What every run of the study had besides.
+        tuned_on: Instances that trials and choice saw.
+        judged_on: Instances that judged.
+    """
+    remarks = [remark]
+    if tuned_on:
+        remarks.append(f"Tuned on {_listed(tuned_on)}.")
+    if judged_on:
+        remarks.append(f"Judged on {_listed(judged_on)}.")
+    if fixed:
+        values = ", ".join(f"{name} = {json.dumps(value)}" for name, value in sorted(fixed.items()))
+        remarks.append(f"Fixed in that study, not part of these settings: {values}.")
+    head = [f"settings of {tracker}", *(line for text in remarks for line in textwrap.wrap(text, 100))]
+    return "\n".join([*(f"# {line}" for line in head), "", *_tables(tuned)])
+
+
+def _tables(tuned: Mapping[str, Any]) -> Iterable[str]:
+    groups: dict[str, list[tuple[str, Any]]] = {}
+    for name, value in sorted(tuned.items()):
+        group, _, leaf = name.rpartition(".")
+        groups.setdefault(group, []).append((leaf, value))
+    for group in sorted(groups):
+        if group:
+            yield f"[{group}]"
+        yield from (f"{leaf} = {json.dumps(value)}" for leaf, value in groups[group])
+        yield ""
+
+
+def _listed(instances: Sequence[str]) -> str:
+    """Instances by their sequences, with their number."""
+    names = list(dict.fromkeys(_scene(text) for text in instances))
+    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return f"{len(instances)} instance{'s' * (len(instances) != 1)} of {shown}"
+
+
+def _scene(instance: str) -> str:
+    """A instance's text without its options but for the scene."""
+    name, _, query = instance.partition("?")
+    return "?".join([name, *(option for option in query.split("&") if option.startswith("scene="))])

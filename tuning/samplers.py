@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import io
+import pickle
 import warnings
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import Any
 
+import numpy as np
 import optuna
-from optuna.distributions import BaseDistribution
+from numpy.typing import NDArray
+from optuna.distributions import BaseDistribution, CategoricalDistribution
+from optuna.search_space import IntersectionSearchSpace
+from optuna.study import Study
+from optuna.study._study_direction import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.seeding import stream
+from dynslam_bench.flow.moth_flame import EMFOA, flames_left, flight, moth_positions, opposites
+from dynslam_bench.tuning.study_file import StudySpec
 
-from . import cmaes_state
-from .emfoa_sampler import EmfoaSampler
-from .study_file import StudySpec
-
-CONSTRAINTS = "constraints"
-"""User attribute of a trial: how far each constraint is violated; <= 0 is fulfilled."""
 _STARTUP_TRIALS = 8
 
 
@@ -34,7 +37,7 @@ def build_sampler(spec: StudySpec) -> StreamedSampler:
 
 
 class StreamedSampler(optuna.samplers.BaseSampler):
-    """Makes a sampler anew for each trial, seeded by the study's seed and the trial's number.
+    """Makes a sampler for each trial, seeded by the study's seed and the trial's number.
 
     Numbers are given out by the storage, so no two workers, and no worker that goes on later, draw from one stream, and
     a study with one worker gives the same trials again.
@@ -48,45 +51,37 @@ class StreamedSampler(optuna.samplers.BaseSampler):
         self._build, self._seed = build, seed
         self._samplers: dict[int, optuna.samplers.BaseSampler] = {}
 
-    def _of(self, trial: FrozenTrial) -> optuna.samplers.BaseSampler:
-        if trial.number not in self._samplers:
-            seed = int(stream(self._seed, "sampler", trial.number).integers(2**31))
-            self._samplers[trial.number] = self._build(seed)
-        return self._samplers[trial.number]
-
     def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
-        """See Optuna."""
-        self._of(trial).before_trial(study, trial)
+        """Make the trial's sampler."""
+        seed = int(stream(self._seed, "sampler", trial.number).integers(2**31))
+        self._samplers[trial.number] = self._build(seed)
+        self._samplers[trial.number].before_trial(study, trial)
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         """See Optuna."""
-        return self._of(trial).infer_relative_search_space(study, trial)
+        return self._samplers[trial.number].infer_relative_search_space(study, trial)
 
     def sample_relative(
         self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
         """See Optuna."""
-        return self._of(trial).sample_relative(study, trial, search_space)
+        return self._samplers[trial.number].sample_relative(study, trial, search_space)
 
     def sample_independent(
         self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
         """See Optuna."""
-        return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
+        return self._samplers[trial.number].sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
         self, study: optuna.Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
-        """See Optuna."""
-        self._of(trial).after_trial(study, trial, state, values)
-        del self._samplers[trial.number]
+        """Drop the trial's sampler; a trial of a dead worker of another process has none here."""
+        if sampler := self._samplers.pop(trial.number, None):
+            sampler.after_trial(study, trial, state, values)
 
 
 def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
-    constrained = spec.min_coverage is not None or spec.min_fps is not None
-    options: dict[str, Any] = {"seed": seed}
-    if constrained and not hasattr(optuna.trial.Trial, "set_constraint"):
-        options["constraints_func"] = violations  # Optuna < 5
     if spec.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     if spec.sampler == "tpe":
@@ -97,12 +92,12 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
                 multivariate=True,
                 group=True,
                 constant_liar=True,
-                **options,
+                seed=seed,
             )
     if spec.sampler == "nsga2":
-        return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), **options)
+        return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed)
     if spec.sampler == "gp":
-        return optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, **options)
+        return optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed)
     if len(spec.objectives) > 1:
         raise StudyError(
             f"sampler '{spec.sampler}' takes one objective, the study has {len(spec.objectives)}",
@@ -111,24 +106,207 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
     if spec.sampler == "cmaes":
         if find_spec("cmaes") is None:
             raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
-        cmaes_state.restrict()
-        return optuna.samplers.CmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS)
+        return RestrictedCmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS)
     return EmfoaSampler(seed=seed, n_trials=spec.trials)
 
 
-def violations(trial: FrozenTrial) -> Sequence[float]:
-    """The constraint values that a finished trial carries, for samplers of Optuna before 5."""
-    return [float(value) for value in trial.user_attrs.get(CONSTRAINTS, {}).values()]
-
-
-def set_constraints(trial: optuna.trial.Trial, values: dict[str, float], *, final: bool) -> None:
-    """Attach constraint values to a trial, in whichever way this Optuna knows; it takes only the `final` ones."""
-    trial.set_user_attr(CONSTRAINTS, values)
-    if final and hasattr(trial, "set_constraint"):
-        for name, value in values.items():
-            trial.set_constraint(name, value)
-
-
 def is_feasible(trial: FrozenTrial) -> bool:
-    """Whether a finished trial fulfils all constraints."""
-    return all(value <= 0 for value in trial.user_attrs.get(CONSTRAINTS, {}).values())
+    """Whether a trial fulfils all constraints."""
+    return all(value <= 0 for value in trial.constraints.values())
+
+
+# CMA-ES: Optuna keeps its state in the storage as a pickle, which anybody who writes to the storage could replace.
+
+_NUMPY = ("numpy._core", "numpy.core")
+_CMA_CLASSES = {
+    ("cmaes._cma", "CMA"),
+    ("numpy", "dtype"),
+    ("numpy", "ndarray"),
+    *((f"{core}.multiarray", name) for core in _NUMPY for name in ("_reconstruct", "scalar")),
+    *((f"{core}.numeric", "_frombuffer") for core in _NUMPY),
+}
+
+
+class _CmaUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _CMA_CLASSES:
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
+        return super().find_class(module, name)
+
+
+def restore_cma(data: bytes) -> Any:
+    """A state of CMA-ES from its pickle, made of nothing but the classes that such a state has.
+
+    Raises:
+        StudyError: It is something else.
+    """
+    try:
+        return _CmaUnpickler(io.BytesIO(data)).load()
+    except Exception as error:  # a forged pickle raises anything
+        raise StudyError(
+            f"the study's storage holds no state of CMA-ES but something else: {str(error)[:200]}",
+            "it was tampered with or is damaged; use another sampler, or a storage of your own",
+        ) from error
+
+
+class RestrictedCmaEsSampler(optuna.samplers.CmaEsSampler):
+    """Optuna's CMA-ES, which restores nothing but its own state (`restore_cma`)."""
+
+    def _restore_optimizer(self, completed_trials: list[FrozenTrial]) -> Any:
+        for trial in reversed(completed_trials):
+            parts = {key: part for key, part in trial.system_attrs.items() if key.startswith(self._attr_key_optimizer)}
+            if parts:
+                return restore_cma(bytes.fromhex(self._concat_optimizer_attrs(parts)))
+        return None
+
+
+# The elite moth-flame algorithm as an Optuna sampler: one trial is one flight of one moth.
+
+Array = NDArray[np.float64]
+CAUCHY_SHARE = 0.05
+"""Scale of the Cauchy steps of Eq. 13, as a share of the unit interval."""
+
+
+class EmfoaSampler(optuna.samplers.BaseSampler):
+    """Moth-flame optimisation with elite opposition, Cauchy steps and the pull of the best flame (Eq. 8-22).
+
+    The best finished trials are the flames. The first population is drawn uniformly, its second half as elite opposites
+    of the first (Eq. 19-22); from then on trial number n is the flight of moth n mod N: a logarithmic spiral from its
+    last position around its flame (Eq. 8-10), with a Cauchy step in the first half of the budget (Eq. 13-16) and the
+    pull of the best flame in the second (Eq. 17-18). The number of flames falls over the budget (Eq. 11).
+
+    Numbers move in the unit interval of their (linear or logarithmic) range; categories are taken from the flame, or
+    drawn again with the probability that a spiral leaves the interval. Pruned trials with a value count as finished.
+
+    Args:
+        seed: Of the random numbers.
+        n_trials: The budget over which flames are reduced; later trials stay in the last phase.
+        population: Moths (and flames).
+    """
+
+    def __init__(self, *, seed: int | None = None, n_trials: int = 100, population: int = 8) -> None:
+        if n_trials < 1 or population < 2:
+            raise ValueError(f"n_trials must be >= 1 and population >= 2, got {n_trials=}, {population=}")
+        self._rng = np.random.default_rng(seed)
+        self._independent = optuna.samplers.RandomSampler(seed=seed)
+        self._n_trials = n_trials
+        self._population = population
+        self._space = IntersectionSearchSpace(include_pruned=True)
+
+    def reseed_rng(self) -> None:
+        """Draw a new seed, for parallel workers."""
+        self._rng = np.random.default_rng()
+        self._independent.reseed_rng()
+
+    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        """The parameters that all finished trials share."""
+        space = self._space.calculate(study)
+        return {name: distribution for name, distribution in space.items() if not distribution.single()}
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        """One flight of one moth."""
+        if study._is_multi_objective():
+            raise ValueError("EmfoaSampler takes one objective")
+        if not search_space:
+            return {}
+        finished = [trial for trial in _finished(study) if search_space.keys() <= trial.params.keys()]
+        if len(finished) < self._population:
+            return self._first_population(finished, search_space)
+        names = sorted(search_space)
+        moths = np.array([[to_unit(trial.params[name], search_space[name]) for name in names] for trial in finished])
+        sign = 1.0 if study.direction == StudyDirection.MINIMIZE else -1.0
+        order = np.argsort([sign * _value(trial) for trial in finished], kind="stable")
+        flames = moths[order[: self._population]]
+        index = trial.number % self._population
+        own = [row for row, other in enumerate(finished) if other.number % self._population == index]
+        moth = moths[own[-1] if own else -1]
+        landed = self._fly(moth, flames, index, min(trial.number, self._n_trials))
+        best = [finished[row] for row in order[: self._population]]
+        flame = best[min(index, len(best) - 1)]
+        return {
+            name: self._land(value, search_space[name], flame.params[name])
+            for name, value in zip(names, landed, strict=True)
+        }
+
+    def sample_independent(
+        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> Any:
+        """Uniformly, for parameters outside the shared space."""
+        return self._independent.sample_independent(study, trial, param_name, param_distribution)
+
+    def _first_population(self, finished: list[FrozenTrial], space: dict[str, BaseDistribution]) -> dict[str, Any]:
+        """A member of the first population: uniform, or the elite opposite of an earlier member."""
+        names = sorted(space)
+        unit = self._rng.random(len(names))
+        if len(finished) >= self._population // 2:
+            members = np.array([[to_unit(trial.params[name], space[name]) for name in names] for trial in finished])
+            low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
+            unit = opposites(np, members[len(finished) % len(members)], low, high, low, high, self._rng.random)
+        return {name: from_unit(value, space[name]) for name, value in zip(names, unit, strict=True)}
+
+    def _fly(self, moth: Array, flames: Array, index: int, trial: int) -> Array:
+        """Where the moth of that index lands in a trial of the budget; `flames` best first."""
+        left = flames_left(self._population, trial, self._n_trials)
+        around, now = flames[min(index, left - 1)], flight(trial / self._n_trials, EMFOA)
+        return np.asarray(
+            moth_positions(np, moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
+        )
+
+    def _land(self, value: float, distribution: BaseDistribution, flame: Any) -> Any:
+        if isinstance(distribution, CategoricalDistribution):
+            if 0.0 <= value <= 1.0 and self._rng.random() > 0.1:
+                return flame
+            return distribution.choices[int(self._rng.integers(len(distribution.choices)))]
+        return from_unit(float(np.clip(value, 0.0, 1.0)), distribution)
+
+
+def _finished(study: Study) -> list[FrozenTrial]:
+    states = (TrialState.COMPLETE, TrialState.PRUNED)
+    trials = study._get_trials(deepcopy=False, states=states, use_cache=True)
+    return [trial for trial in trials if not np.isnan(_value(trial))]
+
+
+def _value(trial: FrozenTrial) -> float:
+    """The value of a complete trial, the last intermediate one of a pruned trial; NaN without any."""
+    if trial.state == TrialState.COMPLETE:
+        return float(trial.value)  # type: ignore[arg-type]  # one objective
+    return trial.intermediate_values[max(trial.intermediate_values)] if trial.intermediate_values else np.nan
+
+
+def _scaled_bounds(distribution: Any) -> tuple[float, float]:
+    """Ends of a numerical range, half a step wider for stepped ones, so that both ends are drawn as often."""
+    low, high = float(distribution.low), float(distribution.high)
+    if distribution.log:
+        half = 0.5 if isinstance(distribution.low, int) else 0.0
+        return float(np.log(low - half)), float(np.log(high + half))
+    half = 0.0 if distribution.step is None else distribution.step / 2
+    return low - half, high + half
+
+
+def to_unit(value: Any, distribution: BaseDistribution) -> float:
+    """Where a value lies in its range, 0 to 1; of a category the middle of its share."""
+    if isinstance(distribution, CategoricalDistribution):
+        return (distribution.to_internal_repr(value) + 0.5) / len(distribution.choices)
+    low, high = _scaled_bounds(distribution)
+    scaled = np.log(value) if distribution.log else float(value)  # type: ignore[attr-defined]
+    return float((scaled - low) / (high - low))
+
+
+def from_unit(unit: float, distribution: BaseDistribution) -> Any:
+    """The value that lies at `unit` of its range."""
+    if isinstance(distribution, CategoricalDistribution):
+        return distribution.choices[min(int(unit * len(distribution.choices)), len(distribution.choices) - 1)]
+    low, high = _scaled_bounds(distribution)
+    value = low + unit * (high - low)
+    if distribution.log:  # type: ignore[attr-defined]
+        value = float(np.exp(value))
+    if isinstance(distribution, optuna.distributions.IntDistribution):
+        step = distribution.step
+        value = distribution.low + step * round((value - distribution.low) / step)
+        return int(np.clip(value, distribution.low, distribution.high))
+    assert isinstance(distribution, optuna.distributions.FloatDistribution)
+    if distribution.step is not None:
+        value = distribution.low + distribution.step * round((value - distribution.low) / distribution.step)
+    return float(np.clip(value, distribution.low, distribution.high))

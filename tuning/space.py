@@ -1,4 +1,4 @@
-"""From the settings' annotations to what a sampler draws."""
+"""The search space: from the settings' annotations to Optuna's distributions."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from dynslam_bench.core.settings import (
     field_names,
     parameters,
     value_of,
+    why_unused,
 )
-from dynslam_bench.core.steering import why_unused
-
-from .seen import source_of_masks
-from .study_file import SpaceSpec
+from dynslam_bench.tuning.splits import source_of_masks
+from dynslam_bench.tuning.study_file import SpaceSpec
 
 
 def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
@@ -42,8 +41,8 @@ def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[
     every = parameters(settings)
     for pattern in (*spec.include, *spec.exclude):
         if not any(fnmatchcase(parameter.name, pattern) for parameter in every):
-            known = [parameter.name for parameter in every]
-            hint = "it exists, but is not tunable" if pattern in field_names(settings) else did_you_mean(pattern, known)
+            similar = did_you_mean(pattern, [parameter.name for parameter in every])
+            hint = "it exists, but is not tunable" if pattern in field_names(settings) else similar
             raise StudyError(f"'{pattern}' matches no tunable setting", hint)
     chosen = [
         parameter
@@ -76,7 +75,7 @@ def suggest(trial: optuna.trial.BaseTrial, space: list[Parameter], base: Mapping
     """
     values: dict[str, Scalar] = {}
     for parameter in space:
-        if all((values.get(name, base.get(name))) in allowed for name, allowed in parameter.when):
+        if _takes_part(parameter, {**base, **values}):
             values[parameter.name] = _draw(trial, parameter)
     return values
 
@@ -94,11 +93,12 @@ def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
 
 def default_configuration(space: list[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
     """The default settings as a configuration: what trial 0 runs."""
-    values: dict[str, Scalar] = {}
-    for parameter in space:
-        if all((values.get(name, base.get(name))) in allowed for name, allowed in parameter.when):
-            values[parameter.name] = base[parameter.name]
-    return values
+    return {parameter.name: base[parameter.name] for parameter in space if _takes_part(parameter, base)}
+
+
+def _takes_part(parameter: Parameter, values: Mapping[str, Any]) -> bool:
+    """Whether the conditions of a parameter hold."""
+    return all(values.get(name) in allowed for name, allowed in parameter.when)
 
 
 def _draw(trial: optuna.trial.BaseTrial, parameter: Parameter) -> Scalar:
@@ -126,3 +126,41 @@ def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:
     if hasattr(settings, "segmentation"):
         return apply_overrides(settings, {"segmentation.source": source_of_masks(settings, sequences)})
     return settings
+
+
+# Starting points.
+
+
+def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
+    """A preset as a configuration of a study; what it does not say is as the default has it.
+
+    Args:
+        preset: Settings by dotted name.
+        space: The study's, from `search_space`.
+        base: Values of all settings that are not tuned.
+
+    Raises:
+        StudyError: The preset sets what the study does not tune to something else, or to a value out of its range.
+    """
+    tuned = {parameter.name: parameter for parameter in space}
+    for name, value in preset.items():
+        if name not in base:
+            raise StudyError(f"the preset to start from sets an unknown '{name}'", did_you_mean(name, list(base)))
+        if name not in tuned and base[name] != value:
+            raise StudyError(
+                f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
+                f'tune it, or say "{name}" = ... under [space.fixed]',
+            )
+        if name in tuned and not _fits(tuned[name], value):
+            raise StudyError(
+                f"the preset to start from sets {name} = {value!r}, outside the range that the study tunes"
+            )
+    return default_configuration(list(space), {**base, **preset})
+
+
+def _fits(parameter: Parameter, value: Any) -> bool:
+    span = distribution(parameter)
+    try:
+        return bool(span._contains(span.to_internal_repr(value)))
+    except ValueError:
+        return False

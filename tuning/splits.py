@@ -1,28 +1,157 @@
-"""Whether a study's blocks are what they say: apart by content, by the catalogue, by the scenes."""
+"""The splits of a study: instances to tune on, to choose on and to judge on, and whether they are apart."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations, product
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Sequence as PySequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations, islice, product
 from typing import Any, Literal, cast
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.part import Part, part_of
-from dynslam_bench.sequences.synthetic import HELD_OUT_INSTANCES, TUNE_INSTANCES
+from dynslam_bench.core.folders import find_data_root
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.reports.model.row import SEEN
+from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
+from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
+from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
+from dynslam_bench.sequences.view import Part, part_of
+from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.objectives import place_of
+from dynslam_bench.tuning.pruning import running_order
+from dynslam_bench.tuning.study_file import StudySpec
 
-from .blocks import Block
-from .same_recording import is_rendered, same_recording
+FEWEST_STARTS = 3
+"""The default settings run from so many starts at every place: all trials would share the luck of a single one."""
+ENOUGH_SCENES = 12
+"""With so many tune scenes a third of them is kept for the choice; else other starts in all of them are."""
+FRESH_SEED = 1000
+"""Seeds of fresh starts: none that a trial has used."""
+RECORDED_FRAMES, RECORDED_STARTS = 120, 4
 
-OVERRIDE = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
+
+@dataclass(frozen=True)
+class Design:
+    """The instances of a study.
+
+    Attributes:
+        tune: What trials run on, in the order of all trials.
+        reference: What the default settings run on beforehand: `tune`, and more starts where those are few.
+        confirm: What the best trials and the default run on for the choice; no trial has seen them.
+        held_out: What judges the choice.
+        recorded: Recordings on which the choice must not be worse.
+        notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
+    """
+
+    tune: tuple[ProblemInstance, ...]
+    reference: tuple[ProblemInstance, ...]
+    confirm: tuple[ProblemInstance, ...]
+    held_out: tuple[ProblemInstance, ...]
+    recorded: tuple[ProblemInstance, ...]
+    notes: tuple[str, ...] = ()
+
+
+def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
+    """Lay out the instances of a study and check them.
+
+    Args:
+        spec: The study.
+        accept: Whether splits that are not apart are only noted, as for a study that is only looked at.
+
+    Raises:
+        DynslamError: See `splits.check_splits`.
+    """
+    accept = accept or spec.allow_overlap
+    tune, confirm = _tune_and_confirm(spec.instances(*spec.tune), spec.instances(*spec.confirm))
+    held_out = spec.instances(*spec.held_out)
+    splits: dict[Split, list[ProblemInstance]] = {"tune": tune, "confirm": confirm, "held_out": held_out}
+    notes = check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
+    taken = {instance.scene for instance in (*tune, *confirm, *held_out)}
+    recorded = _recordings(spec, taken) if spec.recorded is None else spec.instances(*spec.recorded)
+    if spec.recorded:
+        splits = {"tune": [*tune, *confirm], "held_out": recorded}
+        notes += check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
+    tune = running_order(tune, spec.sampler_seed)
+    reference = with_more_starts(tune)
+    return Design(tuple(tune), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes))
+
+
+def with_more_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
+    """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
+    more = []
+    for own in _places(instances).values():
+        missing = FEWEST_STARTS - len({instance.offset for instance in own})
+        more += [replace(own[0], offset=offset) for offset in _unused(own, missing)]
+    return [*instances, *more]
+
+
+def fresh_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
+    """As many instances at each place from starts, and with seeds, that none of the instances has."""
+    return [
+        replace(place, offset=offset, seed=FRESH_SEED + index)
+        for place, own in _places(instances).items()
+        for index, offset in enumerate(_unused(own, len(own)))
+    ]
+
+
+def _places(instances: Iterable[ProblemInstance]) -> dict[ProblemInstance, list[ProblemInstance]]:
+    places: dict[ProblemInstance, list[ProblemInstance]] = {}
+    for instance in instances:
+        places.setdefault(place_of(instance), []).append(instance)
+    return places
+
+
+def _unused(instances: PySequence[ProblemInstance], count: int) -> list[int]:
+    """The first `count` offsets that no instance has."""
+    used = {instance.offset for instance in instances}
+    return list(islice((offset for offset in itertools.count() if offset not in used), max(count, 0)))
+
+
+def _tune_and_confirm(
+    tune: list[ProblemInstance], confirm: list[ProblemInstance]
+) -> tuple[list[ProblemInstance], list[ProblemInstance]]:
+    groups = list(scenes(tune).values())
+    if confirm:
+        return tune, confirm
+    if len(groups) < ENOUGH_SCENES:
+        return tune, fresh_starts(tune)
+    confirm = [instance for group in groups[2::3] for instance in group]
+    return [instance for instance in tune if instance not in confirm], confirm
+
+
+def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
+    """The first frames of the first held-out recording that is here and that the study does not name itself."""
+    root = find_data_root(spec.data_root)
+    for entry in catalogue().values():
+        if entry.split == "held-out" and entry.id not in taken and entry.find(root) is not None:
+            frames = min(RECORDED_FRAMES + RECORDED_STARTS - 1, len(open_public(entry.id, data_root=root)))
+            return [ProblemInstance(entry.id, (0, frames), offset) for offset in range(RECORDED_STARTS)]
+    return []
+
+
+# Whether a study's instances are what they say: apart by content, by the catalogue, by the scenes.
+
+ACCEPT = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
 
 Split = Literal["tune", "confirm", "held_out"]
 
 
 def check_splits(
-    name: str, splits: Mapping[Split, Sequence[Block]], *, data_root: str | None = None, accept: bool = False
+    name: str,
+    splits: Mapping[Split, PySequence[ProblemInstance]],
+    *,
+    data_root: str | None = None,
+    accept: bool = False,
 ) -> list[str]:
-    """Open every block of a study and compare its splits.
+    """Open every instance of a study and compare its splits.
 
     Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
     a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other file
@@ -31,7 +160,7 @@ def check_splits(
 
     Args:
         name: Of the study.
-        splits: Its blocks: to tune on, to judge the survivors on, and held out.
+        splits: Its instances: to tune on, to judge the survivors on, and held out.
         data_root: Folder of the recorded sequences.
         accept: Whether the study accepts it (`StudySpec.allow_overlap`).
 
@@ -39,74 +168,190 @@ def check_splits(
         What is wrong, a line each, where it is accepted.
 
     Raises:
-        StudyError: Something is wrong and not accepted, a split names the same frames twice, or a block is longer than
-            its sequence, too short or without ground truth; names both spellings.
+        StudyError: Something is wrong and not accepted, a split names the same frames twice, or an instance is too
+            long, too short or without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
     tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))
-    tuned = dict.fromkeys(block.sequence for block in tune)
-    judged = dict.fromkeys(block.sequence for block in held_out)
-    whole: dict[str, Any] = {each: open_sequence(each, data_root=data_root) for each in (*tuned, *judged)}
-    for own in (tune, held_out):
-        _check_repeats(own, whole)
-    parts = {name: part_of(found) for name, found in whole.items()}
+    tuned = dict.fromkeys(instance.sequence for instance in tune)
+    judged = dict.fromkeys(instance.sequence for instance in held_out)
+    opened: dict[str, Any] = {name: open_sequence(name, data_root=data_root) for name in (*tuned, *judged)}
+    for instances in (tune, held_out):
+        _check_repeats(instances, opened)
+    scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
         for one, other in product(tuned, judged)
-        if _overlap(whole[one], parts[one], whole[other], parts[other])
+        if scenes_of[one] == scenes_of[other] or _same_recording(opened[one], opened[other])
     ]
-    faults += [_misplaced(each, "tune", "held-out") for each in tuned if _split(whole[each]) == "held-out"]
-    faults += [_misplaced(each, "held-out", "tune") for each in judged if _split(whole[each]) == "tune"]
+    for names, used, own in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
+        faults += [_misplaced(name, used, own) for name in names if getattr(opened[name], "split", "") == own]
     if faults and not accept:
         more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}{more}", OVERRIDE)
+        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}{more}", ACCEPT)
     return faults
 
 
-def _check_repeats(blocks: Sequence[Block], whole: Mapping[str, Any]) -> None:
-    """Within a split, blocks of one scene are repeats of the same frames or share no frame."""
-    if len(set(blocks)) < len(blocks):
-        twice = next(block for block in blocks if list(blocks).count(block) > 1)
-        raise StudyError(f"block '{twice}' is named twice", "leave one out")
-    by_scene: dict[str, list[tuple[Block, Part]]] = {}
-    for block in blocks:
-        part = part_of(cast("Any", block.cut(whole[block.sequence])), block.offset)
-        by_scene.setdefault(part.scene, []).append((block, part))
-    for same in by_scene.values():
-        for (one, here), (other, there) in combinations(same, 2):
-            if _seen(one, here) == _seen(other, there):
-                raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
-            if (here.start, here.stop) != (there.start, there.stop) and _common(here, there) > 0:
-                raise StudyError(
-                    f"'{one}' and '{other}' share {_common(here, there)} frames", "write blocks of a sequence apart"
-                )
+def _check_repeats(instances: PySequence[ProblemInstance], opened: Mapping[str, Any]) -> None:
+    """Within a split, instances of one scene are repeats of the same frames or share no frame."""
+    parts: dict[ProblemInstance, Part] = {}
+    for instance in instances:
+        if instance in parts:
+            raise StudyError(f"instance '{instance}' is named twice", "leave one out")
+        parts[instance] = part_of(cast("Any", instance.cut(opened[instance.sequence])), instance.offset)
+    for (one, here), (other, there) in combinations(parts.items(), 2):
+        if here.scene != there.scene:
+            continue
+        if _content(one, here) == _content(other, there):
+            raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
+        shared = min(here.stop, there.stop) - max(here.start, there.start)
+        if (here.start, here.stop) != (there.start, there.stop) and shared > 0:
+            raise StudyError(f"'{one}' and '{other}' share {shared} frames", "write instances of a sequence apart")
 
 
-def _seen(block: Block, part: Part) -> tuple[object, ...]:
-    own = (block.offset, block.degradation, block.seed, part.noise, part.start, part.stop, part.stride)
-    return (part.content, *own)
-
-
-def _common(one: Part, other: Part) -> int:
-    return min(one.stop, other.stop) - max(one.start, other.start)
-
-
-def _split(sequence: Any) -> str:
-    return str(getattr(sequence, "split", ""))
+def _content(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
+    """What a tracker sees of an instance."""
+    own = (instance.offset, instance.degradation, instance.seed)
+    return (part.content, part.noise, part.start, part.stop, part.stride, *own)
 
 
 def _misplaced(name: str, used: str, own: str) -> str:
     who = "the catalogue"
     if name.startswith("synthetic/"):
-        own_range = HELD_OUT_INSTANCES if own == "held-out" else TUNE_INSTANCES
+        own_range = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
         who = f"its scene ({own_range.start}-{own_range.stop - 1})"
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
 
-def _overlap(one: Any, part: Part, other: Any, other_part: Part) -> bool:
-    """Whether two sequences film the same: the same content by digest, or the same images on the same way."""
-    if part.scene == other_part.scene:
-        return True
-    if is_rendered(one) and is_rendered(other):
-        return False  # rendered scenes are told apart by their parameters
-    return same_recording(one, other)
+def _same_recording(one: Any, other: Any) -> bool:
+    """`same_recording`; rendered scenes are told apart by their parameters."""
+    return not (is_rendered(one) and is_rendered(other)) and same_recording(one, other)
+
+
+# Whether two recordings show the same: by what was filmed and how the camera moved, never by names or stamps.
+
+_AROUND_S = np.array([-0.1, -0.05, 0.05, 0.1])
+"""The shape of a path at a frame: the camera's distances from its positions so long before and after it."""
+_PAIRS = 6
+"""So many pairs of frames with the most similar shapes, and as many with equal stamps, are compared by their images."""
+_LEAST_M = 1e-3
+"""The shape of a shorter path is the ground truth's rounding."""
+_THUMB = (32, 24)
+_GREY_LEVELS = 1.5
+_DEPTH_SHARE = 0.002
+_ENOUGH = 3
+"""Pairs with equal images; fewer may be chance, as two paths may cross."""
+
+
+def same_recording(one: Sequence, other: Sequence) -> bool:
+    """Whether frames of one recording are frames of the other.
+
+    Frames are paired where the ground truths have the same shape around them (in whatever frame of reference, at
+    whatever stamps), where stamps are equal, and in order from the first and from the last frame; of a few pairs the
+    decoded images are compared, reduced to `_THUMB` pixels. Other names, shifted stamps, other image files, frames left
+    out and a smaller size leave a copy a copy.
+    """
+    thumbs = tuple(cache(lambda index, of=of: _thumbnail(of, index)) for of in (one, other))
+    pairs = dict.fromkeys(_likely_pairs(one, other))
+    alike = ((here, there) for here, there in pairs if _alike(thumbs[0](here), thumbs[1](there)))
+    return len(list(islice(alike, _ENOUGH))) == min(_ENOUGH, len(one), len(other))
+
+
+def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
+    shapes = [_shapes(one), _shapes(other)]
+    if len(shapes[0]) and len(shapes[1]):
+        distance, index = cKDTree(shapes[1]).query(shapes[0])
+        nearest = np.asarray(index, np.intp)
+        relative = np.asarray(distance, np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
+        yield from ((int(here), int(nearest[here])) for here in np.argsort(relative, kind="stable")[:_PAIRS])
+    if is_rendered(one) or is_rendered(other):
+        return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
+    stamps = (np.round(one.timestamps, 6), np.round(other.timestamps, 6))
+    _, here, there = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
+    spread = np.unique(np.linspace(0, len(here) - 1, min(_PAIRS, len(here))).astype(np.intp))
+    yield from ((int(here[k]), int(there[k])) for k in spread)
+    yield from ((0, 0), (len(one) - 1, len(other) - 1))
+
+
+def is_rendered(sequence: Sequence) -> bool:
+    """Whether the frames of a sequence are computed and its content is known by its parameters."""
+    return hasattr(sequence, "scene_digest")
+
+
+def _shapes(sequence: Sequence) -> NDArray[np.float64]:
+    """Distances in metres ``[N, 4]`` of the camera at every frame from itself `_AROUND_S` earlier and later.
+
+    They depend neither on the frame of reference nor on a shift of the stamps. Empty without ground truth.
+    """
+    truth = sequence.ground_truth
+    if truth is None or len(truth) < 2:
+        return np.empty((0, len(_AROUND_S)))
+
+    def positions(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+        axes = [np.interp(stamps, truth.timestamps, truth.positions[:, axis]) for axis in range(3)]
+        return np.stack(axes, axis=-1)
+
+    stamps = sequence.timestamps
+    around = positions(stamps[:, None] + _AROUND_S)
+    return np.asarray(np.linalg.norm(around - positions(stamps)[:, None], axis=2), np.float64)
+
+
+def _thumbnail(sequence: Sequence, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Colour ``[24, 32, 3]`` and depth ``[24, 32]`` of a frame, depth in the numbers that its file holds."""
+    frame = sequence[index]
+    raw = (frame.depth * sequence.camera.depth_factor).astype(np.float32)  # as stored, whatever the camera says
+    colour = cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA)
+    depth = cv2.resize(raw, _THUMB, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(colour, np.float32), np.asarray(depth, np.float32)
+
+
+def _alike(
+    one: tuple[NDArray[np.float32], NDArray[np.float32]], other: tuple[NDArray[np.float32], NDArray[np.float32]]
+) -> bool:
+    if np.abs(one[0] - other[0]).mean() > _GREY_LEVELS:
+        return False
+    allowed = _DEPTH_SHARE * float(np.median(one[1])) + 0.5
+    return bool(np.median(np.abs(one[1] - other[1])) <= allowed)
+
+
+# Which instances of a study show scenes that the network behind the masks was trained on: a best case there.
+
+
+def source_of_masks(settings: Settings, sequences: PySequence[str]) -> str:
+    """Where a system's masks come from; the embedded network for ``auto`` where everything is rendered.
+
+    Args:
+        settings: Of the system.
+        sequences: What it runs on.
+
+    Returns:
+        For example ``embedded``; empty for a system without masks.
+    """
+    source = str(getattr(getattr(settings, "segmentation", None), "source", ""))
+    rendered = bool(sequences) and all(name.startswith("synthetic/") for name in sequences)
+    return "embedded" if source == "auto" and rendered else source
+
+
+def splits_seen(settings: Settings, design: Design) -> list[str]:
+    """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
+    splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
+    return [name for name, instances in splits.items() if _masks_seen(settings, instances)]
+
+
+def seen_note(splits: PySequence[str]) -> str:
+    """What such splits mean for a study, in one sentence; empty without any."""
+    if not splits:
+        return ""
+    names = {"tune": "trials", "confirm": "choice", "held_out": "held-out instances"}
+    named = " and ".join(names[split] for split in splits)
+    judged = (
+        "so nothing here judges the masks: held-out instances are rendered scenes from 100 on"
+        if "held_out" in splits
+        else "so the errors there are optimistic, and the held-out instances, which it has not seen, may gain less"
+    )
+    return f"{SEEN} In the {named} the masks come from a network that was trained on those very scenes, {judged}."
+
+
+def _masks_seen(settings: Settings, instances: Iterable[ProblemInstance]) -> bool:
+    names = (instance.sequence for instance in instances)
+    return any(seen_in_training(source_of_masks(settings, [name]), name) for name in names)

@@ -1,49 +1,100 @@
-"""Where a study is kept: a journal file by default, any SQL database, or the gRPC proxy."""
+"""Where a study is stored: a journal file by default, any SQL database, or Optuna's gRPC proxy."""
 
 from __future__ import annotations
 
+import fcntl
+import json
 import os
+import random
 import socket
+import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import IO, Any
+from urllib.parse import unquote, urlsplit
 
 import optuna
+import psutil
+from optuna.exceptions import StorageInternalError
+from optuna.storages import BaseStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend
+from sqlalchemy.exc import DBAPIError
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.sanitise import HIDDEN, without_passwords
+from dynslam_bench.tuning.study_file import StudySpec
 
-from .database import open_database
-from .journal_file import WholeLines
-from .storage_address import check_scheme, without_password
-from .study_file import StudySpec
-
-JOURNAL = "journal.log"
+SCHEMES = ("sqlite", "postgresql", "mysql", "mariadb", "oracle", "mssql", "grpc")
+"""SQL databases (also with a driver: ``postgresql+psycopg``) and Optuna's gRPC proxy. They hold data, never code;
+Optuna unpickles what Redis holds."""
+_ATTEMPTS = 10
+_BEING_MADE = ("already exists", "duplicate", "unique constraint", "is locked")
+"""What drivers say where another worker makes the tables at the same time."""
+_CHUNK = 1 << 16
 
 
 def study_folder(results: Path, spec: StudySpec) -> Path:
-    """Where a study's files lie."""
+    """The folder of a study's files."""
     return results / "studies" / spec.name
 
 
-def open_storage(results: Path, spec: StudySpec) -> optuna.storages.BaseStorage:
+def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
     """Open, or begin, the storage of a study.
 
     Raises:
         StudyError: It cannot be reached or written, or is of no kind that is known.
     """
-    if spec.storage:
-        check_scheme(spec.storage)
+    scheme, separator, address = spec.storage.partition("://")
+    if spec.storage and not (separator and scheme.partition("+")[0] in SCHEMES):
+        raise StudyError(
+            f"the storage {without_passwords(spec.storage)!r} is of no kind that is known",
+            f"one of {', '.join(SCHEMES)}",
+        )
+    folder = study_folder(results, spec)
     try:
         if not spec.storage:
-            folder = study_folder(results, spec)
             folder.mkdir(parents=True, exist_ok=True)
-            return optuna.storages.JournalStorage(WholeLines(folder / JOURNAL))
-        if spec.storage.startswith("grpc://"):
-            return _proxy(spec.storage)
-        return open_database(spec.storage)
-    except Exception as error:  # drivers raise whatever they like
-        where = spec.storage or str(study_folder(results, spec))
-        line = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        said = without_password(f"cannot open the storage {where}: {line}", spec.storage)
-        raise StudyError(said, "check the address and the permissions") from None
+            return optuna.storages.JournalStorage(JournalFile(folder / "journal.log"))
+        if scheme != "grpc":
+            return open_database(spec.storage)
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdigit():
+            raise ValueError("write it as grpc://host:port")
+        return optuna.storages.GrpcStorageProxy(host=host, port=int(port))
+    except Exception as error:  # each driver raises errors of its own
+        line = (str(error).strip() or type(error).__name__).splitlines()[0]
+        text = without_password(f"cannot open the storage {spec.storage or folder}: {line}", spec.storage)
+        raise StudyError(text, "check the address and the permissions") from None
+
+
+def open_database(url: str) -> BaseStorage:
+    """Open a database, and make its tables if it is empty.
+
+    Workers may begin at the same time: one whose tables another worker makes meanwhile tries again.
+
+    Raises:
+        Exception: What the database's driver raises.
+    """
+    for attempt in range(_ATTEMPTS):
+        try:
+            return optuna.storages.get_storage(RDBStorage(url, engine_kwargs={"pool_pre_ping": True}))
+        except (DBAPIError, StorageInternalError) as error:
+            cause = str(error.__cause__ or error).lower()
+            if attempt + 1 == _ATTEMPTS or not any(words in cause for words in _BEING_MADE):
+                raise
+            time.sleep(random.uniform(0.05, 0.5))
+    raise AssertionError("unreachable")
+
+
+def without_password(text: str, address: str) -> str:
+    """A text, for example a driver's message, without the password that an address holds."""
+    try:
+        password = urlsplit(address).password or ""
+    except ValueError:
+        password = ""
+    for secret in {password, unquote(password)} - {""}:
+        text = text.replace(secret, HIDDEN)
+    return without_passwords(text)
 
 
 def worker_name() -> str:
@@ -57,23 +108,68 @@ def worker_is_dead(name: str) -> bool:
     if host != socket.gethostname() or not pid.isdigit():
         return False
     try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
+        return bool(psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
         return True
-    except PermissionError:
-        return False
-    return _is_zombie(int(pid))
 
 
-def _is_zombie(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return False
+class JournalFile(JournalFileBackend):
+    """Optuna's journal file, to which whole lines are appended or nothing.
+
+    A line that a killed process left unfinished is cut off before the next one is written: Optuna appends to it, and
+    can never read the file again. What did not fit on the disk is taken back. The lock is on the file itself and ends
+    with its process; Optuna's own outlives a killed process by 30 s.
+
+    Args:
+        path: The file; begun if it is missing.
+
+    Raises:
+        StudyError: It cannot be begun.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if path.is_symlink():
+            raise StudyError(f"{path} is a link: a study is written in its own folder", "put the file in its place")
+        try:
+            super().__init__(str(path))
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+        self.path = path
+
+    def append_logs(self, logs: Sequence[dict[str, Any]]) -> None:
+        """Append entries.
+
+        Raises:
+            StudyError: They cannot be written; then the file is as it was.
+        """
+        rest = memoryview("".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs).encode())
+        try:
+            with self.path.open("r+b", buffering=0) as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                end = _end_of_lines(file)
+                file.truncate(end)
+                file.seek(end)
+                try:
+                    while rest:
+                        rest = rest[file.write(rest) :]
+                    os.fsync(file.fileno())
+                except OSError:
+                    file.truncate(end)
+                    raise
+        except OSError as error:
+            raise _cannot_write(self.path, error) from error
 
 
-def _proxy(address: str) -> optuna.storages.BaseStorage:
-    host, _, port = address.removeprefix("grpc://").rpartition(":")
-    if not host or not port.isdigit():
-        raise ValueError("write it as grpc://host:port")
-    return optuna.storages.GrpcStorageProxy(host=host, port=int(port))
+def _cannot_write(path: Path, error: OSError) -> StudyError:
+    return StudyError(f"cannot write {path}: {error.strerror}", "free some space, or check the folder; then go on")
+
+
+def _end_of_lines(file: IO[bytes]) -> int:
+    """Where the last complete line of a file ends."""
+    start = file.seek(0, os.SEEK_END)
+    while start:
+        size = min(_CHUNK, start)
+        start = file.seek(start - size)
+        if (newline := file.read(size).rfind(b"\n")) >= 0:
+            return start + newline + 1
+    return 0

@@ -1,388 +1,321 @@
-"""Running a study: trial 0 is the default, trials race on growing sets of blocks, everything resumes."""
+"""Studies: run one from Python with custom objectives, samplers and callbacks, open a stored one, run its stages."""
 
 from __future__ import annotations
 
-import json
-import math
-import sys
-import threading
-import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import optuna
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial
 
-from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.harmless import storable
-from dynslam_bench.core.passwords import words_without_passwords
-from dynslam_bench.core.records import digest, write_atomic
-from dynslam_bench.core.settings import apply_overrides, flatten
-from dynslam_bench.runs import RunEvent, RunStore
-from dynslam_bench.runs.identity import resolve
-from dynslam_bench.runs.storage.record import program_of
-from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.core.errors import SequenceError, SettingsError, StudyError
+from dynslam_bench.core.reading import read_json
+from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.settings import Scalar
+from dynslam_bench.core.toml import read_toml
+from dynslam_bench.tuning.final_runs import finish
+from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.objectives import ACCURACY, Cost, Objective, Outcomes, find_objective, own_objective, together
+from dynslam_bench.tuning.page import write_page
+from dynslam_bench.tuning.pilot import FEWEST, Pilot, refuse_hopeless, run_pilot
+from dynslam_bench.tuning.screening import Screening, live, plan, screen
+from dynslam_bench.tuning.space import starting_point
+from dynslam_bench.tuning.storage import open_storage, study_folder
+from dynslam_bench.tuning.study_file import StudySpec, make_spec, read_study
+from dynslam_bench.tuning.summary import StudySummary
+from dynslam_bench.tuning.trials import trials_frame
+from dynslam_bench.tuning.tuner import OnEvent, OnRun, StudyEvent, Tuner
 
-from . import race
-from .blocks import Block
-from .constraints import coverage, fps, violations
-from .design import design_of
-from .evaluate import BlockFailedError, CancelledError, Outcome, evaluate
-from .objectives import Objective, Outcomes, find_objective
-from .samplers import build_sampler, set_constraints
-from .space import default_configuration, search_space, suggest
-from .storage import open_storage, study_folder, worker_is_dead, worker_name
-from .storage_address import without_password
-from .stored_identity import as_stored, difference, same
-from .study_file import StudySpec
-from .trials import best_trials, errors_in, errors_of
-
-DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-MADE_OF = ("parameters", "data", "program", "version", "source")
-"""What of a study's identity tells the data and the program that made it: must be the same to go on, not to read."""
-CRASHED_WORKER = "worker ended in the middle of the trial"
+if TYPE_CHECKING:
+    import pandas as pd
 
 
-@dataclass(frozen=True)
-class StudyEvent:
-    """Something happened in a study.
-
-    Attributes:
-        kind: ``pilot`` (what it found), ``reference`` (runs with the default settings), ``started`` or ``finished`` (a
-            trial).
-        number: Of the trial.
-        total: How many there are to be.
-        text: One line.
-    """
-
-    kind: Literal["pilot", "reference", "started", "finished"]
-    number: int
-    total: int
-    text: str
+_SPEC_FILE = "study.json"
+Callback = Callable[[optuna.Study, FrozenTrial], object]
+"""Called after each trial, as Optuna's own."""
 
 
-OnEvent = Callable[[StudyEvent], None]
-OnRun = Callable[[RunEvent], None]
-"""Told of every run that a study makes, also while it goes on; several threads may tell at a time."""
+class Study:
+    """A study, to be run or to be looked at.
 
-
-class Tuner:
-    """A study that is ready to run.
+    Example:
+        ``Study(tracker="orb-slam2", tune=["synthetic/walking_xyz?scene=0-3&frames=80"], name="few").run().finish()``
 
     Args:
-        spec: The study.
+        spec: The study, or its TOML file; None if the fields say it all.
         results: The results folder.
-        reading: Only look at a stored study: one of another version of the code opens too, but runs nothing more.
-        objectives: In place of those that the study names, in their order.
-        sampler: In place of the one that the study names.
+        objective: In place of the spec's: names of objectives, or functions from
+            `evaluate.Outcome` to a cost above 0, one or several.
+        sampler: Any of Optuna's, in place of the spec's.
+        callbacks: Called with Optuna's study and the trial after each trial.
+        start: Presets (TOML files, or settings by dotted name) that are tried right after the default.
+        **fields: Fields of `StudySpec`, in place of the spec's; `tune`, `confirm` and `held_out` take instances, too.
 
     Attributes:
-        on_run: Told of every run that the study makes from now on; None for nobody.
+        spec: What it asks for.
+        study: Optuna's study.
 
     Raises:
-        DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
-            study's name; nothing has run then. With `reading` also when nothing is stored.
+        DynslamError: See `Tuner`; or a preset holds settings that the study neither tunes nor has.
     """
+
+    spec: StudySpec
+    study: optuna.Study
+    _tuner: Tuner | None
 
     def __init__(
         self,
-        spec: StudySpec,
-        results: str | Path = "results",
+        spec: StudySpec | Path | str | None = None,
         *,
-        reading: bool = False,
-        objectives: Sequence[Objective] | None = None,
+        results: Path | str = "results",
+        objective: str | Cost | Sequence[str | Cost] | None = None,
         sampler: optuna.samplers.BaseSampler | None = None,
+        callbacks: Iterable[Callback] = (),
+        start: Iterable[Path | str | Mapping[str, Scalar]] = (),
+        **fields: Any,
     ) -> None:
-        self.spec = spec = as_stored(spec, study_folder(Path(results), spec) / "study.json") if reading else spec
-        self.results = Path(results)
-        self.reading = reading
-        self.tracker = TRACKERS.get(spec.tracker)
-        defaults = apply_overrides(self.tracker.settings(), spec.space.fixed)
-        self.space = search_space(
-            self.tracker.settings, spec.space, {block.sequence for block in spec.blocks(*spec.tune)}
-        )
-        self.defaults, self.base = defaults, flatten(defaults)
-        if spec.race == "wilcoxon" and len(spec.objectives) > 1:
-            raise StudyError(
-                f"race 'wilcoxon' takes one objective, the study has {len(spec.objectives)}",
-                "use halving, rejection or none",
-            )
-        self.objectives = [find_objective(each) for each in spec.objectives] if objectives is None else list(objectives)
-        sampler = build_sampler(spec) if sampler is None else sampler
-        self.design = design_of(spec, accept=reading)
-        self.steps = self._steps()
-        self.store = RunStore(self.results)
-        self.store.prepare()
-        self.folder = study_folder(self.results, spec)
-        self.study = self._open(sampler)
-        self._lock = threading.Lock()
-        self._interrupted = threading.Event()
-        self._reference: dict[Block, Outcome] = {}
-        self.on_run: OnRun | None = None
+        base = read_study(spec) if isinstance(spec, Path | str) else spec
+        objectives = _objectives(objective)
+        changes = {key: _texts(value) for key, value in fields.items()}
+        if objectives is not None:
+            changes["objectives"] = tuple(objective.name for objective in objectives)
+        values = {} if base is None else base.model_dump()
+        self.spec = make_spec({"name": "study", **values, **changes}, "the study")
+        self._tuner = tuner = Tuner(self.spec, results, objectives=objectives, sampler=sampler)
+        self.study = tuner.study
+        self._callbacks = tuple(callbacks)
+        self._summary: StudySummary | None = None
+        for preset in start:
+            settings = preset if isinstance(preset, Mapping) else read_preset(Path(preset))
+            tuner.study.enqueue_trial(starting_point(settings, tuner.space, tuner.base), skip_if_exists=True)
 
-    def run(self, *, jobs: int = 1, on_event: OnEvent | None = None) -> optuna.Study:
-        """Run trials until the study has as many finished ones as it asks for.
-
-        Several processes, on one or many machines, may do so at the same time on one storage.
+    @classmethod
+    def open(cls, study: StudySpec | Path | str, results: Path | str = "results") -> Study:
+        """Open a stored study to look at; nothing is run, and neither tracker nor sequences need to be there.
 
         Args:
-            jobs: Trials at a time in this process.
-            on_event: Told of everything that happens.
+            study: A study, its TOML file, or its folder in the results (``results/studies/NAME``).
+            results: The results folder; a study's own folder says where it lies.
 
         Raises:
-            StudyError: The default settings themselves fail on a sequence; says where and why. Or the study was opened
-                for reading.
+            StudyError: There is no such study.
         """
-        if self.reading:
-            raise StudyError(f"study '{self.spec.name}' was opened for reading")
-        self.reference(on_event, jobs)
-        deadline = None if self.spec.timeout_s is None else time.monotonic() + self.spec.timeout_s
-
-        def work() -> None:
-            while (deadline is None or time.monotonic() < deadline) and not self._interrupted.is_set() and self._more():
-                self._one(on_event)
-
-        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool, self._ending_all():
-            for future in [pool.submit(work) for _ in range(jobs)]:
-                future.result()
-        return self.study
-
-    @contextmanager
-    def _ending_all(self) -> Iterator[None]:
-        """Whatever interrupts the waiting ends the runs of all threads at once."""
+        spec, root = _spec_of(study, Path(results))
+        if not spec.storage and not study_folder(root, spec).is_dir():
+            raise StudyError(f"there is no study '{spec.name}' in {root}", "dynslam-bench tune run STUDY.toml")
+        opened = cls.__new__(cls)
         try:
-            yield
-        except BaseException:
-            self._interrupted.set()
-            raise
-
-    def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[Block, Outcome]:
-        """The default settings' outcomes on the tune split, to which every trial is compared."""
-        missing = [block for block in self.design.reference if block not in self._reference]
-        _tell(on_event, "reference", 0, len(missing), "the default settings")
-        with self._ending_all():
-            try:
-                self._reference.update(self.evaluate(self.spec.space.fixed, missing, jobs=jobs))
-            except BlockFailedError as error:
-                raise StudyError(
-                    f"the default settings fail: {error.args[0]}", "a study needs a default that runs"
-                ) from error
-            except CancelledError as error:
-                raise StudyError("interrupted") from error
-        return self._reference
-
-    def evaluate(
-        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
-    ) -> dict[Block, Outcome]:
-        """Run settings on blocks as this study runs them; see `evaluate.evaluate`. `cache` is the study's if None."""
-        return evaluate(
-            self.spec.tracker, settings, blocks, results=self.store, jobs=jobs, protocol=self.spec.protocol,
-            threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
-            data_root=self.spec.data_root, study=self.spec.name, cancelled=self._interrupted.is_set, on_run=self.on_run,
-        )  # fmt: skip
-
-    def evaluate_beside(
-        self, configurations: Sequence[Mapping[str, Any]], blocks: Sequence[Block], *, jobs: int = 1
-    ) -> list[dict[Block, Outcome] | BlockFailedError]:
-        """Run several configurations block by block, without the stage cache, so that their times can be compared.
-
-        Whatever else the machine does at a time then slows all of them alike.
-
-        Returns:
-            For each configuration its outcomes, or why its first failing run failed; it runs on no further block then.
-        """
-        outcomes: list[dict[Block, Outcome]] = [{} for _ in configurations]
-        failed: dict[int, BlockFailedError] = {}
-
-        def one(number: int, block: Block) -> None:
-            if number not in failed:
-                try:
-                    outcomes[number].update(self.evaluate(configurations[number], [block], cache=False))
-                except BlockFailedError as error:
-                    failed.setdefault(number, error)
-
-        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-beside") as pool, self._ending_all():
-            for future in [pool.submit(one, number, block) for block in blocks for number in range(len(outcomes))]:
-                future.result()
-        return [failed.get(number, found) for number, found in enumerate(outcomes)]
-
-    def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
-        """The overrides that a trial ran with."""
-        return {**self.spec.space.fixed, **trial.params}
-
-    def _steps(self) -> list[int]:
-        """The steps of the race at which every objective has a block that counts."""
-        found = race.steps(self.spec.race, len(self.design.race))
-        return [
-            step
-            for step in found[:-1]
-            if all(any(map(each.counts, self.design.race[:step])) for each in self.objectives)
-        ] + found[-1:]
-
-    def _one(self, on_event: OnEvent | None) -> None:
-        with self._lock:
-            trial = self.study.ask()
-            values = suggest(trial, self.space, self.base)
-        trial.set_user_attr("worker", worker_name())
-        _tell(on_event, "started", trial.number, self.spec.trials, f"trial {trial.number}")
-        state, result, text = self._evaluate(trial, values)
-        with self._lock:
-            self.study.tell(trial, result, state=state)
-        _tell(on_event, "finished", trial.number, self.spec.trials, f"trial {trial.number}: {text}")
-
-    def _evaluate(self, trial: optuna.Trial, values: dict[str, Any]) -> tuple[TrialState, list[float] | None, str]:
-        settings = {**self.spec.space.fixed, **values}
-        outcomes: dict[Block, Outcome] = {}
-        started = time.perf_counter()
-        try:
-            for position, step in enumerate(self.steps):
-                outcomes |= self.evaluate(settings, self.design.race[len(outcomes) : step])
-                result = self.values(outcomes)
-                final = step == self.steps[-1]
-                self._record(trial, outcomes, final=final)
-                if not final:
-                    race.note(trial, step, result)
-                    if trial.number > 0 and self._drops(trial.number, position, outcomes):
-                        text = f"dropped after {step} of {self.steps[-1]} blocks"
-                        trial.set_user_attr("reason", text)
-                        return TrialState.PRUNED, None, text
-        except CancelledError:
-            trial.set_user_attr("reason", CRASHED_WORKER)
-            return TrialState.FAIL, None, "interrupted"
-        except BlockFailedError as error:
-            trial.set_user_attr("reason", str(error))
-            return TrialState.FAIL, None, f"failed: {error}"
-        finally:
-            trial.set_user_attr("wall_s", round(time.perf_counter() - started, 3))
-        return TrialState.COMPLETE, result, self._describe(result, outcomes)
-
-    def values(self, outcomes: Outcomes) -> list[float]:
-        """The objectives' values: natural logarithms of ratios to the default settings, less is better."""
-        return [each.value(outcomes, self._reference) for each in self.objectives]
-
-    def _describe(self, result: list[float], outcomes: Outcomes) -> str:
-        parts = [f"{each.what} x {math.exp(value):.3f}" for each, value in zip(self.objectives, result, strict=True)]
-        violated = [name for name, value in violations(self.spec, outcomes, self._reference).items() if value > 0]
-        return ", ".join(parts) + (f", violates {' and '.join(violated)}" if violated else "")
-
-    def _drops(self, number: int, position: int, outcomes: Mapping[Block, Outcome]) -> bool:
-        """Whether a trial leaves the race at a step."""
-        if self.spec.race == "wilcoxon":
-            best = best_trials(self.study, 1)
-            return bool(best) and race.is_worse(errors_in(outcomes), errors_of(best[0]))
-        trials = self.study.get_trials(deepcopy=False)
-        return race.leaves(trials, number, self.steps, position)
-
-    def _record(self, trial: optuna.Trial, outcomes: Mapping[Block, Outcome], *, final: bool) -> None:
-        set_constraints(trial, violations(self.spec, outcomes, self._reference), final=final)
-        trial.set_user_attr("coverage", coverage(outcomes))
-        trial.set_user_attr("fps", fps(outcomes))
-        rows = [[str(block), o.run_id, o.ate_m, o.coverage, o.frame_s] for block, o in outcomes.items()]
-        trial.set_user_attr("blocks", rows)
-
-    def _more(self) -> bool:
-        """Whether another trial is wanted; running ones count, those of dead workers do not."""
-        with self._lock:
-            self._bury_dead_workers()
-            trials = self.study.get_trials(deepcopy=False)
-            counted = [t for t in trials if t.state in DONE and t.user_attrs.get("reason") != CRASHED_WORKER]
-            running = [t for t in trials if t.state == TrialState.RUNNING]
-            return len(counted) + len(running) < self.spec.trials
-
-    def _bury_dead_workers(self) -> None:
-        """Trials that a killed worker of this host left running are over."""
-        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            worker = trial.user_attrs.get("worker", "")
-            if worker and worker_is_dead(worker):
-                with suppress(RuntimeError):  # another worker has buried it meanwhile
-                    self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
-                    self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
-
-    def _open(self, sampler: optuna.samplers.BaseSampler) -> optuna.Study:
-        """The stored study, or a new one whose first trial is the default, whatever is enqueued later."""
-        name, absent = self.spec.name, f"there is no study '{self.spec.name}' in {self.results}"
-        if self.reading and not self.spec.storage and not self.folder.is_dir():
-            raise StudyError(absent, "dynslam-bench tune run STUDY.toml")
-        storage = open_storage(self.results, self.spec)
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        how: dict[str, Any] = {"storage": storage, "study_name": name, "sampler": sampler}
-        how["pruner"] = optuna.pruners.NopPruner()
-        try:
-            if self.reading:
-                study = optuna.load_study(**how)
-            else:
-                study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
-                self._begin(study)
-        except optuna.exceptions.DuplicatedStudyError:
-            study = optuna.load_study(**how)
+            opened.study = optuna.load_study(study_name=spec.name, storage=open_storage(root, spec))
         except KeyError as error:
-            raise StudyError(absent, "dynslam-bench tune run STUDY.toml") from error
-        except Exception as error:  # storages raise their drivers' errors
-            said = without_password(f"cannot open study '{name}': {error}", self.spec.storage)
-            raise StudyError(said) from None
-        stored, identity = _identity_of(study), self._identity()
-        if stored is None:
             raise StudyError(
-                f"the storage holds a study '{name}' that is none of this toolkit", "give yours another name"
-            )
-        if not same(stored, identity, but=MADE_OF if self.reading else ()):
-            raise StudyError(
-                f"study '{name}' is stored with other {difference(stored, identity)}",
-                f"give the study another name, or delete {self.folder}",
-            )
-        if not self.spec.storage:
-            write_atomic(self.folder / "study.json", json.dumps(self.spec.for_others(), indent=2) + "\n")
-        return study
+                f"the storage holds no study '{spec.name}'", "dynslam-bench tune run STUDY.toml"
+            ) from error
+        opened.spec, opened._tuner = spec, None
+        return opened
 
-    def _begin(self, study: optuna.Study) -> None:
-        """What a new study begins with; the identity comes last, others wait for it."""
-        study.set_user_attr("spec", self.spec.for_others())
-        study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            study.set_metric_names(list(self.spec.objectives))
-        study.enqueue_trial(default_configuration(self.space, self.base))
-        study.set_user_attr("identity", self._identity())
+    def run(self, *, jobs: int = 1) -> Study:
+        """Run the trials that are missing; a pilot first, if the study is new and asks for one.
 
-    def _identity(self) -> dict[str, Any]:
-        """What must be the same when a study is resumed."""
-        spec = self.spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "pilot"})
-        if not self.spec.allow_overlap:
-            del spec["allow_overlap"]  # as in studies of before it was there
-        identity = {**spec, "parameters": digest([repr(parameter) for parameter in self.space])}
-        return identity if self.reading else identity | self._made_of()
+        Raises:
+            StudyError: The default settings fail, the pilot shows that the study could find nothing, or it was opened
+                to be looked at.
+        """
+        tuner = self._running()
+        begin(tuner, jobs=jobs)
+        tuner.run(jobs=jobs, on_event=self._call_back)
+        return self
 
-    def _made_of(self) -> dict[str, Any]:
-        """The content of the study's sequences, and the program that runs on them: code, weights, libraries, device."""
-        spec = self.spec
-        first: dict[str, Block] = {}
-        for block in spec.blocks(*spec.tune, *spec.confirm, *spec.held_out):
-            first.setdefault(block.sequence, block)
-        how: dict[str, Any] = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(spec.space.fixed)}
-        data: dict[str, str] = {}
-        program: dict[str, str] = {}
-        for sequence, block in first.items():
-            identity = resolve(block.run_spec(spec.tracker, **how)).identity
-            data[sequence] = digest([identity["content"], identity["camera"]])
-            program |= program_of(identity) | {"device": identity["device"]}
-        return {"data": data, "program": program}
+    def finish(self, *, jobs: int = 1) -> StudySummary:
+        """Judge the best trials, write presets, summary and page; see `final_runs.finish`."""
+        tuner = self._running()
+        summary = finish(tuner, jobs=jobs)
+        write_page(tuner, summary)
+        return summary
+
+    def pilot(self, *, jobs: int = 1) -> Pilot:
+        """What the study's instances could show; see `pilot_of`."""
+        return pilot_of(self._running(), jobs=jobs)
+
+    def screen(self, *, points: int = 2, instances: int = 4, jobs: int = 1) -> Screening:
+        """Which settings matter; see `screen_study`."""
+        return screen_study(self._running(), points=points, instances=instances, jobs=jobs)
+
+    def frame(self) -> pd.DataFrame:
+        """All trials; see `trials.trials_frame`.
+
+        Raises:
+            StudyError: The storage holds something else than this package stores of a trial.
+        """
+        try:
+            return trials_frame(self.spec, self.study)
+        except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError) as error:
+            raise StudyError(f"the storage of study '{self.spec.name}' holds what is no trial: {error}") from error
+
+    def _running(self) -> Tuner:
+        if self._tuner is None:
+            raise StudyError(f"study '{self.spec.name}' was opened to be looked at", "Study(...) makes one to run")
+        return self._tuner
+
+    def _call_back(self, event: StudyEvent) -> None:
+        if event.kind == "finished" and self._callbacks:
+            trial = self.study.get_trials(deepcopy=False)[event.number]
+            for callback in self._callbacks:
+                callback(self.study, trial)
 
 
-def _identity_of(study: optuna.Study, wait_s: float = 10.0) -> dict[str, Any] | None:
-    """What a stored study was made with, as soon as the worker that begins it has said so; None if nobody does."""
-    deadline = time.monotonic() + wait_s
-    while (found := study.user_attrs.get("identity")) is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return None if found is None else dict(found)
+def read_preset(path: Path) -> dict[str, Scalar]:
+    """A preset's settings by dotted name.
+
+    Raises:
+        SettingsError: It cannot be read, or is no TOML.
+    """
+    try:
+        return dict(_flat(read_toml(path.expanduser())))
+    except SequenceError as error:
+        raise SettingsError(str(error)) from None
 
 
-def _tell(
-    on_event: OnEvent | None, kind: Literal["reference", "started", "finished"], number: int, total: int, text: str
-) -> None:
-    if on_event is not None:
-        on_event(StudyEvent(kind, number, total, text))
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _objectives(given: str | Cost | Sequence[str | Cost] | None) -> list[Objective] | None:
+    if given is None:
+        return None
+    several = [given] if isinstance(given, str) or callable(given) else given
+    return [find_objective(one) if isinstance(one, str) else own_objective(one) for one in several]
+
+
+def _texts(value: Any) -> Any:
+    """Instances as the texts that name them; any other value as it is."""
+    values = value if isinstance(value, list | tuple) else [value]
+    return tuple(map(str, values)) if any(isinstance(item, ProblemInstance) for item in values) else value
+
+
+def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, Path]:
+    """The study and the results folder that it lies in."""
+    if isinstance(study, StudySpec):
+        return study, results
+    path = Path(study).expanduser()
+    stored = path / _SPEC_FILE
+    if stored.is_file():
+        return make_spec(read_json(stored, kind=StudyError), str(stored)), path.absolute().parents[1]
+    if path.is_dir():
+        raise StudyError(f"{path} holds no study: it has no {_SPEC_FILE}", "name results/studies/NAME")
+    return read_study(path), results
+
+
+# Running studies: a pilot first, then the trials; and the screening that may come before both.
+
+PILOT_FILE, SCREENING_FILE = "pilot.json", "screening.json"
+SCREENED_INSTANCES = 4
+"""Instances that a screening takes if nothing else is asked for."""
+
+
+def run_study(
+    spec: StudySpec,
+    *,
+    results: str | Path = "results",
+    jobs: int = 1,
+    on_event: OnEvent | None = None,
+    on_run: OnRun | None = None,
+) -> Tuner:
+    """Run a study to its end, or go on with it; a pilot runs first where the study asks for one.
+
+    Args:
+        spec: The study.
+        results: The results folder; the study's own files lie in ``studies/<name>``.
+        jobs: Trials at a time.
+        on_event: Called with every event.
+        on_run: Called with every event of every run, those of `finish` included.
+
+    Returns:
+        The study, for `finish`.
+
+    Raises:
+        DynslamError: See `Tuner`; or the pilot shows that the study could find nothing.
+    """
+    tuner = Tuner(spec, results)
+    tuner.on_run = on_run
+    begin(tuner, jobs=jobs, on_event=on_event)
+    tuner.run(jobs=jobs, on_event=on_event)
+    return tuner
+
+
+def begin(tuner: Tuner, *, jobs: int = 1, on_event: OnEvent | None = None) -> None:
+    """Run a new study's pilot, if it asks for one, and report what it shows.
+
+    Raises:
+        StudyError: The study could find nothing.
+    """
+    if not tuner.spec.pilot or (tuner.folder / PILOT_FILE).is_file() or tuner.study.get_trials(deepcopy=False)[1:]:
+        return
+    if len(scenes(tuner.design.tune)) < FEWEST:
+        texts = [f"no pilot: it takes {FEWEST} scenes to tune on"]
+        pilot = None
+    else:
+        pilot = pilot_of(tuner, jobs=jobs)
+        texts = [pilot.sentence, *filter(None, [pilot.warning])]
+    for text in texts:
+        if on_event is not None:
+            on_event(StudyEvent("pilot", 0, 1, text))
+    if pilot is not None and not tuner.spec.at_equal_accuracy:  # settings that leave the poses alone show their speed
+        refuse_hopeless(pilot)
+
+
+def pilot_of(tuner: Tuner, *, jobs: int = 1) -> Pilot:
+    """Run a study's pilot; `pilot.json` in its folder holds it.
+
+    It looks at the study's own objectives, or at accuracy where a gain counts only at equal accuracy.
+
+    Raises:
+        StudyError: The default settings fail, or there are too few scenes.
+    """
+
+    def run(values: Mapping[str, Any], instances: Sequence[ProblemInstance]) -> Outcomes:
+        return tuner.evaluate({**tuner.spec.space.fixed, **values}, instances, jobs=jobs)
+
+    objective = ACCURACY if tuner.spec.at_equal_accuracy else together(tuner.objectives)
+    split = tuner.design.held_out if len(scenes(tuner.design.held_out)) >= FEWEST else None
+    pilot = run_pilot(
+        tuner.space, tuner.base, run, tuner.design.reference, objective,
+        seed=tuner.spec.sampler_seed, jobs=jobs, split=split,
+    )  # fmt: skip
+    write_atomic(tuner.folder / PILOT_FILE, pilot.to_json())
+    return pilot
+
+
+def screen_study(
+    tuner: Tuner, *, points: int = 2, instances: int = SCREENED_INSTANCES, jobs: int = 1,
+    on_done: Callable[[int, int], None] | None = None,
+) -> Screening:  # fmt: skip
+    """Find the settings of a study's space that matter; `screening.json` in its folder holds them.
+
+    Args:
+        tuner: The study.
+        points: From how many points settings are moved: the default and others near it.
+        instances: On how many of its instances, of different scenes where there are so many.
+        jobs: Runs at a time.
+        on_done: Called with the number of finished configurations and of all.
+
+    Raises:
+        StudyError: See `screening.screen`.
+    """
+    chosen = tuner.design.tune[:instances]
+    objectives = list(dict.fromkeys([*tuner.objectives, ACCURACY]))
+
+    def run(values: Mapping[str, Scalar]) -> Outcomes:
+        return tuner.evaluate({**tuner.spec.space.fixed, **values}, chosen)
+
+    usable = live(tuner.space, tuner.base)
+    if not usable:
+        raise StudyError("no setting of the space has an effect at the default", "fix what switches them on")
+    steps = plan(usable, tuner.base, points, tuner.spec.sampler_seed)
+    screening = screen(steps, run, objectives, jobs=jobs, on_done=on_done)
+    write_atomic(tuner.folder / SCREENING_FILE, screening.to_json())
+    return screening

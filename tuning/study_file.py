@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
-from dynslam_bench.core.passwords import without_passwords
-from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.records import Record
+from dynslam_bench.core.sanitise import without_passwords
 from dynslam_bench.core.toml import read_toml
-
-from .blocks import Block, parse_blocks
-from .old_form import converted
+from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
-RaceName = Literal["halving", "rejection", "wilcoxon", "none"]
+PrunerName = Literal["halving", "wilcoxon", "none"]
 EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
 """Objectives that hold the error themselves."""
 Offset = Annotated[int, Field(ge=0)]
@@ -47,34 +44,34 @@ class StudySpec(_Part):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        tune: Blocks that trials run on, written as `blocks.parse_blocks` reads them:
+        tune: Instances that trials run on, written as `instances.parse_instances` reads them:
             ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
-        confirm: Blocks that no trial runs on, on which the best of them are judged again and the choice is made. Empty
-            for a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
-        held_out: Blocks that decide at the end whether tuning helped; neither trials nor the choice see them.
-        recorded: Blocks of recordings that the choice must not be worse on; None for the first frames of a held-out
+        confirm: Instances that no trial runs on. The best trials are judged again on them, and one is chosen. Empty for
+            a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
+        held_out: Instances that decide at the end whether tuning helped; neither trials nor the choice see them.
+        recorded: Instances of recordings that the choice must not be worse on; None for the first frames of a held-out
             recording where one is present.
         space: Which settings are tuned.
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their scene gives to the
             other split; every table of the study then says so.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
-            minimised, see `statistics.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
-            the worst quarter of the scenes; ``robustness``: ATE on the degraded blocks; ``coverage``: share of lost
+            minimised, see `objectives.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
+            the worst quarter of the scenes; ``robustness``: ATE on the degraded instances; ``coverage``: share of lost
             frames.
         ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
             ATE ratio must lie below 1 + this.
         pilot: Whether a pilot runs first and refuses a study that could show nothing.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
-        seeds: Seeds of the blocks that name none. A seed changes nothing for a tracker that draws nothing from it.
-        offsets: Start offsets of the blocks that name none: so many leading frames are left out.
+        seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that draws nothing from it.
+        offsets: Start offsets of the instances that name none: so many leading frames are left out.
         trials: Finished trials, trial 0 (the default settings) included.
         timeout_s: No trial begins after this many seconds; None for no limit.
         top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
-        race: How trials drop out: by sequential ``halving`` over growing sets of blocks, by successive ``rejection``
-            after every block, by ``wilcoxon``'s test against the best one, or ``none``.
+        pruner: ``halving`` is Optuna's `SuccessiveHalvingPruner` over growing sets of instances, ``wilcoxon`` its
+            `WilcoxonPruner` over the single instances, ``none`` its `NopPruner`.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
             ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
             ``~/.pgpass``): it is in no file that is written.
@@ -104,7 +101,7 @@ class StudySpec(_Part):
     top: int = Field(default=3, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0
-    race: RaceName = "halving"
+    pruner: PrunerName = "halving"
     storage: str = ""
     protocol: str = "tum-rgbd/v1"
     cache: bool = True
@@ -114,58 +111,53 @@ class StudySpec(_Part):
     @model_validator(mode="after")
     def _splits_are_apart(self) -> StudySpec:
         for name in ("tune", "confirm", "held_out", "recorded", "seeds", "offsets", "objectives"):
-            values = getattr(self, name) or ()
-            twice = sorted({str(value) for value in values if list(values).count(value) > 1})
-            if twice:
-                raise ValueError(f"{name} names '{twice[0]}' twice")
-        judged = {block.scene: text for text in reversed(self.held_out) for block in self.blocks(text)}
-        both = {block.scene: text for text in (*self.tune, *self.confirm) for block in self.blocks(text)
-                if block.scene in judged}  # fmt: skip
-        if both and not self.allow_overlap:
-            scene, one = next(iter(both.items()))
-            spelled = "" if one == judged[scene] else f", held out as '{judged[scene]}'"
-            raise ValueError(f"the tune and held_out splits share {len(both)} sequences, the first is '{one}'{spelled}")
+            values = [str(value) for value in getattr(self, name) or ()]
+            repeated = next((value for value in values if values.count(value) > 1), None)
+            if repeated is not None:
+                raise ValueError(f"{name} names '{repeated}' twice")
+        held_out = {instance.scene: text for text in reversed(self.held_out) for instance in self.instances(text)}
+        shared = {
+            instance.scene: text
+            for text in (*self.tune, *self.confirm)
+            for instance in self.instances(text)
+            if instance.scene in held_out
+        }
+        if shared and not self.allow_overlap:
+            scene, text = next(iter(shared.items()))
+            other = "" if text == held_out[scene] else f", held out as '{held_out[scene]}'"
+            raise ValueError(
+                f"the tune and held_out splits share {len(shared)} sequences, the first is '{text}'{other}"
+            )
         return self
 
-    def blocks(self, *texts: str) -> list[Block]:
-        """The blocks that texts of this study name.
+    def instances(self, *texts: str) -> list[ProblemInstance]:
+        """The instances that texts of this study name.
 
         Raises:
             StudyError: One cannot be read.
         """
-        return [block for text in texts for block in parse_blocks(text, offsets=self.offsets, seeds=self.seeds)]
+        return [
+            instance for text in texts for instance in parse_instances(text, offsets=self.offsets, seeds=self.seeds)
+        ]
 
     @property
     def at_equal_accuracy(self) -> bool:
         """Whether a gain counts only at (nearly) the default's accuracy, as it may be paid for with the error."""
         return len(self.objectives) > 1 or self.objectives[0] not in EQUALLY_ACCURATE
 
-    def digest(self) -> str:
-        """Digest of everything that decides the result: not the number of trials, the limits or the storage."""
-        free = {"trials", "timeout_s", "top", "storage", "pilot"}
-        return digest(self.model_dump(mode="json", exclude=free))
-
     def for_others(self) -> dict[str, Any]:
         """The study as it is written down beside its trials: without the password of its storage."""
         return self.model_dump(mode="json") | {"storage": without_passwords(self.storage)}
 
 
-def read_study(path: str | Path, on_note: Callable[[str], None] | None = None) -> StudySpec:
+def read_study(path: str | Path) -> StudySpec:
     """Read a study file.
-
-    Args:
-        path: The file.
-        on_note: Told what was converted, if the file has an old form.
 
     Raises:
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
     """
     path = Path(path)
-    values, notes = converted({"name": path.stem, **read_toml(path, kind=StudyError)})
-    if on_note is not None:
-        for text in notes:
-            on_note(f"{path} has an old form: {text}")
-    return make_spec(values, str(path))
+    return make_spec({"name": path.stem, **read_toml(path, kind=StudyError)}, str(path))
 
 
 def make_spec(values: Any, where: str) -> StudySpec:
@@ -186,7 +178,7 @@ def make_spec(values: Any, where: str) -> StudySpec:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
-            known = [*StudySpec.model_fields, *(f"space.{name}" for name in SpaceSpec.model_fields)]
-            raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, known)) from None
+            key_names = [*StudySpec.model_fields, *(f"space.{name}" for name in SpaceSpec.model_fields)]
+            raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, key_names)) from None
         text = first["msg"].removeprefix("Value error, ")
         raise StudyError(f"{where}: {field + ': ' if field else ''}{text}") from None

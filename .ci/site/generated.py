@@ -8,7 +8,8 @@ from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.trackers import TRACKERS
 
 ROOMS = {
-    "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.steering", "core.errors"]),
+    "api": ("Public interface", ["api"]),
+    "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.errors"]),
     "sequences": (
         "Sequences and geometry",
         ["sequences", "sequences.synthetic", "geometry.camera", "geometry.trajectory", "geometry.se3"],
@@ -75,6 +76,11 @@ def _other_defaults(cls: type[Settings], held: dict[str, Settings]) -> list[str]
     return ["Other defaults:\n\n" + "\n".join(lines) + "\n"] if lines else []
 
 
+def slug(tracker: str) -> str:
+    """The anchor of a tracker; ids of variants hold characters that no anchor may have."""
+    return tracker.translate(str.maketrans("?=&", "---"))
+
+
 def anchor(name: str, cls: type[Settings]) -> str:
     """Where a group's table stands on the page of settings."""
     return f"{name}-{cls.__name__.lower()}"
@@ -84,7 +90,7 @@ def systems() -> str:
     """Every built-in tracker: what it is, whose it is, what was assumed, which settings it has."""
     specs = [found.spec for found in TRACKERS.all()]
     rows = [
-        f"| [`{s.id}`](#{s.id}) | {s.label} | {s.provenance} | {'yes' if s.ranked else 'no'} | {s.summary} |"
+        f"| [`{s.id}`](#{slug(s.id)}) | {s.label} | {s.provenance} | {'yes' if s.ranked else 'no'} | {s.summary} |"
         for s in specs
     ]
     table = "\n".join(["| id | label | provenance | ranked | what it does |", "| --- | --- | --- | --- | --- |", *rows])
@@ -108,7 +114,7 @@ def _system(spec: TrackerSpec) -> str:
         "Remarks": spec.remarks,
     }
     lines = "\n".join(f"- **{name}.** {value}" for name, value in facts.items() if value)
-    return f"## {spec.label} {{ #{spec.id} }}\n\n`{spec.id}`: {spec.summary}.\n\n{lines}\n"
+    return f"## {spec.label} {{ #{slug(spec.id)} }}\n\n`{spec.id}`: {spec.summary}.\n\n{lines}\n"
 
 
 def protocols() -> str:
@@ -136,4 +142,4 @@ def commands() -> str:
 def _held_by(trackers: list[str]) -> str:
     if len(trackers) > MANY:
         return f"{len(trackers)} [systems](systems.md) have it."
-    return "Systems that have it: " + ", ".join(f"[`{name}`](systems.md#{name})" for name in trackers) + "."
+    return "Systems that have it: " + ", ".join(f"[`{name}`](systems.md#{slug(name)})" for name in trackers) + "."

@@ -2,27 +2,57 @@
 
 from __future__ import annotations
 
-__all__ = ["main"]
+import os
+import signal
+import sys
+from io import TextIOWrapper
+from types import FrameType
+
+__all__ = ["interrupted", "leave_interrupted", "main"]
+
+RESUMABLE = ("run", "bench", "tune", "demo", "report", "segmenter", "sequences")
+"""Verbs that keep finished work when they are interrupted."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNAL_CODE = 128
+"""A shell's exit code for a signal is this plus the signal's number."""
+_received: list[int] = []
 
 
 def main() -> None:
     """Entry point of ``dynslam-bench``.
 
     Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed or were lost (or could not
-    write the map that was asked for), 4 verification failed, 128 and the signal's number after one (130 for Ctrl-C).
+    write the map that was asked for), 4 verification failed, 128 plus the signal's number after one (130 for Ctrl-C).
     """
-    import sys
-    from io import TextIOWrapper
-
-    from .ending import leave_interrupted, watch_signals
-
-    watch_signals()
+    for number in _SIGNALS:  # an ignored signal, e.g. SIGHUP below `nohup`, stays ignored
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _interrupt)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a terminal of another encoding shows ? in place of what it lacks
+        if isinstance(stream, TextIOWrapper):  # a terminal of another encoding shows ? for characters that it lacks
             stream.reconfigure(errors="replace")
     try:
-        from .app import start
+        from dynslam_bench.cli.app import start
 
         start()
     except KeyboardInterrupt:
         leave_interrupted()
+
+
+def interrupted() -> bool:
+    """Whether a signal to end was received."""
+    return bool(_received)
+
+
+def leave_interrupted() -> None:
+    """Say how to continue, and exit: with 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
+    resume = "; what is finished is stored, the same command goes on from there"
+    sys.stderr.write(f"interrupted{resume if sys.argv[1:2] and sys.argv[1] in RESUMABLE else ''}\n")
+    sys.exit(_SIGNAL_CODE + (_received[0] if _received else signal.SIGINT))
+
+
+def _interrupt(number: int, _: FrameType | None) -> None:
+    """Raise `KeyboardInterrupt` in the main thread; a second signal ends the process at once."""
+    _received.append(number)
+    if len(_received) > 1:
+        os._exit(_SIGNAL_CODE + number)  # the fork server notices, and ends the runs
+    raise KeyboardInterrupt

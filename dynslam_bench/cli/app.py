@@ -8,28 +8,27 @@ from typing import Annotated, Optional
 
 import typer
 
-from dynslam_bench.core.download_progress import show_downloads
-from dynslam_bench.core.errors import DynslamError
-
-from . import (
-    caches,
-    doctor,
-    environments,
-    evaluating,
-    imports,
-    presentation,
+from dynslam_bench.cli import (
+    interrupted,
+    leave_interrupted,
+    maintenance,
+    reports,
     running,
+    runs,
     segmenters,
     sequences,
-    stored,
     studies,
     trackers,
+    trajectories,
 )
-from .ending import interrupted, leave_interrupted
-from .output import complain_of, drawn_download, for_scripts
-from .panels import CARE, MEASURE, REPORT, START
+from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START
+from dynslam_bench.cli.output import download_bar, set_json_mode, write_error
+from dynslam_bench.core.download import show_downloads
+from dynslam_bench.core.errors import DynslamError
 
 INTERRUPT_CODE = 130
+LISTS = ("--seed", "--offset")
+"""Options that take several whole numbers."""
 app = typer.Typer(
     name="dynslam-bench",
     help="Benchmark and tune visual SLAM in dynamic scenes.",
@@ -38,19 +37,17 @@ app = typer.Typer(
     add_completion=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-presentation.add_demo(app)
+app.command(rich_help_panel=START)(reports.demo)
 app.add_typer(sequences.app, name="sequences", rich_help_panel=START)
 app.add_typer(trackers.app, name="trackers", rich_help_panel=START)
 running.add(app)
-app.add_typer(stored.app, name="runs", rich_help_panel=MEASURE)
-evaluating.add(app)
+app.add_typer(runs.app, name="runs", rich_help_panel=MEASURE)
+trajectories.add(app)
 app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
-presentation.add_report(app)
-imports.add(app)
+app.add_typer(reports.app, name="report", rich_help_panel=REPORT)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
-app.add_typer(caches.app, name="cache", rich_help_panel=CARE)
-environments.add(app)
-doctor.add(app)
+app.add_typer(maintenance.cache, name="cache", rich_help_panel=CARE)
+maintenance.add(app)
 
 
 def _version(asked: bool) -> None:
@@ -69,50 +66,46 @@ def _root(
     ] = None,
 ) -> None:
     """Benchmark and tune visual SLAM in dynamic scenes."""
-    show_downloads(drawn_download)
+    show_downloads(download_bar)
 
 
 def start(arguments: list[str] | None = None) -> None:
     """Run the program and exit.
 
     Args:
-        arguments: What follows the program's name; by default the command line's.
+        arguments: The command line without the program's name; by default that of the process.
     """
     arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
     try:
         app(args=arguments, prog_name="dynslam-bench")
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader went away, e.g. `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has ended, e.g. `| head`
         sys.exit(0)
     except Exception as error:
-        if interrupted():  # libraries make errors of their own of an interrupt that meets them
+        if interrupted():  # libraries turn an interrupt into errors of their own
             leave_interrupted()
         if not isinstance(error, DynslamError):
             raise
-        complain_of(error)
+        write_error(error)
         sys.exit(1)
     except SystemExit as ended:  # typer turns an interrupt within a command into this
         if ended.code == INTERRUPT_CODE:
             leave_interrupted()
         raise
     finally:
-        for_scripts(False)
-
-
-LISTS = ("--seed", "--offset")
-"""Options that take several whole numbers."""
+        set_json_mode(False)
 
 
 def expand_lists(arguments: list[str]) -> list[str]:
     """Let ``--seed 0 1 2`` stand for ``--seed 0 --seed 1 --seed 2``; likewise every option of `LISTS`."""
     expanded: list[str] = []
-    following = ""
+    option = ""
     for argument in arguments:
         if argument in LISTS:
-            following = argument
+            option = argument
         elif not argument.isdigit():
-            following = ""
-        elif following and expanded[-1] not in LISTS:
-            expanded.append(following)
+            option = ""
+        elif option and expanded[-1] not in LISTS:
+            expanded.append(option)
         expanded.append(argument)
     return expanded

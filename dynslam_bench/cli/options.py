@@ -1,20 +1,137 @@
-"""Options that several verbs share."""
+"""Options that several verbs share, their shell completion, and the classes of commands and groups."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from . import completion
-from .output import for_scripts
+from dynslam_bench.cli.output import set_json_mode
+from dynslam_bench.core.errors import DynslamError
 
+if TYPE_CHECKING:
+    from dynslam_bench.contracts.tracker import TrackerSpec
+
+START, MEASURE = "Begin here", "Run and measure"
+REPORT, CARE = "Report and tune", "Extend and care"
+"""Headings below which the program's help lists its verbs."""
 FRAMES, SETTINGS = "Which frames, how often", "The tracker's settings"
-TRAJECTORY_FORMATS = "TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP"
 MACHINE, OUTPUT = "The machine, and how much of it", "What is kept and shown"
 """Headings of the options' help."""
+TRAJECTORY_FORMATS = "TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP"
 
+
+class DefaultGroup(TyperGroup):
+    """A group with the default verb ``make``: ``report results`` is ``report make results``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the default verb where none is named."""
+        if not args or (args[0] not in self.commands and args[0] not in ("-h", "--help")):
+            args = ["make", *args]
+        return super().parse_args(ctx, args)
+
+
+class ShortHelp(TyperCommand):
+    """A command whose ``--help`` leaves out rarely used options; ``--help-all`` shows them."""
+
+    RARE = frozenset(
+        "stride threads realtime drop degrade cache video rrd save_map start_map localisation_only label "
+        "time_limit memory_limit retry scheduler".split()
+    )
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help."""
+        for parameter in self.params:
+            if isinstance(parameter, TyperOption):
+                parameter.hidden = parameter.name in self.RARE and not ctx.meta.get("help-all")
+        super().format_help(ctx, formatter)
+
+
+def _help_all(ctx: typer.Context, on: bool) -> None:
+    if on:
+        ctx.meta["help-all"] = True
+        typer.echo(ctx.get_help())
+        raise typer.Exit
+
+
+def complete_trackers() -> Iterable[str]:
+    """Trackers by their id."""
+    from dynslam_bench.trackers import TRACKERS
+
+    return [entry.spec.id for entry in TRACKERS.all()]
+
+
+def complete_sequences() -> Iterable[str]:
+    """Ids of the catalogue and of rendered sequences."""
+    from dynslam_bench.sequences.catalogue import summaries
+
+    return [summary.id for summary in summaries()]
+
+
+def complete_settings(ctx: typer.Context, incomplete: str) -> Iterable[str]:
+    """``NAME=`` of every setting of the tracker on the command line, and ``NAME=CHOICE`` where it has choices."""
+    from dynslam_bench.core.settings import flatten, parameters
+
+    spec = _tracker(ctx)
+    if spec is None:
+        return []
+    if "=" not in incomplete:
+        return [f"{name}=" for name in flatten(spec.settings())]
+    return [f"{p.name}={choice}" for p in parameters(spec.settings) for choice in p.choices or ()]
+
+
+def complete_presets(ctx: typer.Context) -> Iterable[str]:
+    """Presets of the tracker on the command line."""
+    spec = _tracker(ctx)
+    return [] if spec is None else list(spec.presets)
+
+
+def complete_suites() -> Iterable[str]:
+    """Names of the shipped suites, and TOML files."""
+    from dynslam_bench.suites import suite_names
+
+    return [*suite_names(), *map(str, Path().glob("*.toml"))]
+
+
+def complete_formats() -> Iterable[str]:
+    """Formats that `export` writes."""
+    from dynslam_bench.runs.exchange.export import FORMATS
+
+    return list(FORMATS)
+
+
+def complete_protocols() -> Iterable[str]:
+    """Protocols by their id."""
+    from dynslam_bench.evaluation.protocol import PROTOCOLS
+
+    return list(PROTOCOLS)
+
+
+def complete_statuses() -> Iterable[str]:
+    """The statuses of runs."""
+    from typing import get_args
+
+    from dynslam_bench.runs.record import Status
+
+    return get_args(Status)
+
+
+def _tracker(ctx: typer.Context) -> TrackerSpec | None:
+    """The tracker on the command line, its first word; None if it is unknown."""
+    from dynslam_bench.trackers import TRACKERS
+
+    try:
+        return TRACKERS.get(str(ctx.params.get("tracker") or next(iter(ctx.args), "")))
+    except DynslamError:
+        return None
+
+
+HelpAll = Annotated[
+    bool, typer.Option("--help-all", is_eager=True, callback=_help_all, help="Show all options and exit.")
+]
 DataRoot = Annotated[
     Optional[Path],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
     typer.Option(
@@ -27,7 +144,7 @@ Results = Annotated[Path, typer.Option("--results", help="Results folder.", rich
 AsJson = Annotated[
     bool,
     typer.Option(
-        "--json", callback=for_scripts, help="Write JSON for scripts, and nothing else.", rich_help_panel=OUTPUT
+        "--json", callback=set_json_mode, help="Write JSON for scripts, and nothing else.", rich_help_panel=OUTPUT
     ),
 ]
 Camera = Annotated[
@@ -71,7 +188,7 @@ Assignments = Annotated[
         metavar="NAME=VALUE",
         help="Set a setting, e.g. features.n_features=800; repeatable.",
         rich_help_panel=SETTINGS,
-        autocompletion=completion.settings,
+        autocompletion=complete_settings,
     ),
 ]
 SettingsFile = Annotated[
@@ -94,7 +211,7 @@ ProtocolId = Annotated[
         "--protocol",
         help="How to evaluate; see `protocols list`.",
         rich_help_panel=OUTPUT,
-        autocompletion=completion.protocols,
+        autocompletion=complete_protocols,
     ),
 ]
 Retry = Annotated[
@@ -103,13 +220,13 @@ Retry = Annotated[
         "--retry",
         help="Run again what ended so: failed, or a status.",
         rich_help_panel=OUTPUT,
-        autocompletion=completion.statuses,
+        autocompletion=complete_statuses,
     ),
 ]
 Preset = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
-        "--preset", help="A preset of the tracker.", rich_help_panel=SETTINGS, autocompletion=completion.presets
+        "--preset", help="A preset of the tracker.", rich_help_panel=SETTINGS, autocompletion=complete_presets
     ),
 ]
 Realtime = Annotated[
@@ -160,9 +277,7 @@ Label = Annotated[
 ]
 Trackers = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option(
-        "--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=completion.trackers
-    ),
+    typer.Option("--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=complete_trackers),
 ]
 Scheduler = Annotated[
     Optional[str],  # noqa: UP045
@@ -192,16 +307,14 @@ MemoryLimit = Annotated[
 ]
 
 
-def gather_settings(assignments: list[str] | None, file: Path | None, preset: dict[str, Any]) -> dict[str, Any]:
-    """Overrides by dotted name: the preset's, then the file's, then the assignments'.
+def gather_settings(assignments: list[str] | None, file: Path | None = None) -> dict[str, Any]:
+    """Overrides by dotted name: the assignments go before the file.
 
     Raises:
-        SettingsError: The file cannot be read, or an assignment is none.
+        SettingsError: The file cannot be read, or an assignment is not of the form NAME=VALUE.
     """
     from dynslam_bench.core.settings import parse_assignments
     from dynslam_bench.core.toml import read_settings
 
-    merged = dict(preset)
-    if file is not None:
-        merged |= read_settings(file)
-    return merged | parse_assignments(assignments or ())
+    overrides = {} if file is None else read_settings(file)
+    return overrides | parse_assignments(assignments or ())

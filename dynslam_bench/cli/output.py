@@ -1,4 +1,4 @@
-"""What commands write: tables for people, JSON for scripts, progress only where somebody watches."""
+"""What commands write: tables for people, JSON for scripts, progress on a terminal."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
-from dynslam_bench.core.download_progress import Report
-from dynslam_bench.core.harmless import printable
+from dynslam_bench.core.download import Report
+from dynslam_bench.core.sanitise import printable
 
 if TYPE_CHECKING:
     from dynslam_bench.core.errors import DynslamError
@@ -21,47 +21,52 @@ if TYPE_CHECKING:
 
 SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
+HEARTBEAT_S = 10.0
+"""Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
+_MIN_WIDTH = 8
+"""Characters that a shortened column keeps."""
+
+_json_mode = False
+"""Whether ``--json`` was given: then nothing but errors goes to standard error."""
 
 
-_for_scripts = False
-"""Whether the command that runs was asked for JSON: then nothing but errors goes to standard error."""
+def set_json_mode(on: bool) -> bool:
+    """Switch between JSON and text; the callback of ``--json``, undone when the program ends."""
+    global _json_mode
+    _json_mode = on
+    return on
 
 
-def for_scripts(asked: bool) -> bool:
-    """Say whether JSON is asked for; the callback of ``--json``, and taken back where the program ends."""
-    global _for_scripts
-    _for_scripts = asked
-    return asked
+def json_mode() -> bool:
+    """Whether JSON is written."""
+    return _json_mode
 
 
 def write(text: str = "", *, now: bool = False) -> None:
-    """Write a line to standard output; `now` also where nobody watches, ahead of what follows.
-
-    What it names may come from anywhere: a terminal is never handed what it would act upon.
-    """
+    """Write a line to standard output, without escape sequences that a terminal would execute; `now` flushes."""
     sys.stdout.write(printable(text) + "\n")
     if now:
         sys.stdout.flush()
 
 
 def note(text: str) -> None:
-    """Write a line for people to standard error, only if they watch and nobody asked for JSON."""
-    if sys.stderr.isatty() and not _for_scripts:
-        complain(text)
+    """Write a line to standard error, only on a terminal and without ``--json``."""
+    if sys.stderr.isatty():
+        announce(text)
 
 
 def announce(text: str) -> None:
-    """Write a line for people to standard error, a terminal or not; none with ``--json``."""
-    if not _for_scripts:
-        complain(text)
+    """Write a line to standard error, on a terminal or not; none with ``--json``."""
+    if not _json_mode:
+        warn(text)
 
 
-def complain(text: str) -> None:
-    """Write a line to standard error, whoever watches: what was asked for and cannot be had; harmless as in `write`."""
+def warn(text: str) -> None:
+    """Write a line to standard error in any case."""
     sys.stderr.write(printable(text) + "\n")
 
 
-def complain_of(error: DynslamError) -> None:
+def write_error(error: DynslamError) -> None:
     """Write an error to standard error: its headline in one line, each cure below it."""
     line = printable(" ".join(f"error: {error.headline}".split()))
     sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")
@@ -69,14 +74,17 @@ def complain_of(error: DynslamError) -> None:
         sys.stderr.write(f"  - {printable(' '.join(option.split()))}\n")
 
 
-def can_ask() -> bool:
-    """Whether somebody sits at a terminal who can answer a question, and no script reads what is written."""
-    return sys.stdin.isatty() and sys.stderr.isatty() and not _for_scripts
+def is_interactive() -> bool:
+    """Whether a user at a terminal can answer a question."""
+    return sys.stdin.isatty() and sys.stderr.isatty() and not _json_mode
 
 
-def write_json(value: Any) -> None:
-    """Write a value as JSON; pydantic models and paths included."""
-    sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")
+def present(value: Any, show: Callable[[], None]) -> None:
+    """Write a value as JSON (pydantic models, paths and arrays included) with ``--json``; else call `show`."""
+    if _json_mode:
+        sys.stdout.write(json.dumps(value, indent=2, default=_plain) + "\n")
+    else:
+        show()
 
 
 def write_table(
@@ -101,27 +109,23 @@ def write_table(
 def write_columns(
     columns: Sequence[tuple[str, Sequence[object]]], *, shrink: Sequence[str] = (), spare: Sequence[str] = ()
 ) -> None:
-    """Write a table as aligned text, on a terminal no wider than that; where the output is none, it is whole.
+    """Write a table as aligned text; on a terminal it is no wider than that.
 
     Args:
         columns: Headings, each with the cells below it.
-        shrink: Columns that are shortened first to fit a terminal, one after the other; then all others.
-        spare: Columns that are left out then if it is still too wide, the first one first; a line below names them.
+        shrink: Columns that are shortened first to fit a terminal, in this order; then all others.
+        spare: Columns that are left out if the table is still too wide, in this order; a line below names them.
     """
     cells: list[Sequence[str]] = [[_text(name), *_texts(values)] for name, values in columns]
     left_out: list[str] = []
     if sys.stdout.isatty():
-        rows_of_text, left_out = fitted(list(zip(*cells, strict=True)), shrink, spare, _terminal_width())
-        cells = list(zip(*rows_of_text, strict=True))
-    head, separator, body = _under_each_other(cells).partition("\n")
+        rows, left_out = fitted(list(zip(*cells, strict=True)), shrink, spare, _terminal_width())
+        cells = list(zip(*rows, strict=True))
+    head, separator, body = _aligned_columns(cells).partition("\n")
     sys.stdout.write(f"\033[1m{head}\033[0m" if sys.stdout.isatty() else head)
-    sys.stdout.write(f"{separator}{body}\n")  # harmless: `_text` has made every cell so
+    sys.stdout.write(f"{separator}{body}\n")  # `_text` has removed escape sequences from every cell
     if left_out:
         write(f"(no room for: {', '.join(left_out)})")
-
-
-_LEAST = 8
-"""Characters that a shortened column keeps."""
 
 
 def fitted(
@@ -138,32 +142,25 @@ def fitted(
     Returns:
         The table, and the headings of the columns that are left out.
     """
-    table = [list(row) for row in rows]
-    droppable = [*(name for name in spare if name in table[0]), *(n for n in table[0][:0:-1] if n not in spare)]
+    columns = {column[0]: column for column in zip(*rows, strict=True)}
+    widths = {name: max(map(len, column)) for name, column in columns.items()}
+    droppable = [name for name in spare if name in columns]
+    droppable += [name for name in list(columns)[:0:-1] if name not in spare]
     left_out: list[str] = []
-    while True:
-        first = [table[0].index(name) for name in shrink if name in table[0]]
-        widths = _shrunk([max(map(len, cells)) for cells in zip(*table, strict=True)], first, width)
-        if _total(widths) <= width or not droppable:
-            break
+
+    def excess() -> int:
+        return sum(widths.values()) + 2 * (len(widths) - 1) - width
+
+    while sum(min(size, _MIN_WIDTH) for size in widths.values()) + 2 * (len(widths) - 1) > width and droppable:
         left_out.append(droppable.pop(0))
-        at = table[0].index(left_out[-1])
-        table = [row[:at] + row[at + 1 :] for row in table]
-    return [[_cut(cell, room) for cell, room in zip(row, widths, strict=True)] for row in table], left_out
-
-
-def _total(widths: Sequence[int]) -> int:
-    return sum(widths) + 2 * (len(widths) - 1)
-
-
-def _shrunk(widths: list[int], first: Sequence[int], width: int) -> list[int]:
-    """Widths that fit, or the least ones: the columns `first` give way before the others, of which the widest does."""
-    widths = list(widths)
-    for at in first:
-        widths[at] = max(widths[at] - max(_total(widths) - width, 0), min(widths[at], _LEAST))
-    while _total(widths) > width and max(widths) > _LEAST:
-        widths[widths.index(max(widths))] -= 1
-    return widths
+        del widths[left_out[-1]]
+    for name in shrink:
+        if name in widths:
+            widths[name] = max(widths[name] - max(excess(), 0), min(widths[name], _MIN_WIDTH))
+    while excess() > 0 and max(widths.values()) > _MIN_WIDTH:
+        widths[max(widths, key=widths.__getitem__)] -= 1
+    shown = [[_cut(cell, size) for cell in columns[name]] for name, size in widths.items()]
+    return [list(row) for row in zip(*shown, strict=True)], left_out
 
 
 def _cut(text: str, room: int) -> str:
@@ -189,11 +186,11 @@ def _terminal_width() -> int:
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of text with their columns under each other."""
-    return _under_each_other(list(zip(*rows, strict=True)))
+    """Rows of text with aligned columns."""
+    return _aligned_columns(list(zip(*rows, strict=True)))
 
 
-def _under_each_other(columns: Sequence[Sequence[str]]) -> str:
+def _aligned_columns(columns: Sequence[Sequence[str]]) -> str:
     line = "  ".join(f"%-{max(map(len, column))}s" for column in columns)
     return "\n".join([(line % cells).rstrip() for cells in zip(*columns, strict=True)])
 
@@ -206,70 +203,65 @@ def write_fields(fields: Mapping[str, object]) -> None:
         write(f"{name.ljust(width)}  {value}")
 
 
-HEARTBEAT_S = 10.0
-"""Off a terminal something that lasts says so this often, unless JSON was asked for."""
-
-
 @contextmanager
 def heartbeat() -> Iterator[Callable[[str], None]]:
-    """A line on standard error every `HEARTBEAT_S` seconds while something lasts; none with ``--json``.
+    """A line on standard error every `HEARTBEAT_S` seconds during a long operation; none with ``--json``.
 
     Yields:
-        Call it as often as you like with what is going on; threads may.
+        Call it with the current step as often as you like; threads may.
     """
-    began = told = time.monotonic()
+    began = last = time.monotonic()
 
     def beat(text: str) -> None:
-        nonlocal told
+        nonlocal last
         now = time.monotonic()
-        if now - told >= HEARTBEAT_S and not _for_scripts:
-            told = now
-            complain(f"{text}, {now - began:.0f} s")
-            sys.stderr.flush()
+        if now - last >= HEARTBEAT_S:
+            last = now
+            announce(f"{text}, {now - began:.0f} s")
 
     yield beat
 
 
 class _Lines:
-    """Progress where there is no terminal: a line every `HEARTBEAT_S` seconds, from a thread of its own."""
+    """Progress off a terminal: a line every `HEARTBEAT_S` seconds, from a thread."""
 
     def __init__(self, label: str) -> None:
         self.label, self.began, self.text = label, time.monotonic(), ""
         self.ended = threading.Event()
         threading.Thread(target=self._run, daemon=True).start()
 
-    def told(self, done: float, total: float | None, what: str = "") -> None:
+    def update(self, done: float, total: float | None, step: str = "") -> None:
         share = "" if not total else f" {done:.{0 if done == int(done) else 1}f} of {total:.0f}"
         spent = time.monotonic() - self.began
         left = f", about {spent * (total - done) / done:.0f} s left" if total and 0 < done < total else ""
-        self.text = f"{share}{left}" + (f" ({what})" if what else "")
+        self.text = f"{share}{left}" + (f" ({step})" if step else "")
 
     def _run(self) -> None:
         while not self.ended.wait(HEARTBEAT_S):
-            complain(f"{self.label}{':' * bool(self.text)}{self.text}, {time.monotonic() - self.began:.0f} s so far")
+            warn(f"{self.label}{':' * bool(self.text)}{self.text}, {time.monotonic() - self.began:.0f} s so far")
             sys.stderr.flush()
 
 
 Advance = Callable[..., None]
-"""Called with what is done, the total (None if unknown) and, if there is more to say, what is going on."""
+"""Called with the amount done, the total (None if unknown) and, optionally, the current step."""
 
 
 @contextmanager
 def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
     """A progress bar on standard error where that is a terminal; elsewhere a line every `HEARTBEAT_S` seconds.
 
-    With ``--json`` there is neither: a script that keeps standard error finds nothing but errors there.
+    With ``--json`` there is neither, so that standard error holds nothing but errors.
 
     Yields:
         See `Advance`.
     """
-    if _for_scripts:
+    if _json_mode:
         yield lambda *_: None
         return
     if not sys.stderr.isatty():
         lines = _Lines(label)
         try:
-            yield lines.told
+            yield lines.update
         finally:
             lines.ended.set()
         return
@@ -281,28 +273,25 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(printable(label), total=1)
 
-        def told(done: float, total: float | None, what: str = "") -> None:
-            shown = f"{label}: {what}" if what else label
-            total = total if total is not None else done + 1
-            bar.update(task, completed=done, total=total, description=printable(shown))
+        def update(done: float, total: float | None, step: str = "") -> None:
+            text = printable(f"{label}: {step}" if step else label)
+            bar.update(task, completed=done, total=done + 1 if total is None else total, description=text)
 
-        yield told
+        yield update
 
 
 @contextmanager
-def drawn_download(name: str) -> Iterator[Report]:
-    """`progress` of one file's download, for `core.download.show_downloads`."""
+def download_bar(name: str) -> Iterator[Report]:
+    """`progress` of one file's download, for `core.download_progress.show_downloads`."""
     with progress(name, unit="bytes") as advance:
         yield lambda state: advance(state.done, state.total)
 
 
 def _texts(values: Sequence[object]) -> Sequence[str]:
-    """The cells of a column: `_text` of each, a long column of plain words or numbers at once."""
+    """The cells of a column: `_text` of each, with a fast path for long columns of plain words or numbers."""
     kinds = set(map(type, values))
     if kinds == {str} and "".join(cast("Sequence[str]", values)).isprintable():
         return cast("Sequence[str]", values)
-    if kinds == {float}:
-        return [f"{value:.4g}" for value in values]
     return [_text(value) for value in values]
 
 
@@ -325,6 +314,4 @@ def _plain(value: Any) -> Any:
         return value.model_dump(mode="json")
     if isinstance(value, (set, frozenset)):
         return sorted(value)
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return str(value)
+    return value.tolist() if hasattr(value, "tolist") else str(value)

@@ -7,9 +7,17 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from . import completion
-from .options import AsJson, Camera, DataRoot, Device, Frames, Threads, gather_settings
-from .output import progress, write, write_fields, write_json, write_table
+from dynslam_bench.cli.options import (
+    AsJson,
+    Camera,
+    DataRoot,
+    Device,
+    Frames,
+    Threads,
+    complete_sequences,
+    gather_settings,
+)
+from dynslam_bench.cli.output import present, progress, write, write_fields, write_table
 
 TrainingAssignments = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
@@ -42,15 +50,10 @@ def train(
     from dynslam_bench.core.settings import apply_overrides
     from dynslam_bench.envs import resolve_device
     from dynslam_bench.segmentation.training.settings import TrainSettings
-    from dynslam_bench.segmentation.training.train import TrainProgress
     from dynslam_bench.segmentation.training.train import train as train_network
 
-    chosen = apply_overrides(TrainSettings(), gather_settings(assignments, settings, {}))
+    chosen = apply_overrides(TrainSettings(), gather_settings(assignments, settings))
     with progress("training") as advance:
-
-        def told(state: TrainProgress) -> None:
-            advance(state.done, state.total)
-
         result = train_network(
             chosen,
             output,
@@ -58,13 +61,10 @@ def train(
             device=resolve_device(device),
             threads=threads,
             resume=resume,
-            progress=told,
+            progress=lambda state: advance(state.done, state.total),
         )
     facts = {"weights": str(result.best), "step": result.step, "iou": result.iou, "ended": result.stopped}
-    if as_json:
-        write_json(facts)
-    else:
-        write_fields(facts)
+    present(facts, lambda: write_fields(facts))
 
 
 @app.command()
@@ -85,12 +85,8 @@ def evaluate(
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
 
-    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments, None, {})})
+    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments)})
     with progress(data) as advance:
-
-        def told(done: int, total: int) -> None:
-            advance(done, total)
-
         score = evaluate_segmenter(
             settings,
             data,
@@ -99,23 +95,25 @@ def evaluate(
             threads=threads,
             min_area=min_area,
             limit=limit,
-            progress=told,
+            progress=advance,
         )
-    if as_json:
-        write_json(score)
-        return
     values: dict[str, Any] = score.model_dump(mode="json")
     classes = values.pop("classes")
-    write_fields(values)
-    if classes:
-        write()
-        columns = sorted({key for quality in classes.values() for key in quality})
-        write_table(("class", *columns), [(name, *(row.get(key) for key in columns)) for name, row in classes.items()])
+
+    def show() -> None:
+        write_fields(values)
+        if classes:
+            write()
+            columns = sorted({key for quality in classes.values() for key in quality})
+            rows = [(name, *(quality.get(key) for key in columns)) for name, quality in classes.items()]
+            write_table(("class", *columns), rows)
+
+    present(score, show)
 
 
 @app.command()
 def record(
-    sequence: Annotated[str, typer.Argument(help="Id or path.", autocompletion=completion.sequences)],
+    sequence: Annotated[str, typer.Argument(help="Id or path.", autocompletion=complete_sequences)],
     output: Annotated[Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")],
     source: Annotated[str, typer.Option(help="coco, weights:PATH, onnx:PATH, oracle ...")] = "auto",
     assignments: MaskAssignments = None,
@@ -128,11 +126,11 @@ def record(
     """Write a segmenter's masks of a sequence as PNG files; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
     from dynslam_bench.envs import resolve_device
-    from dynslam_bench.segmentation.masks.recording import record_masks
+    from dynslam_bench.segmentation.recorded import record_masks
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.sequences.catalogue import open_sequence
 
-    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments, None, {})})
+    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments)})
     opened = open_sequence(sequence, data_root=data_root, camera=camera, frames=frames)
     with progress(f"masks of {opened.id}") as advance:
         made = record_masks(opened, output, settings, device=resolve_device(device), threads=threads, progress=advance)
@@ -151,7 +149,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write one of our networks as an ONNX file of fixed shapes, which lighter runtimes can serve."""
-    from dynslam_bench.segmentation.networks.onnx.export import export_network, parse_size, weights_of
+    from dynslam_bench.segmentation.networks.onnx_export import export_network, parse_size, weights_of
 
     chosen = weights_of(source, side)
     done = export_network(chosen.path, output, size=parse_size(size), side=chosen.side)
@@ -161,7 +159,4 @@ def export(
         "input": f"image [1, 3, {done.size[0]}, {done.size[1]}], RGB in [0, 1]",
         "classes": len(done.classes),
     }
-    if as_json:
-        write_json(facts)
-    else:
-        write_fields(facts)
+    present(facts, lambda: write_fields(facts))

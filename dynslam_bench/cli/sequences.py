@@ -10,14 +10,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from . import completion
-from .options import AsJson, Camera, DataRoot, Frames
-from .output import VERIFICATION_FAILED, complain, note, progress, write, write_fields, write_json, write_table
+from dynslam_bench.cli.options import AsJson, Camera, DataRoot, Frames, complete_sequences
+from dynslam_bench.cli.output import (
+    VERIFICATION_FAILED,
+    note,
+    present,
+    progress,
+    warn,
+    write,
+    write_fields,
+    write_table,
+)
 
 if TYPE_CHECKING:
-    from dynslam_bench.sequences.listing import Summary
+    from dynslam_bench.sequences.catalogue import Summary
 
 app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
+Name = Annotated[str, typer.Argument(help="Id, published folder name or path.", autocompletion=complete_sequences)]
 
 
 @app.command("list")
@@ -30,68 +39,66 @@ def list_(
 ) -> None:
     """List all sequences and whether they are on this machine."""
     from dynslam_bench.core.errors import SequenceError, did_you_mean
-    from dynslam_bench.sequences.listing import summaries
+    from dynslam_bench.sequences.catalogue import summaries
 
     everything = summaries(data_root=data_root)
-    tags = sorted({each for summary in everything for each in summary.tags})
+    tags = sorted({name for summary in everything for name in summary.tags})
     if tag is not None and tag not in tags:
         raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
-    if not any(fnmatch.fnmatch(each.id, pattern) for each in everything):
-        folder = f"{pattern.rstrip('/')}/*"
-        pattern = folder if any(fnmatch.fnmatch(each.id, folder) for each in everything) else pattern
-    if not any(fnmatch.fnmatch(each.id, pattern) for each in everything):
-        raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, [each.id for each in everything]))
-    found = [
-        each
-        for each in everything
-        if fnmatch.fnmatch(each.id, pattern) and (tag is None or tag in each.tags) and (each.here or not here)
+    patterns = (pattern, f"{pattern.rstrip('/')}/*")
+    pattern = next((p for p in patterns if any(fnmatch.fnmatch(s.id, p) for s in everything)), "")
+    if not pattern:
+        ids = [summary.id for summary in everything]
+        raise SequenceError(f"no sequence matches '{patterns[0]}'", did_you_mean(patterns[0], ids))
+    matches = [
+        summary
+        for summary in everything
+        if fnmatch.fnmatch(summary.id, pattern) and (tag is None or tag in summary.tags) and (summary.here or not here)
     ]
-    if as_json:
-        write_json([asdict(each) for each in found])
-    elif not found:
-        asked = [f"'{pattern}'", *([f"with the tag {tag}"] if tag else []), *(["on this machine"] if here else [])]
-        write(f"no sequence matches {' '.join(asked)}; all {len(everything)}: dynslam-bench sequences list")
-    for title, group in groupby([] if as_json else found, key=lambda each: each.dataset):
-        _write_group(title, list(group))
+
+    def show() -> None:
+        if not matches:
+            limits = [f"'{pattern}'", *([f"with the tag {tag}"] if tag else []), *(["on this machine"] if here else [])]
+            write(f"no sequence matches {' '.join(limits)}; all {len(everything)}: dynslam-bench sequences list")
+        for title, group in groupby(matches, key=lambda summary: summary.dataset):
+            _write_group(title, list(group))
+
+    present([asdict(summary) for summary in matches], show)
 
 
-def _write_group(title: str, found: list[Summary]) -> None:
-    """A data set's sequences under a line of what holds for all of them."""
-    count = f"{len(found)} listed, {sum(each.here for each in found)} here"
-    layout, by_hand = found[0].layout, found[0].by_hand
-    about = [count, f"licence: {found[0].license}", f"layout: {layout} on the publisher's files" if layout else ""]
-    write(f"{title} ({'; '.join(filter(None, (*about, f'by hand: {by_hand}' if by_hand else '')))})")
+def _write_group(title: str, group: list[Summary]) -> None:
+    """The sequences of a data set below a line of their common facts."""
+    first = group[0]
+    facts = [f"{len(group)} listed, {sum(summary.here for summary in group)} here", f"licence: {first.license}"]
+    facts += [f"layout: {first.layout} on the publisher's files"] if first.layout else []
+    facts += [f"by hand: {first.by_hand}"] if first.by_hand else []
+    write(f"{title} ({'; '.join(facts)})")
     write_table(
         ("sequence", "here", "size", "tags", "split", "ground truth", "checksum"),
-        [(each.id, each.here, each.size, each.tags, each.split, each.ground_truth, each.checksum) for each in found],
+        [(s.id, s.here, s.size, s.tags, s.split, s.ground_truth, s.checksum) for s in group],
         spare=("checksum", "ground truth", "split"),
     )
-    write("")
+    write()
 
 
 @app.command()
 def info(
-    name: Annotated[
-        str, typer.Argument(help="Id, published folder name or path.", autocompletion=completion.sequences)
-    ],
+    name: Name,
     data_root: DataRoot = None,
     camera: Camera = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what is known of a sequence, and what it holds if it is on this machine."""
-    from dynslam_bench.sequences.listing import describe
+    """Show the facts of a sequence, and its contents if it is on this machine."""
+    from dynslam_bench.sequences.catalogue import describe
 
-    found: dict[str, Any] = describe(name, data_root=data_root, camera=camera)
-    if as_json:
-        write_json(found)
-    else:
-        write_fields(found)
+    facts: dict[str, Any] = describe(name, data_root=data_root, camera=camera)
+    present(facts, lambda: write_fields(facts))
 
 
 @app.command()
 def fetch(
     names: Annotated[
-        list[str], typer.Argument(help="Ids or patterns such as 'bonn/*'.", autocompletion=completion.sequences)
+        list[str], typer.Argument(help="Ids or patterns such as 'bonn/*'.", autocompletion=complete_sequences)
     ],
     data_root: DataRoot = None,
     url: Annotated[Optional[str], typer.Option(help="A mirror's address of the archive.")] = None,  # noqa: UP045
@@ -99,83 +106,80 @@ def fetch(
     keep_archive: Annotated[bool, typer.Option("--keep-archive", help="Keep the archive, too.")] = False,
 ) -> None:
     """Download public sequences; a call that was cut short goes on where it stopped."""
-    from dynslam_bench.core.download import Progress
+    from dynslam_bench.sequences.catalogue import expand
     from dynslam_bench.sequences.fetch import RECEIPT, Receipt, status
     from dynslam_bench.sequences.fetch import fetch as fetch_one
-    from dynslam_bench.sequences.listing import expand
 
     for name in expand(names):
         new = status(name, data_root=data_root).folder is None
         with progress(name, unit="bytes") as advance:
-
-            def report(state: Progress, advance: Any = advance) -> None:
-                advance(state.done, state.total)
-
             place = fetch_one(
-                name, data_root=data_root, progress=report, checksum=checksum, keep_archive=keep_archive, url=url
+                name,
+                data_root=data_root,
+                progress=lambda state, advance=advance: advance(state.done, state.total),  # type: ignore[misc]
+                checksum=checksum,
+                keep_archive=keep_archive,
+                url=url,
             )
         write(str(place))
         if new and not (receipt := Receipt.read(place / RECEIPT)).checked:
-            complain(
-                f"warning: no checksum of {name} was known; that of what came is {receipt.sha256}, "
-                "and the next fetch from there has to bring the same"
+            warn(
+                f"warning: no checksum of {name} is published; that of this archive is {receipt.sha256}, "
+                "and the next fetch from there has to have the same"
             )
 
 
 @app.command()
 def verify(
-    names: Annotated[list[str], typer.Argument(help="Ids, patterns or paths.", autocompletion=completion.sequences)],
+    names: Annotated[list[str], typer.Argument(help="Ids, patterns or paths.", autocompletion=complete_sequences)],
     data_root: DataRoot = None,
     camera: Camera = None,
     as_json: AsJson = False,
 ) -> None:
     """Decode every frame, and compare every file with the checksum taken when it was fetched."""
+    from dynslam_bench.sequences.catalogue import expand
     from dynslam_bench.sequences.fetch import verify as verify_one
-    from dynslam_bench.sequences.listing import expand
 
     reports = []
     for name in expand(names):
         with progress(name) as advance:
             reports.append(verify_one(name, data_root=data_root, camera=camera, progress=advance))
-    if as_json:
-        write_json([{**asdict(report), "ok": report.ok} for report in reports])
-    else:
+
+    def show() -> None:
         for report in reports:
-            compared = (
-                "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
-            )
             verdict = "ok" if report.ok else f"{len(report.faults)} faults"
-            write(f"{report.id}: {verdict}, {report.frames} frames, {compared}")
-            if report.dropped is not None:
-                write(f"  {report.dropped.describe()}")
-            for fault in report.faults:
-                write(f"  {fault}")
+            how = "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
+            write(f"{report.id}: {verdict}, {report.frames} frames, {how}")
+            dropped = [] if report.dropped is None else [report.dropped.describe()]
+            for line in (*dropped, *report.faults):
+                write(f"  {line}")
+
+    present([{**asdict(report), "ok": report.ok} for report in reports], show)
     if not all(report.ok for report in reports):
         raise typer.Exit(VERIFICATION_FAILED)
 
 
 @app.command()
 def doctor(
-    name: Annotated[
-        str, typer.Argument(help="Id, published folder name or path.", autocompletion=completion.sequences)
-    ],
+    name: Name,
     data_root: DataRoot = None,
     camera: Camera = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a recording's images with its camera and its truth; exits with 4 where a fault was found."""
+    """Compare a recording's images with its camera and its truth; exits with 4 if there is a fault."""
     from dynslam_bench.sequences.doctor import diagnose
 
     with progress(name) as advance:
         diagnosis = diagnose(name, data_root=data_root, camera=camera, progress=advance)
-    if as_json:
-        write_json({**asdict(diagnosis), "ok": diagnosis.ok, "verdict": diagnosis.verdict})
-    else:
-        frames = f"{diagnosis.frames} frame{'s' * (diagnosis.frames != 1)}"
-        write(f"{diagnosis.id}: {diagnosis.verdict} ({frames} read)")
+
+    def show() -> None:
+        faults = sum(finding.severity == "fault" for finding in diagnosis.findings)
+        verdict = "no fault found" if diagnosis.ok else f"{faults} fault{'s' * (faults != 1)}"
+        write(f"{diagnosis.id}: {verdict}, {diagnosis.frames} frames compared")
         for finding in diagnosis.findings:
-            write(f"  {finding.severity} {finding.id}: {finding.text}")
-            write(f"    cure: {finding.cure}")
+            write(f"  {finding.severity} {finding.id}: {finding.text}\n    cure: {finding.cure}")
+
+    present({**asdict(diagnosis), "ok": diagnosis.ok}, show)
     if not diagnosis.ok:
         raise typer.Exit(VERIFICATION_FAILED)
 
@@ -192,14 +196,15 @@ def unpack(
     """Unpack a ROS bag or MCAP file into a folder that is a sequence."""
     from dynslam_bench.sequences.bags import unpack_bag
 
-    found = unpack_bag(bag, folder, colour=colour, depth=depth, truth=truth)
-    if as_json:
-        write_json({**asdict(found), "folder": str(found.folder)})
-        return
-    for line in found.notes:
-        note(line)
-    poses = f", poses from {found.truth}" if found.truth else ", no ground truth"
-    write(f"{found.folder}: {found.frames} frames from {found.colour} and {found.depth}{poses}")
+    unpacked = unpack_bag(bag, folder, colour=colour, depth=depth, truth=truth)
+
+    def show() -> None:
+        for line in unpacked.notes:
+            note(line)
+        poses = f", poses from {unpacked.truth}" if unpacked.truth else ", no ground truth"
+        write(f"{unpacked.folder}: {unpacked.frames} frames from {unpacked.colour} and {unpacked.depth}{poses}")
+
+    present({**asdict(unpacked), "folder": str(unpacked.folder)}, show)
 
 
 @app.command()
@@ -221,7 +226,7 @@ def render(
 
 @app.command()
 def calibrate(
-    name: Annotated[str, typer.Argument(help="Path or id of a recording.", autocompletion=completion.sequences)],
+    name: Annotated[str, typer.Argument(help="Path or id of a recording.", autocompletion=complete_sequences)],
     data_root: DataRoot = None,
     camera: Camera = None,
     frames: Frames = None,
@@ -233,29 +238,36 @@ def calibrate(
 ) -> None:
     """Measure the readout time of a rolling shutter, the delay of depth, and the depth factor."""
     from dynslam_bench.sequences.calibration import calibrate as measure
+    from dynslam_bench.sequences.cameras import write_camera
     from dynslam_bench.sequences.catalogue import open_sequence
-    from dynslam_bench.sequences.published.cameras import write_camera
 
     sequence = open_sequence(name, data_root=data_root, camera=camera, frames=frames)
     with progress(name) as advance:
-        found = measure(sequence, progress=advance)
-    written = output is not None and found.measured
+        result = measure(sequence, progress=advance)
+    written = output is not None and result.measured
     if output is not None and written:
-        write_camera(output, found.camera, fps=sequence.fps)
-    if as_json:
-        write_json({**asdict(found), "file": str(output) if written else None})
-        return
-    units = {"readout_s": (1e3, "ms"), "depth_delay_s": (1e3, "ms"), "depth_factor": (1.0, "a metre")}
-    rows = []
-    for each in found.quantities:
-        scale, unit = units[each.name]
-        estimate = "" if each.value is None else f"{scale * each.value:.4g} {unit}"
-        interval = "" if each.low is None or each.high is None else f"{scale * each.low:.4g} to {scale * each.high:.4g}"
-        verdict = "not observable" if not each.observable else "kept" if each.written is None else f"{each.written:g}"
-        rows.append((each.name, estimate, interval, verdict, each.reason))
-    write_table(("quantity", "estimate", "95 % interval", "camera.toml", "why"), rows)
-    write(f"{found.windows} windows of {found.frames} frames, keypoints to {found.pixel_noise:.2f} px")
-    if written:
-        write(f"{output}")
-    elif output is not None:
-        note(f"nothing to write: {output} is left alone")
+        write_camera(output, result.camera, fps=sequence.fps)
+
+    def show() -> None:
+        write_table(
+            ("quantity", "estimate", "95 % interval", "camera.toml", "why"), list(map(_calibrated, result.quantities))
+        )
+        write(f"{result.windows} windows of {result.frames} frames, keypoints to {result.pixel_noise:.2f} px")
+        if written:
+            write(str(output))
+        elif output is not None:
+            note(f"nothing to write: {output} is left alone")
+
+    present({**asdict(result), "file": str(output) if written else None}, show)
+
+
+def _calibrated(quantity: Any) -> tuple[str, ...]:
+    """A row of the table of `calibrate`."""
+    scale, unit = (1.0, "a metre") if quantity.name == "depth_factor" else (1e3, "ms")
+    value, low, high = (
+        None if v is None else f"{scale * v:.4g}" for v in (quantity.value, quantity.low, quantity.high)
+    )
+    interval = "" if low is None or high is None else f"{low} to {high}"
+    verdict = "kept" if quantity.written is None else f"{quantity.written:g}"
+    verdict = verdict if quantity.observable else "not observable"
+    return quantity.name, "" if value is None else f"{value} {unit}", interval, verdict, quantity.reason

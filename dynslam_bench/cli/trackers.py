@@ -2,63 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from . import completion
-from .options import AsJson, Assignments, MemoryLimit, SettingsFile, gather_settings
-from .output import VERIFICATION_FAILED, heartbeat, write, write_fields, write_json, write_table
+from dynslam_bench.cli.options import (
+    AsJson,
+    Assignments,
+    MemoryLimit,
+    SettingsFile,
+    complete_trackers,
+    gather_settings,
+)
+from dynslam_bench.cli.output import (
+    VERIFICATION_FAILED,
+    heartbeat,
+    json_mode,
+    present,
+    write,
+    write_fields,
+    write_table,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.core.settings import Settings
+    from dynslam_bench.testing import Check
     from dynslam_bench.trackers import TrackerSpec
 
-Tracker = Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.", autocompletion=completion.trackers)]
+Tracker = Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.", autocompletion=complete_trackers)]
 
 app = typer.Typer(help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True)
 
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """List all trackers, those included that lack a package."""
-    from dynslam_bench.trackers import TRACKERS
+    """List all trackers by kind, those included that lack a package; variants stand below their tracker."""
+    from dynslam_bench.trackers.registry import TRACKERS, tracker_groups
 
-    rows: list[dict[str, Any]] = [
+    sources = {tracker.spec.id: tracker.source for tracker in TRACKERS.all()}
+
+    def show() -> None:
+        for kind, families in tracker_groups().items():
+            if families:
+                write(f"{kind}:")
+            for spec, *variants in families:
+                write(f"  {spec.id:18} {spec.label}{'' if spec.missing() == [] else ' (not installed)'}")
+                if variants:
+                    write(f"  {'':18} {'  '.join(variant.id.removeprefix(spec.id) for variant in variants)}")
+
+    rows = [
         {
-            "id": found.spec.id,
-            "label": found.spec.label,
-            "sensors": found.spec.sensors,
-            "provenance": found.spec.provenance,
-            "ranked": found.spec.ranked,
-            "available": not found.spec.missing(),
-            "install": found.spec.missing(),
-            "source": found.source,
-            "summary": found.spec.summary,
+            "id": spec.id,
+            "label": spec.label,
+            "sensors": spec.sensors,
+            "provenance": spec.provenance,
+            "ranked": spec.ranked,
+            "available": not spec.missing(),
+            "install": spec.missing(),
+            "source": sources[spec.id],
+            "summary": spec.summary,
         }
-        for found in TRACKERS.all()
+        for spec in (tracker.spec for tracker in TRACKERS.all())
     ]
-    if as_json:
-        write_json(rows)
-        return
-    columns = ("id", "sensors", "provenance", "ranked", "available", "summary")
-    write_table(columns, [[row[column] for column in columns] for row in rows], shrink=("summary",))
+    present(rows, show)
 
 
 @app.command()
-def info(
-    tracker: Tracker,
-    as_json: AsJson = False,
-) -> None:
+def info(tracker: Tracker, as_json: AsJson = False) -> None:
     """Show a tracker's description, its settings and its published numbers."""
     from dynslam_bench.core.settings import flatten, settings_table
-    from dynslam_bench.trackers import TRACKERS
-    from dynslam_bench.trackers.measured import epipolar_skipped
+    from dynslam_bench.core.toml import assignments
+    from dynslam_bench.trackers.registry import TRACKERS, epipolar_skipped
 
     spec = TRACKERS.get(tracker)
-    numbers = _published(spec)
+    numbers, skipped = _published(spec), epipolar_skipped(spec.id)
     facts: dict[str, Any] = {
         "id": spec.id,
         "label": spec.label,
@@ -75,37 +94,25 @@ def info(
         "presets": {name: dict(values) for name, values in spec.presets.items()},
         "assumptions": list(spec.assumptions),
         "remarks": spec.remarks,
+        "epipolar_skipped": skipped,
     }
-    skipped = epipolar_skipped(spec.id)
-    if as_json:
-        described = parameter_facts(spec.settings)
-        facts |= {"epipolar_skipped": skipped, "settings": flatten(spec.settings()), "parameters": described}
-        write_json({**facts, "reported": numbers})
-        return
-    facts["presets"] = [f"{name} ({_assigned(values)})" for name, values in spec.presets.items()]
-    if skipped:
-        facts["epipolar_skipped"] = [f"{100 * share:.0f} % of {where}" for where, share in skipped.items()]
-    write_fields(facts)
-    write()
-    write(settings_table(spec.settings).rstrip())
-    if numbers:
-        write()
-        write_table(
-            ("sequence", "reported metric", "value", "source", "remarks"), [tuple(row.values()) for row in numbers]
-        )
 
+    def show() -> None:
+        presets = [f"{name} ({', '.join(assignments(values))})" for name, values in spec.presets.items()]
+        shares = [f"{100 * share:.0f} % of {sequence}" for sequence, share in skipped.items()]
+        write_fields(facts | {"presets": presets, "epipolar_skipped": shares})
+        write(f"\n{settings_table(spec.settings).rstrip()}")
+        if numbers:
+            write()
+            columns = ("sequence", "reported metric", "value", "source", "remarks")
+            write_table(columns, [tuple(row.values()) for row in numbers])
 
-def _assigned(values: Mapping[str, Any]) -> str:
-    """Settings as ``--set`` takes them."""
-    from dynslam_bench.core.toml import assignments
-
-    return ", ".join(assignments(values))
+    details = {"settings": flatten(spec.settings()), "parameters": parameter_facts(spec.settings), "reported": numbers}
+    present(facts | details, show)
 
 
 def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
-    """Every setting with its default; of those that studies may tune also what they need to know."""
-    from dataclasses import asdict
-
+    """Every setting with its default; the tunable ones also with range, scale, unit and meaning."""
     from dynslam_bench.core.settings import flatten, parameters
 
     tunable = {parameter.name: asdict(parameter) for parameter in parameters(settings)}
@@ -116,39 +123,34 @@ def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
 
 
 def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
-    """What others report of a system: its own spec's numbers, the published ones and those that the paper claims."""
+    """The reported numbers of a system: those of its spec, of publications, and the claims of the paper."""
     from dynslam_bench.reports.model.published import CLAIMED, claimed, published
 
-    own = [
+    stated = [
         (name, metric, value, "its spec", "") for name, row in spec.reported.items() for metric, value in row.items()
     ]
-    read = [
-        (p.sequence, p.metric, p.value, p.source, "; ".join(filter(None, (p.alignment, p.remarks))))
-        for p in published()
+    measured = [
+        (p.sequence, p.metric, p.value, p.source, "; ".join(str(text) for text in (p.alignment, p.remarks) if text))
+        for p in published().itertuples()
         if p.system in spec.published_as
     ]
     paper = [
         (c.sequence, c.quantity, c.value, f"EMFOA-OFT-SLAM, table {c.table}", f"{CLAIMED}: see 'report audit-paper'")
-        for c in claimed()
+        for c in claimed().itertuples()
         if c.system in spec.published_as and c.kind == "value"
     ]
     names = ("sequence", "metric", "value", "source", "remarks")
-    return [dict(zip(names, row, strict=True)) for row in own + read + paper]
+    return [dict(zip(names, row, strict=True)) for row in stated + measured + paper]
 
 
 @app.command()
 def doctor(as_json: AsJson = False) -> None:
-    """Say which plug-ins are not available, and why."""
-    from dynslam_bench.testing.doctor import diagnose
+    """Show which plug-ins are not available, and why."""
+    from dynslam_bench.testing.installation import unavailable_plugins
 
-    found = diagnose()
-    if as_json:
-        write_json([each.__dict__ for each in found])
-        return
-    if not found:
-        write("all plug-ins are available")
-    for each in found:
-        write(f"{each.kind}: {each.name}: {each.reason}")
+    plugins = unavailable_plugins()
+    lines = [f"{plugin.kind}: {plugin.name}: {plugin.reason}" for plugin in plugins]
+    present([asdict(plugin) for plugin in plugins], lambda: write("\n".join(lines or ["all plug-ins are available"])))
 
 
 @app.command()
@@ -163,28 +165,27 @@ def test(
     memory_limit: MemoryLimit = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check that a tracker keeps its contract, in a process of its own."""
-    from dynslam_bench.testing import Check, isolated_tracker_report
+    """Check that a tracker keeps its contract, in a child process."""
+    from dynslam_bench.testing import isolated_tracker_report
 
-    def told(check: Check) -> None:
-        if not as_json:
+    def on_check(check: Check) -> None:
+        if not json_mode():
             write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""), now=True)
 
     with heartbeat() as beat:
         report = isolated_tracker_report(
             tracker,
-            settings=gather_settings(assignments, settings, {}),
+            settings=gather_settings(assignments, settings),
             frames=frames,
             frame_s=time_limit,
             start_s=5 * time_limit,
             memory_mb=memory_limit,
-            on_check=told,
-            on_wait=lambda running: beat(f"checking: {running}"),
+            on_check=on_check,
+            on_wait=lambda check: beat(f"checking: {check}"),
         )
-    if as_json:
-        write_json({"subject": report.subject, "ok": report.ok, "checks": [check.__dict__ for check in report.checks]})
-    else:
-        write(f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed")
+    facts = {"subject": report.subject, "ok": report.ok, "checks": [asdict(check) for check in report.checks]}
+    total = f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed"
+    present(facts, lambda: write(total))
     if not report.ok:
         raise typer.Exit(VERIFICATION_FAILED)
 

@@ -1,6 +1,6 @@
 """What may be plugged in, and what the plug-ins exchange; a plug-in imports from here, from settings and errors only.
 
-Importing this room loads neither torch nor OpenCV, numba, scipy, Gymnasium or Optuna.
+Importing this package loads neither torch nor OpenCV, numba, scipy, Gymnasium or Optuna.
 
 | plug-in | its spec | its heavy part | what it is given and gives |
 | --- | --- | --- | --- |
@@ -11,7 +11,7 @@ Importing this room loads neither torch nor OpenCV, numba, scipy, Gymnasium or O
 | features | `FeatureSpec` | `FeatureExtractor` | a grey image; `Keypoints` |
 | filter | none: a tracker is composed of filters | `DynamicFilter` | `FrameBundle`, `FilterState`; `FilterResult` |
 
-`docs/plugins.md` shows one of each. The registries, which find plug-ins by id, lie in the rooms of their kind.
+`docs/plugins.md` shows one of each. The registries, which find plug-ins by id, are in the packages of their kind.
 
 Example:
     >>> from dynslam_bench.contracts import TrackerSpec
@@ -21,19 +21,24 @@ Example:
 
 from __future__ import annotations
 
+from dynslam_bench.contracts.checks import TrackerContractError
+from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec, Keypoints
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need
+from dynslam_bench.contracts.flow import FlowEstimator, FlowResult, FlowSpec
+from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
+from dynslam_bench.contracts.sequence import DatasetSpec, Frame, FrameMasks, MaskSource, Sequence
+from dynslam_bench.contracts.tracker import (
+    KeyframeRecord,
+    MapOutputs,
+    Provenance,
+    Tracker,
+    TrackerContext,
+    TrackerSpec,
+    TrackingState,
+    TrackResult,
+)
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .checks import TrackerContractError
-from .features import FeatureExtractor, FeatureSpec, Keypoints
-from .filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need
-from .flow import FlowEstimator, FlowResult, FlowSpec
-from .map_outputs import KeyframeRecord, MapOutputs
-from .provenance import Provenance
-from .result import TrackingState, TrackResult
-from .segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
-from .sequence import DatasetSpec, Frame, FrameMasks, MaskSource, Sequence
-from .tracker import Tracker, TrackerContext, TrackerSpec
 
 __all__ = [
     "Camera",

@@ -15,14 +15,12 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts.tracker import TrackerSpec, TrackingState, TrackResult
 from dynslam_bench.core.errors import SequenceError, TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .result import TrackingState, TrackResult
-from .sequence import Frame, Sequence
-from .tracker import TrackerSpec
 
 STATES = get_args(TrackingState)
 FARTHEST_M = 1e9
@@ -178,8 +176,8 @@ def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
 
 def _pose_faults(pose: object) -> Iterator[Fault]:
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4):
-        found = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
-        yield Fault(f"{found} as pose, expected a 4x4 matrix")
+        kind = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
+        yield Fault(f"{kind} as pose, expected a 4x4 matrix")
     elif pose.dtype.kind not in "fiu":
         yield Fault(f"a pose of the type {pose.dtype}, expected real numbers", "return float64")
     elif not np.isfinite(pose).all():

@@ -63,14 +63,13 @@ class FeatureExtractor(Protocol):
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image; none is an empty result."""
-        ...
 
 
 @runtime_checkable
 class MaskedExtractor(FeatureExtractor, Protocol):
     """An extractor that can see to it that what lies on a mask takes no place of what lies outside."""
 
-    def extract_beside(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
         """As `extract`; where less than a share of the keypoints sought lies outside, all are sought there too.
 
         Args:
@@ -82,4 +81,3 @@ class MaskedExtractor(FeatureExtractor, Protocol):
             The keypoints of `extract` on the mask, and outside it those of `extract` or as many as it would find if
             nothing else were in the image; in the order of `extract`.
         """
-        ...

@@ -9,13 +9,12 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.tracker import Provenance as Provenance
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
-
-from .features import Keypoints
-from .flow import FlowResult
-from .provenance import Provenance as Provenance
-from .segmenter import Instances
 
 Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
 """What a filter asks for: `FilterState` and `FrameBundle` hold it."""
@@ -167,8 +166,6 @@ class DynamicFilter(Protocol):
 
     def reset(self, camera: Camera) -> None:
         """Forget everything: a new sequence begins."""
-        ...
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Judge the frame's keypoints; never raises on degenerate input, says so in `stats` instead."""
-        ...

@@ -58,7 +58,6 @@ class FlowEstimator(Protocol):
 
     def prepare(self, gray: NDArray[np.uint8]) -> Any:
         """Whatever the method needs of a uint8 ``[H, W]`` image."""
-        ...
 
     def track(
         self,
@@ -82,7 +81,6 @@ class FlowEstimator(Protocol):
             One row a point; degenerate input (black, identical, textureless images) gives rows that are not valid,
             never an exception or NaN in valid rows.
         """
-        ...
 
 
 def stats_names_of(flow: FlowEstimator) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The contract of segmenters: what announces them, what they are told and what they return."""
+"""The contract of segmenters: their spec, their context and their result."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from .sequence import Frame, MaskSource
+from dynslam_bench.contracts.sequence import Frame, MaskSource
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,4 +98,3 @@ class Segmenter(Protocol):
 
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame; no objects is an empty result, never an error."""
-        ...

@@ -63,46 +63,37 @@ class Sequence(Protocol):
     @property
     def id(self) -> str:
         """For example ``tum/fr3/walking_xyz`` or ``synthetic/walking_xyz?scene=0&frames=600``."""
-        ...
 
     @property
     def camera(self) -> Camera:
         """Intrinsics of the images that `__getitem__` returns."""
-        ...
 
     @property
     def timestamps(self) -> NDArray[np.float64]:
         """Stamps of all frames in seconds, strictly increasing."""
-        ...
 
     @property
     def ground_truth(self) -> Trajectory | None:
         """Camera-to-world poses at their own stamps, possibly with holes; None if there are none."""
-        ...
 
     @property
     def masks(self) -> MaskSource | None:
         """Exact masks, where the sequence has them."""
-        ...
 
     @property
     def fps(self) -> float:
         """Nominal frame rate in Hz."""
-        ...
 
     @property
     def license(self) -> str:
         """Licence of the data."""
-        ...
 
     @property
     def citation(self) -> str:
         """What to cite."""
-        ...
 
     def digest(self) -> str:
         """Short digest of the content (files' names and sizes, or the renderer's version and parameters)."""
-        ...
 
     def __len__(self) -> int: ...
 
@@ -111,8 +102,8 @@ class Sequence(Protocol):
 
 def timestamps_ns(sequence: Sequence) -> NDArray[np.int64]:
     """Stamps of all frames in nanoseconds, int64 ``[N]``."""
-    known: NDArray[np.int64] | None = getattr(sequence, "timestamps_ns", None)
-    return from_seconds(sequence.timestamps.tolist()) if known is None else known
+    exact: NDArray[np.int64] | None = getattr(sequence, "timestamps_ns", None)
+    return from_seconds(sequence.timestamps.tolist()) if exact is None else exact
 
 
 def exact_stamps(sequence: Sequence) -> dict[float, int]:

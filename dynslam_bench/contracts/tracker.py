@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Frame, MaskSource
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
-
-from .provenance import Provenance as Provenance
-from .result import TrackResult
-from .sequence import Frame, MaskSource
 
 
 @runtime_checkable
@@ -29,11 +27,9 @@ class Tracker(Protocol):
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; all randomness must come from `rng`."""
-        ...
 
     def track(self, frame: Frame) -> TrackResult:
         """Process one frame and return its camera-to-world pose, causally: later frames change nothing."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -128,3 +124,89 @@ class TrackerSpec:
             return hints
         hint = load_object(self.check)()
         return [hint] if hint else []
+
+
+# What tracking one frame gives.
+
+TrackingState = Literal["initialising", "ok", "lost"]
+"""A pose that is given with `lost` is a prediction and enters no trajectory."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackResult:
+    """One frame's outcome.
+
+    Attributes:
+        T_world_cam: Camera-to-world pose, float64 ``[4, 4]``; None if the tracker has none. A pose given while
+            `state` is ``lost`` is a prediction and enters no trajectory.
+        state: ``ok`` (tracked), ``lost`` or ``initialising``.
+        stats: Diagnostics, plain floats, the same keys on every frame of a tracker. Keys the environment knows:
+            ``keypoints``, ``culled``, ``matches``, ``inliers``, ``map_points``, ``keyframes``, ``keyframe``
+            (1 on frames that became keyframes), ``residual_px``, ``mask_fraction``.
+        timings: Seconds by stage, in the order of the pipeline (``features``, ``segmentation``, ``flow``, ...).
+        dynamic_mask: bool ``[H, W]``, pixels held for dynamic, or None.
+        keypoints_xy: float32 ``[N, 2]``, raw pixels of the features, for rendering; or None.
+        keypoints_keep: bool ``[N]``, which of them were kept; or None.
+    """
+
+    T_world_cam: NDArray[np.float64] | None
+    state: TrackingState
+    stats: Mapping[str, float] = field(default_factory=dict)
+    timings: Mapping[str, float] = field(default_factory=dict)
+    dynamic_mask: NDArray[np.bool_] | None = None
+    keypoints_xy: NDArray[np.float32] | None = None
+    keypoints_keep: NDArray[np.bool_] | None = None
+
+
+# How closely a re-implementation follows its source.
+
+Provenance = Literal["own", "faithful-code", "faithful-paper", "inspired", "assumed", "external", "control"]
+"""``faithful-code``: as the authors' code does; ``faithful-paper``: as the paper says; ``inspired``: its idea in
+another form; ``assumed``: the source is silent on what matters; ``own``: put together here, no one paper or
+program describes the whole; ``external``: another project's program;
+``control``: a reference, no system."""
+
+
+# What a tracker's map looks like from outside.
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeRecord:
+    """One keyframe.
+
+    Attributes:
+        id: Number in order of creation.
+        frame: Index of its frame; -1 for one of an earlier run, in whose map this one began.
+        timestamp: Seconds; NaN for one of an earlier run.
+        T_world_cam: Camera-to-world pose ``[4, 4]``.
+        features: Features it holds.
+        observations: Map points it observes.
+        map: 0 for the map that the trajectory is in; another number for one that began after a loss and never met it.
+    """
+
+    id: int
+    frame: int
+    timestamp: float
+    T_world_cam: NDArray[np.float64]
+    features: int
+    observations: int
+    map: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class MapOutputs:
+    """Keyframes, oldest first, and map points.
+
+    Attributes:
+        keyframes: All keyframes.
+        ids: int64 ``[M]`` ids of the points; of maps that never met the first one none: where they lie is unknown.
+        positions: float64 ``[M, 3]`` world coordinates, metres.
+        colours: uint8 ``[M, 3]`` red, green, blue.
+        observations: int64 ``[M]``, keyframes that observe each point.
+    """
+
+    keyframes: tuple[KeyframeRecord, ...]
+    ids: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    observations: NDArray[np.int64]

@@ -20,7 +20,7 @@ _WORD = re.compile(rb"[\w./~+\-]+")
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([A-Za-z_]\w*)|import[ \t]+([A-Za-z_][\w., \t]*))", re.MULTILINE)
 _SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
-_STORE = ("index", "metrics", "sequences", "latest")
+_STORE = ("index.sqlite", "sequences", "latest")
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
 
 
@@ -38,11 +38,11 @@ def foreign_modules(file: Path) -> set[str]:
     Raises:
         OSError: A file cannot be read.
     """
-    known, foreign = set[str](), set[str]()
+    own, foreign = set[str](), set[str]()
     waiting = [file]
     while waiting:
-        names = imported_modules(waiting) - known
-        known |= names
+        names = imported_modules(waiting) - own
+        own |= names
         waiting = []
         for name in names:
             module, package = file.parent / f"{name}.py", file.parent / name
@@ -79,24 +79,24 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
     Raises:
         OSError: A file cannot be read.
     """
-    found: set[str] = set()
+    modules: set[str] = set()
     for file in filter(is_python, files):
         source = file.read_bytes()
         try:
             nodes = list(ast.walk(ast.parse(source)))
         except (SyntaxError, ValueError, RecursionError):  # of another version of Python
             for single, several in _IMPORT.findall(source):
-                found |= {name.strip() for name in (single or several).decode().split(",")}
+                modules |= {name.strip() for name in (single or several).decode().split(",")}
             continue
         for node in nodes:
             if isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names}
+                modules |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
-                found.add(node.module or "")
+                modules.add(node.module or "")
             elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
                 first = node.args[0] if node.args else None
-                found.add(first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else "")
-    return {name.partition(".")[0].partition(" ")[0] for name in found} - {""}
+                modules.add(first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else "")
+    return {name.partition(".")[0].partition(" ")[0] for name in modules} - {""}
 
 
 def is_python(file: Path) -> bool:
@@ -142,15 +142,15 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
     base = Path() if folder is None else folder
     first = str(base / Path(command[0]).expanduser()) if os.sep in command[0] else shutil.which(command[0])
     program = None if first is None else Path(first)
-    found = [] if program is None or not _is_file(program) else [program, *_linked_libraries(program.resolve())]
+    files = [] if program is None or not _is_file(program) else [program, *_linked_libraries(program.resolve())]
     for word in command[1:]:
         for path in {base / Path(text).expanduser() for text in (word, word.partition("=")[2]) if text}:
-            found += files_below(path) if _is_folder(path) else [path] if _is_file(path) else []
+            files += files_below(path) if _is_folder(path) else [path] if _is_file(path) else []
     if program is not None and program.name.startswith("python") and "-m" in command[:-1]:
-        found += _module_files(command[command.index("-m") + 1], base)
-    named = _with_named_files(found, base)
+        files += _module_files(command[command.index("-m") + 1], base)
+    named = _with_named_files(files, base)
     shells = [file for file in named if file.suffix in (".sh", ".bash") or (not file.suffix and _words(file))]
-    named += [each for file in shells for each in _named([file], list(files_below(file.parent)))]
+    named += [data_file for file in shells for data_file in _named([file], list(files_below(file.parent)))]
     scripts = [file for file in named if is_python(file) and not _is_of_system(file)]
     own = [file for folder in sorted({script.parent for script in scripts}) for file in program_files(folder)]
     modules = {name for script in scripts for name in foreign_modules(script)} - set(sys.stdlib_module_names)
@@ -193,32 +193,32 @@ def _linked_libraries(program: Path) -> list[Path]:
 
 def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
     """Files, and those that scripts and configurations among them name, relative to themselves or to `base`."""
-    found: dict[Path, None] = {}
+    reached: dict[Path, None] = {}
     waiting = list(files)
     while waiting:
         file = waiting.pop(0)
-        if file in found:
+        if file in reached:
             continue
-        found[file] = None
+        reached[file] = None
         for word in sorted(_words(file)):
             if "." in word or "/" in word:
                 path = Path(word).expanduser() if word.startswith("~/") else Path(word)
                 places = {file.parent / path, base / path}  # an absolute path stays as it is
                 waiting += [place for place in places if not _is_of_system(place) and _is_file(place)]
-    return list(found)
+    return list(reached)
 
 
 def _named(code: list[Path], others: list[Path]) -> list[Path]:
     """Those of the other files that the code names; what they name in turn counts, too."""
-    found: list[Path] = []
+    files: list[Path] = []
     waiting = list(code)
     while waiting and others:
         words = {word.rpartition("/")[2] for file in waiting for word in _words(file)}
         ends = tuple(word for word in words if "." in word)
         waiting = [file for file in others if file.name in words or file.name.endswith(ends)]
         others = [file for file in others if file not in set(waiting)]
-        found += waiting
-    return found
+        files += waiting
+    return files
 
 
 def _words(file: Path) -> set[str]:

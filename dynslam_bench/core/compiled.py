@@ -18,7 +18,7 @@ def kernel(function: Function) -> Function:
     """Compile a function, cached on disk and without the GIL.
 
     The compiled code lies beside the source, or in the user's cache folder; where neither can be written it is compiled
-    anew in every process. Sums of floats keep their written order (no fast-math), so that a result does not depend on
+    again in every process. Sums of floats keep their written order (no fast-math), so that a result does not depend on
     the processor's vector width.
     """
     return _compiled(function)

@@ -1,33 +1,63 @@
-"""Resumable download of one file over HTTP, bounded in size and time."""
+"""Resumable download of one file over HTTP, bounded in size and time.
+
+Nothing heavy is imported before something is downloaded.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import hashlib
-import http.client
 import json
 import shutil
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from .address import check_address, connect
-from .download_progress import Progress, Report, reporting
-from .errors import DownloadError, DynslamError
-from .locks import claimed
-from .passwords import without_passwords
-from .reading import read_json
+from dynslam_bench.core.errors import DownloadError, DynslamError
+from dynslam_bench.core.files import claimed
+from dynslam_bench.core.reading import read_json
+from dynslam_bench.core.sanitise import without_passwords
 
-__all__ = ["CHUNK", "Progress", "Report", "download", "file_sha256", "forget"]
+if TYPE_CHECKING:
+    from urllib.parse import SplitResult
+    from urllib.request import Request
+
 
 CHUNK = 1 << 18
 MOST_BYTES = 32 * 2**30
 DEADLINE_S = 24 * 3600.0
+_LONGEST_PAUSE_S = 30.0
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EIO)
+_GO_ON = "run the same command again, it goes on from there"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a fetch is.
+
+    Attributes:
+        stage: What is being done.
+        done: Bytes done, those of earlier calls included.
+        total: Bytes in all; None if the server does not say.
+    """
+
+    stage: Literal["download", "check", "extract"]
+    done: int
+    total: int | None
+
+
+Report = Callable[[Progress], None]
+Display = Callable[[str], contextlib.AbstractContextManager[Report]]
+"""Shows the download of a file of that name as long as the context lasts."""
+_display: list[Display] = []
+
+
+def show_downloads(display: Display) -> None:
+    """Let this process show every download that is called without `progress`; the command line does so."""
+    _display[:] = [display]
 
 
 def download(
@@ -50,7 +80,7 @@ def download(
         url: An ``https`` address, or an ``http`` one where the checksum is known.
         target: The file to write.
         sha256: Expected checksum, or its first digits; None if it is not known.
-        progress: Called with the bytes done; None leaves that to what `download_progress.show_downloads` was given.
+        progress: Called with the bytes done; None leaves that to what `show_downloads` was given.
         attempts: Connections in a row that may fail without bringing a single byte.
         wait_s: Pause before the second attempt, doubled before each further one.
         timeout_s: How long a connection may be silent.
@@ -69,60 +99,42 @@ def download(
     part = target.with_name(target.name + ".part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DownloadError(f"cannot write into {target.parent}: {error.strerror}", "name another folder") from error
-    bounds = _Bounds(most_bytes, time.monotonic() + deadline_s, deadline_s)
-    try:
-        with _only_one(part.with_name(part.name + ".lock"), url), reporting(target.name, progress) as report:
-            here = target if target.is_file() else part
-            if here is part:
-                _complete(url, part, report, attempts, wait_s, timeout_s, bounds)
-            found = file_sha256(here, report)
-            if sha256 is not None and not found.startswith(sha256):
-                raise _discard(here, part, f"{url} has the checksum {found}", sha256)
-            if here is part:
+        with contextlib.ExitStack() as stack:
+            if not stack.enter_context(_claimed(part.with_name(part.name + ".lock"))):
+                raise DownloadError(
+                    f"another process is downloading {url}", "wait for it, then run the same command again"
+                )
+            if progress is None:
+                progress = stack.enter_context(_display[0](target.name)) if _display else lambda _: None
+            partial = _Partial(url, part, progress, timeout_s, most_bytes, deadline_s)
+            whole = target.is_file()
+            if not whole:
+                partial.complete(attempts, wait_s)
+            checksum = file_sha256(target if whole else part, progress)
+            if sha256 is not None and not checksum.startswith(sha256):
+                size = (target if whole else part).stat().st_size
+                target.unlink(missing_ok=True)
+                partial.forget()
+                raise DownloadError(
+                    f"{url} has the checksum {checksum} ({size} bytes), expected {sha256}",
+                    "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
+                )
+            if not whole:
                 part.replace(target)
-            forget(part)  # also what a process left that was killed between these two lines
-            return found
+            partial.forget()  # also what a process left that was killed between these two lines
+            return checksum
     except OSError as error:
         raise DownloadError(f"cannot write {target}: {error.strerror or error}", "name another folder") from error
 
 
-def _discard(here: Path, part: Path, what: str, expected: str) -> DownloadError:
-    """Throw away bytes whose checksum is not the expected one."""
-    size = here.stat().st_size
-    here.unlink()
-    forget(part)
-    return DownloadError(
-        f"{what} ({size} bytes), expected {expected}",
-        "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
-    )
-
-
-@dataclass(frozen=True)
-class _Bounds:
-    """How long a file may be, and until when it has to be here."""
-
-    most_bytes: int
-    deadline: float
-    seconds: float
-
-    def check(self, url: str, part: Path, size: int) -> None:
-        """Refuse what is too long, and throw away what came of it; end what takes too long, and keep it."""
-        if size > self.most_bytes:
-            forget(part)
-            raise DownloadError(f"{url} is longer than the {self.most_bytes / 1e9:.2f} GB that are expected, refused")
-        if time.monotonic() > self.deadline:
-            raise DownloadError(
-                f"download of {url} stopped at {_size(part)} bytes: it took longer than {self.seconds:g} s",
-                "run the same command again, it goes on from there",
-            )
-
-
-def forget(part: Path) -> None:
-    """Remove a partial download and its notes."""
-    part.unlink(missing_ok=True)
-    _notes(part).unlink(missing_ok=True)
+@contextlib.contextmanager
+def _claimed(lock: Path) -> Iterator[bool]:
+    with contextlib.ExitStack() as stack:
+        try:
+            mine = stack.enter_context(claimed(lock))
+        except DynslamError as error:
+            raise DownloadError(str(error.args[0]), error.hint) from error
+        yield mine
 
 
 def file_sha256(path: Path, progress: Report | None = None) -> str:
@@ -137,158 +149,226 @@ def file_sha256(path: Path, progress: Report | None = None) -> str:
     return value.hexdigest()
 
 
-def _complete(
-    url: str, part: Path, report: Report, attempts: int, wait_s: float, timeout_s: float, bounds: _Bounds
-) -> None:
-    """Connect until the partial file is whole."""
-    fruitless, pause, reason, best = 0, wait_s, "", _size(part)
-    while fruitless < attempts:
-        bounds.check(url, part, _size(part))
+class _Partial:
+    """A partial download with its notes: where it came from, its length, and what the server calls that version."""
+
+    def __init__(
+        self, url: str, part: Path, report: Report, timeout_s: float, most_bytes: int, deadline_s: float
+    ) -> None:
+        self.url, self.part, self.report, self.timeout_s = url, part, report, timeout_s
+        self.most_bytes, self.deadline_s = most_bytes, deadline_s
+        self._notes = part.with_name(part.name + ".json")
+        self._end = time.monotonic() + deadline_s
+
+    def complete(self, attempts: int, wait_s: float) -> None:
+        """Connect until the file is whole.
+
+        Raises:
+            DownloadError: It does not become so.
+        """
+        import http.client
+        import urllib.error
+
+        fruitless, pause_s, best, reason = 0, wait_s, self._size(), ""
+        while fruitless < attempts:
+            self._check(self._size())
+            try:
+                if self._connect():
+                    return
+                reason = "the server closed the connection early"
+            except urllib.error.HTTPError as error:
+                reason = f"the server answers {error.code} {error.reason}"
+                if error.code < 500 and error.code not in (408, 429):
+                    raise DownloadError(f"{reason} for {self.url}") from error
+            except (OSError, http.client.HTTPException, ValueError) as error:  # no route, time-out, TLS, odd redirect
+                reason = str(getattr(error, "reason", "") or error) or type(error).__name__
+            if self._size() > best:
+                fruitless, pause_s, best = 0, wait_s, self._size()
+                continue
+            fruitless += 1
+            if fruitless < attempts:
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+        announced = self._read_notes().get("total")
+        expected = f" of {announced}" if announced else ""
+        raise DownloadError(f"download of {self.url} stopped at {self._size()}{expected} bytes: {reason}", _GO_ON)
+
+    def forget(self) -> None:
+        """Remove the file and its notes."""
+        self.part.unlink(missing_ok=True)
+        self._notes.unlink(missing_ok=True)
+
+    def _connect(self) -> bool:
+        """One request from where the file ends; True if it is whole afterwards."""
+        from urllib.error import HTTPError
+        from urllib.request import Request
+
+        start, notes = self._size(), self._read_notes()
+        if start and notes.get("url") != without_passwords(self.url):
+            self.forget()
+            start, notes = 0, {}
+        request = Request(self.url, headers={"User-Agent": "dynslam-bench", "Accept-Encoding": "identity"})
+        if start:
+            request.add_header("Range", f"bytes={start}-")
+            if validator := notes.get("etag") or notes.get("modified"):
+                request.add_header("If-Range", validator)
         try:
-            if _one_connection(url, part, report, timeout_s, bounds):
-                return
-            reason = "the server closed the connection early"
-        except urllib.error.HTTPError as error:
-            if error.code < 500 and error.code not in (408, 429):
-                raise DownloadError(f"the server answers {error.code} {error.reason} for {url}") from error
-            reason = f"the server answers {error.code} {error.reason}"
-        except (OSError, http.client.HTTPException, ValueError) as error:  # no route, time-out, TLS, an odd redirect
-            reason = str(getattr(error, "reason", "") or error) or type(error).__name__
-        if _size(part) > best:
-            fruitless, pause, best = 0, wait_s, _size(part)
-            continue
-        fruitless += 1
-        if fruitless < attempts:
-            time.sleep(pause)
-            pause = min(2 * pause, 30.0)
-    announced = _read_notes(part).get("total")
-    expected = f" of {announced}" if announced else ""
-    raise DownloadError(
-        f"download of {url} stopped at {_size(part)}{expected} bytes: {reason}",
-        "run the same command again, it goes on from there",
-    )
-
-
-def _one_connection(url: str, part: Path, report: Report, timeout_s: float, bounds: _Bounds) -> bool:
-    """One request from where the partial file ends; True if the file is whole afterwards."""
-    start, notes = _size(part), _read_notes(part)
-    if start and notes.get("url") != without_passwords(url):
-        forget(part)
-        start, notes = 0, {}
-    request = urllib.request.Request(url, headers={"User-Agent": "dynslam-bench", "Accept-Encoding": "identity"})
-    if start:
-        request.add_header("Range", f"bytes={start}-")
-        if validator := notes.get("etag") or notes.get("modified"):
-            request.add_header("If-Range", validator)
-    try:
-        response = connect(request, timeout_s)
-    except urllib.error.HTTPError as error:
-        if error.code != 416 or not start:
-            raise
-        if _total(error.headers.get("Content-Range")) == start:
-            return True
-        forget(part)  # longer than the file on the server, or the server does not say: begin anew
-        return False
-    with response:
-        if start and (response.status != 206 or not _continues(response.headers.get("Content-Range"), start)):
-            if response.status == 206:  # a range, but not the one that was asked for
-                forget(part)
-                return False
-            start = 0  # the whole file comes: the server knows no ranges, or the file has changed
-        length = response.headers.get("Content-Length")
-        total = start + int(length) if length is not None and length.isdigit() else None
-        _write_notes(part, url, total, response.headers)
-        bounds.check(url, part, total or start)
-        _check_space(part, total, start)
-        return _receive(response, part, start, total, report, lambda size: bounds.check(url, part, size))
-
-
-def _receive(
-    response: Any, part: Path, start: int, total: int | None, report: Report, check: Callable[[int], None]
-) -> bool:
-    """Append the body to the partial file; True if it came to its announced end."""
-    done = start
-    try:
-        with part.open("r+b" if start else "wb") as file:
-            file.seek(start)
-            while True:
-                try:
-                    block = response.read1(CHUNK)
-                except http.client.IncompleteRead as error:
-                    file.write(error.partial)
+            response = connect(request, self.timeout_s)
+        except HTTPError as error:
+            if error.code != 416 or not start:
+                raise
+            if (error.headers.get("Content-Range") or "").rpartition("/")[2] == str(start):
+                return True
+            self.forget()  # longer than the file on the server, or the server does not say: begin again
+            return False
+        with response:
+            if start and response.status == 206:
+                if not (response.headers.get("Content-Range") or "").startswith(f"bytes {start}-"):
+                    self.forget()  # another range than was asked for
                     return False
-                if not block:
-                    return total is None or done == total
-                check(done + len(block))
-                file.write(block)
-                done += len(block)
-                report(Progress("download", done, total))
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EIO):
-            raise
-        raise DownloadError(
-            f"cannot write {part} at {done} of {total if total is not None else 'unknown'} bytes: {error.strerror}",
-            "make room and run the same command again, it goes on from there",
-        ) from error
+            elif start:
+                start = 0  # the whole file comes: the server knows no ranges, or the file has changed
+            length = response.headers.get("Content-Length")
+            total = start + int(length) if length is not None and length.isdigit() else None
+            self._write_notes(total, response.headers)
+            self._check(total or start)
+            free = shutil.disk_usage(self.part.parent).free
+            if total is not None and total - start > free:
+                raise DownloadError(
+                    f"{self.part.parent} has {free / 1e9:.2f} GB free, but {(total - start) / 1e9:.2f} GB are still to "
+                    "download",
+                    "make room, or name another folder",
+                )
+            return self._receive(response, start, total)
 
+    def _receive(self, response: Any, start: int, total: int | None) -> bool:
+        """Append the body to the file; True if it came to its announced end."""
+        from http.client import IncompleteRead
 
-def _check_space(part: Path, total: int | None, start: int) -> None:
-    free = shutil.disk_usage(part.parent).free
-    if total is not None and total - start > free:
-        raise DownloadError(
-            f"{part.parent} has {free / 1e9:.2f} GB free, but {(total - start) / 1e9:.2f} GB are still to download",
-            "make room, or name another folder",
-        )
-
-
-@contextlib.contextmanager
-def _only_one(lock: Path, url: str) -> Iterator[None]:
-    with contextlib.ExitStack() as held:
+        done = start
         try:
-            mine = held.enter_context(claimed(lock))
-        except DynslamError as error:
-            raise DownloadError(str(error.args[0]), error.hint) from error
-        if not mine:
-            raise DownloadError(f"another process is downloading {url}", "wait for it, then run the same command again")
-        yield
+            with self.part.open("r+b" if start else "wb") as file:
+                file.seek(start)
+                while True:
+                    try:
+                        block = response.read1(CHUNK)
+                    except IncompleteRead as error:
+                        file.write(error.partial)
+                        return False
+                    if not block:
+                        return total is None or done == total
+                    self._check(done + len(block))
+                    file.write(block)
+                    done += len(block)
+                    self.report(Progress("download", done, total))
+        except OSError as error:
+            if error.errno not in _DISK_ERRORS:
+                raise
+            raise DownloadError(
+                f"cannot write {self.part} at {done} of {total or 'unknown'} bytes: {error.strerror}",
+                f"make room and {_GO_ON}",
+            ) from error
+
+    def _check(self, size: int) -> None:
+        """Refuse what is too long, and throw away what came of it; end what takes too long, and keep it."""
+        if size > self.most_bytes:
+            self.forget()
+            expected = f"the {self.most_bytes / 1e9:.2f} GB that are expected"
+            raise DownloadError(f"{self.url} is longer than {expected}, refused")
+        if time.monotonic() > self._end:
+            raise DownloadError(
+                f"download of {self.url} stopped at {self._size()} bytes: it took longer than {self.deadline_s:g} s",
+                _GO_ON,
+            )
+
+    def _size(self) -> int:
+        return self.part.stat().st_size if self.part.exists() else 0
+
+    def _read_notes(self) -> dict[str, Any]:
+        try:
+            notes = read_json(self._notes)
+        except DynslamError:
+            return {}
+        return notes if isinstance(notes, dict) else {}
+
+    def _write_notes(self, total: int | None, headers: Any) -> None:
+        etag = headers.get("ETag")
+        notes = {
+            "url": without_passwords(self.url),
+            "total": total,
+            "etag": None if etag is None or etag.startswith("W/") else etag,  # a weak one cannot validate a range
+            "modified": headers.get("Last-Modified"),
+        }
+        with contextlib.suppress(OSError):  # without notes the next call begins again, which is safe
+            self._notes.write_text(json.dumps(notes))
 
 
-def _continues(content_range: str | None, start: int) -> bool:
-    return content_range is not None and content_range.startswith(f"bytes {start}-")
+def check_address(url: str, *, checked: bool) -> SplitResult:
+    """The parts of an address that may be fetched: https, or http where the content is checked.
 
+    Args:
+        url: The address.
+        checked: Whether a checksum of the content is known; then plain http will do, and on this machine always.
 
-def _total(content_range: str | None) -> int | None:
-    """The length in ``bytes */123`` or ``bytes 5-9/123``."""
-    total = (content_range or "").rpartition("/")[2]
-    return int(total) if total.isdigit() else None
+    Raises:
+        DownloadError: Another scheme, no host, characters that no address has, or a password.
+    """
+    from urllib.parse import urlsplit
 
-
-def _size(path: Path) -> int:
+    shown = f"cannot download {url[:200]!r}"
     try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return 0
+        parts = urlsplit(url)
+        host, port = (parts.hostname or "").encode("idna").decode(), parts.port
+    except ValueError as error:
+        raise DownloadError(f"{shown}: {error}") from error
+    if parts.scheme not in ("http", "https"):
+        raise DownloadError(shown, "the address has to begin with http:// or https://")
+    if not host or port == 0 or not url.isascii() or not url.isprintable() or " " in url:
+        raise DownloadError(f"{shown}: it is no web address", "for example https://host/name.tgz")
+    if parts.username is not None or parts.password is not None:
+        raise DownloadError(f"cannot download from {host}: the address holds a name or password", "leave them out")
+    if parts.scheme == "http" and not checked and not _is_loopback(host):
+        raise DownloadError(f"{shown}: http without a known checksum could bring anything", "use https")
+    return parts
 
 
-def _notes(part: Path) -> Path:
-    return part.with_name(part.name + ".json")
+def connect(request: Request, timeout_s: float) -> Any:
+    """Open an address as the standard library does, for http and https alone, whatever a server redirects to.
+
+    Raises:
+        DownloadError: The server redirects to another scheme.
+        OSError: It cannot be reached, or answers with an error.
+    """
+    import urllib.request
+
+    class Redirect(urllib.request.HTTPRedirectHandler):
+        """Follows redirects to https, and from http to http."""
+
+        def redirect_request(self, req: Request, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
+            scheme = newurl.partition(":")[0].lower()
+            if scheme not in ("https", req.type):
+                raise DownloadError(
+                    f"the server redirects {req.full_url} to {newurl[:200]!r}, refused", "name a mirror"
+                )
+            return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+    opener = urllib.request.OpenerDirector()
+    for handler in (
+        urllib.request.ProxyHandler,
+        urllib.request.HTTPHandler,
+        urllib.request.HTTPSHandler,
+        urllib.request.HTTPDefaultErrorHandler,
+        urllib.request.HTTPErrorProcessor,
+        Redirect,
+    ):
+        opener.add_handler(handler())
+    return opener.open(request, timeout=timeout_s)
 
 
-def _read_notes(part: Path) -> dict[str, Any]:
+def _is_loopback(host: str) -> bool:
+    import ipaddress
+
     try:
-        notes = read_json(_notes(part))
-    except DynslamError:
-        return {}
-    return notes if isinstance(notes, dict) else {}
-
-
-def _write_notes(part: Path, url: str, total: int | None, headers: Any) -> None:
-    etag = headers.get("ETag")
-    notes = {
-        "url": without_passwords(url),
-        "total": total,
-        "etag": None if etag is None or etag.startswith("W/") else etag,  # a weak one cannot validate a range
-        "modified": headers.get("Last-Modified"),
-    }
-    with contextlib.suppress(OSError):  # without notes the next call begins anew, which is safe
-        _notes(part).write_text(json.dumps(notes))
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -9,7 +9,7 @@ import difflib
 from collections.abc import Iterable
 from typing import Any
 
-from .passwords import without_passwords
+from dynslam_bench.core.sanitise import without_passwords
 
 
 class DynslamError(Exception):

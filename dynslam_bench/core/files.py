@@ -8,18 +8,20 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import fcntl
 import os
 import re
 import secrets
 import shutil
 import sys
+import tempfile
 import time
+import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import DynslamError
-from .locks import hold, is_abandoned
+from dynslam_bench.core.errors import DynslamError
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.(tmp|new)")
 _NEW_S = 60.0
@@ -54,7 +56,7 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     Raises:
         DynslamError: The folder cannot be written (full disk, permissions); nothing is left behind.
     """
-    with _told(path), replacing(path) as temporary:
+    with _clear_errors(path), replacing(path) as temporary:
         temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
@@ -64,13 +66,13 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
     Raises:
         DynslamError: As `write_atomic`.
     """
-    with _told(path), replacing(path) as temporary, temporary.open("wb") as file:
+    with _clear_errors(path), replacing(path) as temporary, temporary.open("wb") as file:
         file.writelines(f"{line}\n".encode(errors="backslashreplace") for line in lines)
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """What goes wrong in writing a file, as one line."""
+def _clear_errors(path: Path) -> Iterator[None]:
+    """Turn what goes wrong in writing a file into one line."""
     try:
         yield
     except OSError as error:
@@ -81,7 +83,7 @@ def _told(path: Path) -> Iterator[None]:
 def replace_folder(work: Path, target: Path) -> None:
     """Rename a finished folder to `target`, on the same file system; what `target` held before is deleted.
 
-    At every moment `target` is what it was or what it is to be, whoever else replaces it at the same time (where the
+    At every moment `target` is what it was or what it is to be, even if others replace it at the same time (where the
     system can exchange two names at once: Linux, on its own file systems; elsewhere it is missing for a moment).
 
     Raises:
@@ -186,3 +188,132 @@ def atomic_folder(target: Path) -> Iterator[Path]:
             replace_folder(work, target)
         except OSError as error:
             raise DynslamError(f"cannot write {target}: {error.strerror}", "check the permissions") from error
+
+
+# -- locks, which the system releases when their holder dies -----------------------------------------------------------
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[bool]:
+    """Hold a name while the block lasts, if nobody else does; its file is removed afterwards.
+
+    Args:
+        path: Of the lock's file; its folder exists.
+
+    Yields:
+        Whether it is held; always, where the file system knows no locks.
+
+    Raises:
+        DynslamError: The file cannot be made.
+    """
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        raise DynslamError(f"cannot write {path}: {error.strerror}", "check the permissions and the disk") from error
+    try:
+        mine = _lock(handle) is not False and _is_at(handle, path)  # else its last holder has just removed it
+        try:
+            yield mine
+        finally:
+            if mine:  # while it is locked, so that nobody locks a file that goes away unseen
+                with contextlib.suppress(OSError):  # it is harmless if it stays
+                    path.unlink()
+    finally:
+        os.close(handle)
+
+
+def hold(path: Path) -> int:
+    """Lock a file or folder until the descriptor is closed, or this process and those that it forked have ended.
+
+    Raises:
+        OSError: It is not there.
+    """
+    handle = os.open(path, os.O_RDONLY)
+    _lock(handle)
+    return handle
+
+
+def is_abandoned(path: Path) -> bool:
+    """Whether a file or folder is there and nobody holds it; False where the file system knows no locks."""
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return False
+    try:
+        return _lock(handle) is True
+    finally:
+        os.close(handle)
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Whether an open file still has that name."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except OSError:
+        return False
+
+
+def _lock(handle: int) -> bool | None:
+    """Whether the lock was free and is ours now; None where the file system knows none."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+# -- private temporary folders, which are removed with the process that made them, also when that is killed ------------
+
+_PREFIX = "dynslam-held-"
+SHARED_MEMORY = Path("/dev/shm")
+
+
+class TemporaryFolder:
+    """A folder that only this user may enter; removed by `close`, at the latest with the object.
+
+    It is locked while its process lives, so that `sweep` knows those of killed processes.
+
+    Args:
+        base: Where; None for the system's folder of temporary files.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+
+    def __init__(self, base: Path | None = None) -> None:
+        fresh = Path(tempfile.mkdtemp(prefix=f"new-{_PREFIX}", dir=base))
+        lock = hold(fresh)
+        self.path = fresh.rename(fresh.with_name(fresh.name.removeprefix("new-")))  # from now on `sweep` sees it
+        self._remove = weakref.finalize(self, _remove, self.path, lock, os.getpid())
+
+    def close(self) -> None:
+        """Remove it with what it holds; may be called more than once."""
+        self._remove()
+
+
+def sweep() -> int:
+    """Remove this user's folders whose process is no more; returns how many there were."""
+    abandoned = [
+        folder
+        for base in {Path(tempfile.gettempdir()), SHARED_MEMORY}
+        for folder in base.glob(f"{_PREFIX}*")
+        if _is_mine(folder) and is_abandoned(folder)
+    ]
+    for folder in abandoned:
+        shutil.rmtree(folder, ignore_errors=True)
+    return len(abandoned)
+
+
+def _is_mine(folder: Path) -> bool:
+    try:
+        return folder.is_dir() and folder.stat().st_uid == os.getuid()
+    except OSError:  # its process has just removed it
+        return False
+
+
+def _remove(path: Path, lock: int, owner: int) -> None:
+    if os.getpid() == owner:  # a fork of the owner does not own it
+        shutil.rmtree(path, ignore_errors=True)
+    os.close(lock)

@@ -6,12 +6,16 @@ Everything is read from files and folders: no plug-in is imported to know its di
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import hashlib
 import importlib.metadata
 import os
 import platform
+import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dynslam_bench
-
-from .code_files import files_below, foreign_modules, imported_modules, is_code, program_files
-from .digests import code_files_digest, path_digest
-from .errors import PluginError
-from .records import digest
-from .settings import Settings, flatten, named
-from .version import release
+from dynslam_bench.core.code_files import files_below, foreign_modules, imported_modules, is_code, program_files
+from dynslam_bench.core.errors import DynslamError, PluginError
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.folders import digest_cache_folder
+from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.settings import Settings, flatten, named
+from dynslam_bench.core.version import release
 
 OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 """The distributions that bring OpenCV; more than one may be installed, over each other."""
@@ -68,13 +72,13 @@ def named_digests(settings: Settings) -> dict[str, str]:
     Raises:
         PluginError: One cannot be read.
     """
-    found = {}
+    digests = {}
     for name, path in named_files(settings).items():
         try:
-            found[name] = path_digest(path)[:16]
+            digests[name] = path_digest(path)[:16]
         except OSError as error:
             raise PluginError(f"cannot read {path}, which the setting '{name}' names: {error.strerror}") from error
-    return found
+    return digests
 
 
 def _texts(name: str, value: object) -> Iterator[tuple[str, str]]:
@@ -92,20 +96,20 @@ def _texts(name: str, value: object) -> Iterator[tuple[str, str]]:
 # -- code --------------------------------------------------------------------------------------------------------------
 
 
-def code_digest(entry_point: str, rooms: Sequence[str]) -> str:
-    """Digest of the code behind an entry point as it lies on the disk now: this package's rooms and a plug-in's files.
+def code_digest(entry_point: str, packages: Sequence[str]) -> str:
+    """Digest of the code behind an entry point as it is on the disk now: packages of ours and a plug-in's files.
 
     A plug-in in a file counts with the code of its folder and the data files that this names, one in a package with all
     files of its top-level package. Python sources count by their syntax: comments and docstrings change nothing.
 
     Args:
         entry_point: ``module:Attr`` or ``file.py:Attr``.
-        rooms: The rooms of this package that it may use, e.g. ``features``.
+        packages: The subpackages of this package that it may use, e.g. ``features``.
 
     Raises:
         PluginError: The plug-in's files cannot be found or read.
     """
-    return digest([package_digest(tuple(rooms)), plugin_digest(entry_point)])
+    return digest([package_digest(tuple(packages)), plugin_digest(entry_point)])
 
 
 def plugin_digest(entry_point: str) -> str:
@@ -125,7 +129,7 @@ def plugin_digest(entry_point: str) -> str:
         if module.endswith(".py"):
             file = Path(module).expanduser().resolve()
             files = program_files(file.parent)
-            return digest([code_files_digest(files, file.parent), _dependencies(foreign_modules(file))])
+            return digest([contents_digest(files, file.parent), _dependencies(foreign_modules(file))])
         places = _folders_of(top)
         names = imported_modules(file for place in places for file in _files_of(place)) - {top}
         return digest([[_whole(place) for place in places], _dependencies(names)])
@@ -141,22 +145,22 @@ def _dependencies(modules: set[str]) -> dict[str, str]:
     Raises:
         OSError: A file cannot be read.
     """
-    found: dict[str, str] = {}
+    digests: dict[str, str] = {}
     waiting = set(modules)
     while waiting:
         top = waiting.pop()
-        if top in found or top == _OWN or top in sys.stdlib_module_names:
+        if top in digests or top == _OWN or top in sys.stdlib_module_names:
             continue
         try:
             places = _folders_of(top)
         except (PluginError, ImportError, ValueError):
             continue
         if any(part in ("site-packages", "dist-packages") for part in places[0].parts):
-            found[top] = distribution_of_module(top)[1]
+            digests[top] = distribution_of_module(top)[1]
         else:
-            found[top] = digest([_whole(place) for place in places])
+            digests[top] = digest([_whole(place) for place in places])
             waiting |= imported_modules(file for place in places for file in _files_of(place))
-    return found
+    return digests
 
 
 def distribution_of_module(module: str) -> tuple[str, str]:
@@ -171,11 +175,11 @@ def _distributions() -> Mapping[str, Sequence[str]]:
 
 
 @cache
-def package_digest(rooms: tuple[str, ...]) -> str:
-    """Digest of the code of rooms of this package; read once a process, as its modules are."""
-    folders = [Path(folder) / room for folder in dynslam_bench.__path__ for room in rooms]
+def package_digest(packages: tuple[str, ...]) -> str:
+    """Digest of the code of packages of this package; read once a process, as its modules are."""
+    folders = [Path(folder) / package for folder in dynslam_bench.__path__ for package in packages]
     codes = {folder: [file for file in files_below(folder) if is_code(file)] for folder in folders if folder.is_dir()}
-    return digest([[folder.name, code_files_digest(files, folder)] for folder, files in codes.items()])
+    return digest([[folder.name, contents_digest(files, folder)] for folder, files in codes.items()])
 
 
 def _files_of(place: Path) -> list[Path]:
@@ -183,7 +187,7 @@ def _files_of(place: Path) -> list[Path]:
 
 
 def _whole(place: Path) -> str:
-    return code_files_digest(_files_of(place), place.parent if place.is_file() else place)
+    return contents_digest(_files_of(place), place.parent if place.is_file() else place)
 
 
 def _folders_of(top: str) -> list[Path]:
@@ -204,9 +208,9 @@ def _folders_of(top: str) -> list[Path]:
 @cache
 def opencv_version() -> str:
     """Every installed distribution of OpenCV with its version; that of the module for a build of one's own."""
-    found = [f"{name} {number}" for name in OPENCV if (number := distribution_version(name))]
-    if found or find_spec("cv2") is None:
-        return ", ".join(found)
+    versions = [f"{name} {number}" for name in OPENCV if (number := distribution_version(name))]
+    if versions or find_spec("cv2") is None:
+        return ", ".join(versions)
     import cv2
 
     return f"cv2 {cv2.__version__}"
@@ -224,8 +228,8 @@ def distribution_version(name: str) -> str:
 def machine_digest() -> str:
     """Short digest of the machine and the versions that change a stage's result or its cost."""
     versions = {name: distribution_version(name) for name in _STAGES_NEED}
-    found = {"dynslam-bench": release(), "opencv": opencv_version(), **versions}
-    return digest({"node": platform.node(), "cpu": _cpu_name(), "versions": found})
+    software = {"dynslam-bench": release(), "opencv": opencv_version(), **versions}
+    return digest({"node": platform.node(), "cpu": _cpu_model(), "versions": software})
 
 
 def content_digest(*arrays: NDArray[Any]) -> str:
@@ -237,9 +241,226 @@ def content_digest(*arrays: NDArray[Any]) -> str:
     return state.hexdigest()
 
 
-def _cpu_name() -> str:
+# -- file contents, whose digests are remembered while the files are unchanged ----------------------------------------
+
+_BLOCK = 1 << 20
+_SETTLED_NS = 2_000_000_000
+_MEMORY: dict[str, str] = {}
+
+
+def contents_digest(files: Iterable[Path], root: Path | None = None, *, syntax: bool = True) -> str:
+    """SHA-256 of the contents of files.
+
+    Args:
+        files: The files; without a root their order counts and their names do not.
+        root: A folder; with one their names below it count and their order does not.
+        syntax: Whether Python sources count by `syntax_digest`, and not by their bytes.
+
+    Raises:
+        OSError: One cannot be read.
+    """
+    ordered = list(files) if root is None else sorted(files)
+
+    def compute() -> str:
+        whole = hashlib.sha256()
+        for file in ordered:
+            name = "" if root is None else f"{file.relative_to(root).as_posix()}\0"
+            is_source = syntax and file.suffix == ".py"
+            content = syntax_digest(file.read_bytes()) if is_source else _sha256(file)
+            whole.update(f"{name}{content}\n".encode(errors="surrogateescape"))
+        return whole.hexdigest()
+
+    return _remembered(f"contents {root} {syntax}", ordered, compute)
+
+
+def path_digest(path: Path) -> str:
+    """SHA-256 of a file's content, or of the names and contents of all files in a folder.
+
+    Raises:
+        OSError: Something cannot be read.
+    """
+    if path.is_file():
+        return _remembered("file", [path], lambda: _sha256(path))
+    return contents_digest((file for file in path.rglob("*") if file.is_file()), path, syntax=False)
+
+
+def syntax_digest(source: bytes) -> str:
+    """SHA-256 of a Python source's syntax tree without comments, layout and docstrings.
+
+    It does not depend on the version of Python that parses it. What cannot be parsed counts by its bytes.
+    """
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+        words = "\0".join(_tokens_of(ast.parse(source)))
+    except (SyntaxError, ValueError, RecursionError):
+        return hashlib.sha256(source).hexdigest()
+    return hashlib.sha256(words.encode(errors="backslashreplace")).hexdigest()
+
+
+def _tokens_of(node: Any) -> Iterator[str]:
+    """A syntax tree as text tokens; empty fields, which differ between versions of Python, are left out."""
+    if isinstance(node, ast.AST):
+        yield f"({type(node).__name__}"
+        for name, value in ast.iter_fields(node):
+            if value is not None and value != [] and name not in ("ctx", "kind", "type_comment"):
+                yield name
+                yield from _tokens_of(value)
+        yield ")"
+    elif isinstance(node, list):
+        for inner in node:
+            if not _is_docstring(inner):
+                yield from _tokens_of(inner)
+    else:
+        yield repr(node)
+
+
+def _is_docstring(node: Any) -> bool:
+    """Whether a statement is a string alone, which does nothing."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def _sha256(path: Path) -> str:
+    whole = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            whole.update(block)
+    return whole.hexdigest()
+
+
+def _remembered(kind: str, files: list[Path], compute: Callable[[], str]) -> str:
+    state, newest = _files_state(files)
+    key = hashlib.sha256(f"{kind}\0{state}".encode()).hexdigest()
+    if key in _MEMORY:
+        return _MEMORY[key]
+    entry = digest_cache_folder() / key[:40]
+    with contextlib.suppress(OSError):
+        stored = entry.read_text(encoding="ascii", errors="replace")
+        if len(stored) == 64:
+            _MEMORY[key] = stored
+            return stored
+    value = compute()
+    if is_settled(newest):
+        _MEMORY[key] = value
+        with contextlib.suppress(DynslamError):  # a cache that cannot be written costs time only
+            write_atomic(entry, value)
+    return value
+
+
+def is_settled(newest_ns: int | None) -> bool:
+    """Whether files whose newest time is this may be remembered: a change within the same tick would not show.
+
+    Args:
+        newest_ns: Time in nanoseconds since 1970; None without a file.
+    """
+    return newest_ns is not None and time.time_ns() - newest_ns > _SETTLED_NS
+
+
+def _files_state(files: Iterable[Path]) -> tuple[str, int]:
+    """Digest of path, size, times and inode of each file, and the newest of the times in nanoseconds.
+
+    Raises:
+        OSError: One is not there.
+    """
+    whole, newest = hashlib.sha256(), 0
+    for file in files:
+        path = os.fspath(file)
+        if not os.path.isabs(path):  # noqa: PTH117 - thousands of files: pathlib takes several times as long
+            path = os.path.abspath(path)  # noqa: PTH100
+        stat = os.stat(path)  # noqa: PTH116
+        newest = max(newest, stat.st_mtime_ns, stat.st_ctime_ns)
+        text = f"{path}\0{stat.st_size},{stat.st_mtime_ns},{stat.st_ctime_ns},{stat.st_ino}\n"
+        whole.update(text.encode(errors="surrogateescape"))
+    return whole.hexdigest(), newest
+
+
+# -- where and with what a run was made --------------------------------------------------------------------------------
+
+PACKAGES = ("numpy", "scipy", "torch", "numba", "gtsam", "gymnasium", "optuna")
+
+
+class Machine(Record):
+    """The computer, without its name.
+
+    Attributes:
+        cpu: Model name.
+        cores: Logical processors that the process may use.
+        memory_gb: Main memory.
+        system: Operating system and architecture.
+        gpu: Name of the GPU the run used, empty without one.
+    """
+
+    cpu: str
+    cores: int
+    memory_gb: float
+    system: str
+    gpu: str = ""
+
+
+class GitRevision(Record):
+    """The checkout the package was imported from.
+
+    Attributes:
+        revision: Commit hash.
+        dirty: Whether tracked files differ from it.
+    """
+
+    revision: str
+    dirty: bool
+
+
+@cache
+def this_machine() -> Machine:
+    """This computer."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return Machine(
+        cpu=_cpu_model(),
+        cores=len(affinity(0)) if affinity is not None else os.cpu_count() or 1,
+        memory_gb=round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
+        system=f"{platform.system()} {platform.release()} {platform.machine()}",
+    )
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of Python, of this package and of those that a result depends on; missing ones are left out."""
+    environment = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
+    for name in PACKAGES:
+        installed = distribution_version(name)
+        if installed:
+            environment[name] = installed
+    if opencv_version():
+        environment["opencv"] = opencv_version()
+    return environment
+
+
+@cache
+def git_revision() -> GitRevision | None:
+    """The commit of the checkout that the package lies in; None for an installed package or without git."""
+    checkout = Path(dynslam_bench.__file__).resolve().parent.parent
+    if not (checkout / "pyproject.toml").is_file() or not (checkout / ".git").exists():
+        return None
+    try:
+        revision = _git(checkout, "rev-parse", "HEAD")
+        changes = _git(checkout, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return GitRevision(revision=revision, dirty=bool(changes))
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(folder), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=10).stdout.strip()
+
+
+def _cpu_model() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(errors="replace").splitlines():
+            if line.lower().startswith(("model name", "hardware")):
+                return line.partition(":")[2].strip()
+    if platform.system() == "Darwin":
+        try:
+            command = ["sysctl", "-n", "machdep.cpu.brand_string"]
+            return subprocess.run(command, check=True, capture_output=True, text=True, timeout=5).stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            return platform.processor()
+    return platform.processor() or platform.machine()

@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import warnings
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DynslamError
-from .image_header import image_size, is_whole_jpeg
-from .reading import MEGABYTE, read_bytes
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.reading import MEGABYTE, read_bytes
 
 Image = NDArray[np.integer | np.floating]
 MOST_PIXELS = 1 << 26
 """Larger images (67 megapixels) are refused where nothing says which size to expect."""
 MOST_BYTES = 512 * MEGABYTE
-AS_STORED = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-_JPEG_START = b"\xff\xd8\xff"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
+_TILE_SIZE = (322, 323)
+"""TIFF tags of the width and height of a tile, for which OpenCV takes memory as well."""
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in pixels that the header of a PNG, JPEG, TIFF, BMP or PNM file states; None if it is none."""
+    from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, TiffImagePlugin
+
+    png, jpeg, tiff = PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, TiffImagePlugin.TiffImageFile
+    for reader in (png, jpeg, tiff, BmpImagePlugin.BmpImageFile, PpmImagePlugin.PpmImageFile):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of damaged metadata
+                image = reader(io.BytesIO(data))  # not `PIL.Image.open`, which does not state a size that is too large
+            tile = [getattr(image, "tag_v2", {}).get(tag, 0) for tag in _TILE_SIZE]
+            return max(image.width, int(tile[0])), max(image.height, int(tile[1]))
+        except Exception:  # Pillow raises almost anything over damaged headers
+            continue
+    return None
 
 
 def read_image(
@@ -28,7 +45,7 @@ def read_image(
     size: tuple[int, int] | None = None,
     mismatch: str = "another size was expected",
     hint: str = "",
-    flags: int = AS_STORED,
+    flags: int | None = None,
     kind: type[DynslamError] = DynslamError,
 ) -> Image:
     """Decode a PNG, JPEG, TIFF, BMP or PNM file.
@@ -38,7 +55,7 @@ def read_image(
         size: Width and height that it has to have, in pixels; None for any up to `MOST_PIXELS`.
         mismatch: Ends the message where it has another one, e.g. ``but the camera is 640x480``.
         hint: What to do then.
-        flags: OpenCV's ``IMREAD_*``.
+        flags: OpenCV's ``IMREAD_*``; None for the pixels as they are stored.
         kind: What is raised.
 
     Returns:
@@ -47,21 +64,22 @@ def read_image(
     Raises:
         DynslamError: Of the given kind: the file is missing, empty, truncated, of another size or no image.
     """
+    import cv2
+
     data = read_bytes(path, limit=MOST_BYTES, kind=kind)
     if not data:
         raise kind(f"image {path} is empty (0 bytes)", "fetch it again")
-    whole = not data.startswith(_PNG_START) or _is_whole_png(data)
-    if not whole or (data.startswith(_JPEG_START) and not is_whole_jpeg(data)):
-        # OpenCV fills what is missing of a JPEG, some versions also of a PNG; some take the memory that a chunk claims
+    if not _is_whole(data):
         raise kind(f"image {path} is truncated ({len(data)} bytes)", "fetch it again")
-    found = image_size(data)
-    if found is not None and size is not None and found != size:
-        raise kind(f"image {path} is {found[0]}x{found[1]}, {mismatch}", hint)
-    if found is not None and found[0] * found[1] > MOST_PIXELS:
+    stated = image_size(data)
+    if stated is not None and size is not None and stated != size:
+        raise kind(f"image {path} is {stated[0]}x{stated[1]}, {mismatch}", hint)
+    if stated is not None and stated[0] * stated[1] > MOST_PIXELS:
         most = f"at most {MOST_PIXELS >> 20} megapixels are decoded"
-        raise kind(f"image {path} ({len(data)} bytes) claims to be {found[0]}x{found[1]}, {most}")
+        raise kind(f"image {path} ({len(data)} bytes) claims to be {stated[0]}x{stated[1]}, {most}")
+    as_stored = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = None if found is None else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = stated and cv2.imdecode(np.frombuffer(data, np.uint8), as_stored if flags is None else flags)
     except cv2.error:
         image = None
     if image is None or 0 in image.shape:
@@ -71,8 +89,15 @@ def read_image(
     return np.asarray(image)
 
 
-def _is_whole_png(data: bytes) -> bool:
-    """Whether every chunk up to the last ends within the file."""
+def _is_whole(data: bytes) -> bool:
+    """Whether a PNG or JPEG file has its end.
+
+    OpenCV fills what is missing of a JPEG, and some versions of it of a PNG; some take the memory that a chunk claims.
+    """
+    if data.startswith(b"\xff\xd8\xff"):  # the end marker does not occur within the image data that it ends
+        return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda") > 0
+    if not data.startswith(_PNG_START):
+        return True
     position = len(_PNG_START)
     while position + 12 <= len(data):
         (length,), kind = struct.unpack_from(">I", data, position), data[position + 4 : position + 8]

@@ -11,10 +11,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import os
+import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cache
 from hashlib import sha256
 from importlib.metadata import entry_points
 from operator import attrgetter
@@ -22,8 +26,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
-from .errors import DynslamError, PluginError, did_you_mean
-from .plugin_probe import check_import
+from dynslam_bench.core.errors import DynslamError, PluginError, did_you_mean
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_PLUGINS"
 Kind = Literal["trackers", "segmenters", "features", "flow", "filters", "sequences"]
@@ -80,7 +83,7 @@ class Registry(Generic[P]):
 
     def all(self) -> list[Found[P]]:
         """Every available plug-in, sorted by id."""
-        return [found for _, found in sorted(self._discover().items())]
+        return [plugin for _, plugin in sorted(self._discover().items())]
 
     def failures(self) -> list[Failure]:
         """The plug-ins that could not be loaded, with reasons."""
@@ -93,13 +96,13 @@ class Registry(Generic[P]):
         Raises:
             PluginError: Unknown id (with a did-you-mean), or the named object cannot be loaded or is no spec.
         """
-        found = self._discover()
-        if name in found:
-            return found[name].spec
+        plugins = self._discover()
+        if name in plugins:
+            return plugins[name].spec
         if ":" in name:
             return self._not_built_in(self._check(load_object(name), name), name)
         broken = [failure for failure in self._failures if name in failure.source]
-        hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, found)
+        hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, plugins)
         raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
 
     def refresh(self) -> None:
@@ -110,7 +113,7 @@ class Registry(Generic[P]):
     def _discover(self) -> dict[str, Found[P]]:
         if self._found is not None:
             return self._found
-        found: dict[str, Found[P]] = {}
+        plugins: dict[str, Found[P]] = {}
         self._failures = []
 
         def add(load: Callable[[], object], source: str) -> None:
@@ -119,10 +122,10 @@ class Registry(Generic[P]):
             except Exception as error:  # a foreign plug-in may raise anything; the reason is kept
                 self._failures.append(Failure(source, _reason(error)))
                 return
-            if spec.id in found:
-                self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {found[spec.id].source}"))
+            if spec.id in plugins:
+                self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {plugins[spec.id].source}"))
                 return
-            found[spec.id] = Found(spec, source)
+            plugins[spec.id] = Found(spec, source)
 
         for spec in self._builtin():
             add(lambda spec=spec: spec, "built in")  # type: ignore[misc]
@@ -132,13 +135,13 @@ class Registry(Generic[P]):
             distribution = point.dist.name if point.dist else "unknown distribution"
             target = f"{point.module}:{point.attr}"
             add(lambda target=target: load_object(target), f"entry point '{point.name}' of {distribution}")  # type: ignore[misc]
-        self._found = found
-        return found
+        self._found = plugins
+        return plugins
 
     def _not_built_in(self, spec: P, source: str) -> P:
         """Refuse a plug-in under the id of a built-in one: tables could not tell them apart."""
-        known = self._discover().get(spec.id)
-        if known is not None and known.source == "built in" and known.spec != spec:
+        registered = self._discover().get(spec.id)
+        if registered is not None and registered.source == "built in" and registered.spec != spec:
             raise PluginError(f"{source} has the id '{spec.id}', which is built in", "give the plug-in another id")
         return spec
 
@@ -225,3 +228,52 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, DynslamError):
         return text[-1]
     return f"{type(error).__name__}: {text[-1]}" if text else type(error).__name__
+
+
+# Whether a plug-in's module can be imported at all: asked in a process of its own, which the import may end.
+
+ISOLATED_VARIABLE = "DYNSLAM_BENCH_ISOLATED"
+"""Set in processes that may end by an import without harm: the children of runs, and the probes themselves."""
+LIMIT_S = 120
+_IMPORTED = 113
+_PROBE = """
+import json, os, sys
+location, sys.path[:] = sys.argv[1], json.loads(sys.argv[2])
+from dynslam_bench.core.plugins import import_module
+try:
+    import_module(location)
+except Exception:
+    pass  # the caller meets it again and reports it
+os._exit(int(sys.argv[3]))
+"""
+
+
+@cache
+def check_import(location: str) -> None:
+    """Import a plug-in's module in a process of its own, once for every location.
+
+    What the import raises is left to the caller's own import; here counts that it comes to an end and that the process
+    lives on: ``sys.exit``, ``os._exit``, a crash of a native library or an endless loop would end, or hang, the
+    importing process.
+
+    Args:
+        location: Name of a module, or path of a ``.py`` file.
+
+    Raises:
+        PluginError: It does not; with how it ended.
+    """
+    if os.environ.get(ISOLATED_VARIABLE):
+        return
+    command = [sys.executable, "-c", _PROBE, location, json.dumps(sys.path), str(_IMPORTED)]
+    environment = {**os.environ, ISOLATED_VARIABLE: "1"}
+    quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    try:
+        code = subprocess.run(command, env=environment, timeout=LIMIT_S, check=False, **quiet).returncode  # type: ignore[call-overload]
+    except subprocess.TimeoutExpired:
+        raise PluginError(f"cannot import {location}: it is not done after {LIMIT_S} s") from None
+    if code != _IMPORTED:
+        how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
+        raise PluginError(
+            f"cannot import {location}: that ends the process ({how})",
+            "a plug-in must not call sys.exit or os._exit when it is imported",
+        )

@@ -1,24 +1,31 @@
-"""Read files that somebody else may have written: bounded in size, and one clear error whatever they hold.
+"""Read files that others may have written: bounded in size, and one clear error for any fault.
 
-Every reader of text, JSON or bytes goes through here, so that what is no UTF-8, nested too deeply, longer than it
-should be or not readable at all is the same one line everywhere.
+Every reader of text, JSON, arrays or bytes uses this module, so that the message is the same everywhere for files that
+are not UTF-8, nested too deeply, too long or not readable.
 """
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .errors import DynslamError
+from dynslam_bench.core.errors import DynslamError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 
 MEGABYTE = 1 << 20
 RECORD_BYTES = 16 * MEGABYTE
-"""Most bytes of a record, a settings file or anything else that people and this package write by hand or by frame."""
+"""Most bytes of a record, a settings file or anything else that is written by hand or by frame."""
 TABLE_BYTES = 1024 * MEGABYTE
 """Most bytes of a table with a line a frame."""
-
+MOST_BYTES = 1 << 28
+"""Most bytes of an ``.npz`` file, and of all arrays in it together."""
 _MOST_FILES = 1 << 16
 """Bytes that hold most files whole."""
 
@@ -35,14 +42,13 @@ def read_bytes(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError
         DynslamError: Of the given kind: it cannot be read, or is larger.
     """
     try:
-        with path.open("rb") as file:  # at first no more room than most files need: asking for `limit` takes as long
+        with path.open("rb") as file:  # in two steps: taking memory for `limit` bytes costs as much as reading them
             data = file.read(min(_MOST_FILES, limit + 1))
-            if len(data) == _MOST_FILES:
-                data += file.read(limit + 1 - len(data))
+            data += file.read(limit + 1 - len(data)) if len(data) == _MOST_FILES else b""
     except (OSError, ValueError) as error:  # ValueError: a name with a null byte
         raise kind(f"cannot read {path}: {_reason(error)}") from error
     if len(data) > limit:
-        raise kind(f"{path} has more than the {limit / MEGABYTE:g} MB that are read of such a file")
+        raise kind(_too_large(path, limit))
     return data
 
 
@@ -70,7 +76,7 @@ def read_lines(path: Path, *, limit: int = TABLE_BYTES, kind: type[DynslamError]
             while line := file.readline(limit + 1):
                 done += len(line)
                 if done > limit:
-                    raise kind(f"{path} has more than the {limit / MEGABYTE:g} MB that are read of such a file")
+                    raise kind(_too_large(path, limit))
                 yield line
     except UnicodeDecodeError as error:
         raise kind(_no_text(path, error)) from error
@@ -106,8 +112,58 @@ def parse_json(text: str, where: str, *, kind: type[DynslamError] = DynslamError
         raise kind(f"{where} is no valid JSON: it is nested too deeply") from error
 
 
+def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str, NDArray[Any]]:
+    """The arrays of an ``.npz`` file by name; nothing is unpickled.
+
+    Args:
+        path: The file.
+        kind: What is raised.
+
+    Raises:
+        DynslamError: Of the given kind: it cannot be read, is damaged, or holds or claims more than `MOST_BYTES`.
+    """
+    data = read_bytes(path, limit=MOST_BYTES, kind=kind)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+            claimed = sum(entry.file_size for entry in entries)
+            if claimed > MOST_BYTES:
+                raise kind(f"{path} claims {claimed / 1e6:.0f} MB of arrays, at most {MOST_BYTES / 1e6:.0f} are read")
+            return {entry.filename.removesuffix(".npy"): _array(archive.read(entry)) for entry in entries}
+    except DynslamError:
+        raise
+    except Exception as error:  # zipfile and numpy raise almost anything over damaged files
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise kind(f"{path} holds no arrays: {reason}") from error
+
+
+def _array(content: bytes) -> NDArray[Any]:
+    """One array; its header is read first, because numpy takes the memory that it claims.
+
+    Raises:
+        ValueError: It claims more than it holds, or holds objects.
+    """
+    import numpy as np
+
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(stream)
+    claimed = dtype.itemsize
+    for size in shape:
+        claimed *= int(size)
+    if claimed != len(content) - stream.tell():
+        raise ValueError(f"it claims {dtype} of shape {str(shape)[:60]}, which it does not hold")
+    array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+    return array
+
+
 def _reason(error: OSError | ValueError) -> str:
     return str(getattr(error, "strerror", None) or error)
+
+
+def _too_large(path: Path, limit: int) -> str:
+    return f"{path} has more than the {limit / MEGABYTE:g} MB that are read of such a file"
 
 
 def _no_text(path: Path, error: UnicodeDecodeError) -> str:

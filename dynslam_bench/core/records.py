@@ -9,11 +9,10 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from .errors import DynslamError
-from .files import atomic_folder, write_atomic
-from .harmless import storable
-from .passwords import json_without_passwords
-from .reading import RECORD_BYTES, read_text
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.files import atomic_folder, write_atomic
+from dynslam_bench.core.reading import RECORD_BYTES, read_text
+from dynslam_bench.core.sanitise import json_without_passwords, storable
 
 __all__ = ["Digest", "Record", "atomic_folder", "digest", "schema", "write_atomic"]
 

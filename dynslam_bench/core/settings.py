@@ -19,16 +19,16 @@ import json
 import os
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from .errors import SettingsError, did_you_mean
+from dynslam_bench.core.errors import SettingsError, did_you_mean
 
 S = TypeVar("S", bound="Settings")
 Scalar = bool | int | float | str
@@ -161,17 +161,17 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
 
     A field of type `Path` counts as a file, too.
     """
-    found = {}
+    differences = {}
     for name, field, _ in _leaves(type(settings)):
         extra = field.json_schema_extra
         note = extra.get(_NAMES) if isinstance(extra, dict) else None
         value = value_of(settings, name)
         if isinstance(note, dict):
             value = value or os.environ.get(str(note["otherwise"]), "")
-            found[name] = (str(note["kind"]), str(value))
+            differences[name] = (str(note["kind"]), str(value))
         elif isinstance(value, Path):
-            found[name] = ("file", str(value))
-    return {name: each for name, each in found.items() if each[1]}
+            differences[name] = ("file", str(value))
+    return {name: pair for name, pair in differences.items() if pair[1]}
 
 
 def build(cls: type[S], values: Mapping[str, Any] | None = None) -> S:
@@ -198,14 +198,14 @@ def apply_overrides(settings: S, overrides: Mapping[str, Any]) -> S:
         SettingsError: Unknown name (with a did-you-mean), or a value that does not fit.
     """
     values = settings.model_dump()
-    known = {name: field for name, field, _ in _leaves(type(settings))}
+    leaves = {name: field for name, field, _ in _leaves(type(settings))}
     for name, value in overrides.items():
         node, *rest = _walk(values, name.split("."))
-        if name not in known or rest:
-            if any(field.startswith(f"{name}.") for field in known):
+        if name not in leaves or rest:
+            if any(field.startswith(f"{name}.") for field in leaves):
                 raise SettingsError(f"setting '{name}' is a group", f"set one of {name}.*")
-            raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, known))
-        node[name.split(".")[-1]] = _parse(value, known[name].annotation)
+            raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, leaves))
+        node[name.split(".")[-1]] = _parse(value, leaves[name].annotation)
     return build(type(settings), values)
 
 
@@ -390,3 +390,90 @@ def _shown(value: Any) -> str:
     except ValueError:  # more digits than Python writes out
         return "a number of thousands of digits"
     return text if len(text) <= 200 else f"{text[:200]}..."
+
+
+# Changing settings in mid-episode: the one contract of everything that has online settings.
+
+
+@runtime_checkable
+class Reconfigurable(Protocol):
+    """A part whose online settings may change in mid-episode."""
+
+    def configure(self, settings: Any) -> None:
+        """Put settings into force from the next frame on.
+
+        Args:
+            settings: All settings of the part, of the class that it was built with; only fields marked ``online``
+                differ from those in force.
+        """
+        ...
+
+
+def online_parameters(settings: Settings) -> list[Parameter]:
+    """The online settings that have an effect with these settings, in order of definition.
+
+    A parameter is left out where a condition of its (``when``) does not hold, where a group that it lies in is idle
+    (`Settings.idle`), or where it or its group has no effect as the rest is set (`Settings.unused`).
+    """
+    online = parameters(type(settings), online_only=True)
+    return [parameter for parameter in online if not why_idle(settings, parameter)]
+
+
+def why_idle(settings: Settings, parameter: Parameter) -> str:
+    """Why a parameter has no effect with these settings, for a message; empty where it has one."""
+    if reason := why_unused(settings, parameter.name):
+        return reason
+    for name, allowed in parameter.when:
+        if (value := value_of(settings, name)) not in allowed:
+            return f"{name} is {value!r}"
+    return ""
+
+
+def why_unused(settings: Settings, name: str) -> str:
+    """Why nothing reads a field, as the fields that are not tunable stand; empty where something does."""
+    node: Settings = settings
+    for part in name.split("."):
+        if reason := node.idle or node.unused.get(part, ""):
+            return reason
+        if part != "enabled" and not getattr(node, "enabled", True):
+            return f"{type(node).__name__} is not enabled"
+        node = getattr(node, part)
+    return ""
+
+
+class OnlineSettings:
+    """Which part takes which group of a system's settings.
+
+    Args:
+        settings: The complete settings that the system was built with.
+        parts: Name of a group and what takes its settings; several parts may take one group.
+
+    Raises:
+        SettingsError: An online setting that has an effect lies in a group that no part takes.
+    """
+
+    def __init__(self, settings: Settings, parts: Iterable[tuple[str, Callable[[Any], None]]]) -> None:
+        self._built = self._in_force = settings
+        self._parts = tuple(parts)
+        taken = {group for group, _ in self._parts}
+        for parameter in online_parameters(settings):
+            group = parameter.name.split(".")[0]
+            if group not in taken:
+                raise SettingsError(
+                    f"online setting '{parameter.name}' of {type(settings).__name__} is taken by no part of the system",
+                    f"give the part a method configure(settings) and the group '{group}', "
+                    "or leave the group out of the settings",
+                )
+
+    def configure(self, settings: Settings) -> None:
+        """Hand the groups that differ from those in force to their parts."""
+        for group, take in self._parts:
+            if (given := getattr(settings, group)) != getattr(self._in_force, group):
+                take(given)
+        self._in_force = settings
+
+    def restore(self) -> None:
+        """Hand every part the settings that it was built with."""
+        for group, take in self._parts:
+            take(getattr(self._built, group))
+        self._in_force = self._built

@@ -12,17 +12,19 @@ import contextlib
 import hashlib
 import io
 import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DynslamError
-from .files import replacing
-from .folders import STAGES_VARIABLE, stage_cache_folder
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.files import replacing
+from dynslam_bench.core.folders import STAGES_VARIABLE, stage_cache_folder
 
 DEFAULT_MAX_BYTES = 8 * 2**30
 _PRUNE_EVERY = 512
@@ -82,10 +84,8 @@ class StageCache:
                 path.unlink(missing_ok=True)
             return None
         cost = float(arrays.pop("cost_s"))
-        try:
+        with contextlib.suppress(OSError):  # evicted by another process meanwhile: the content is in hand
             os.utime(path)
-        except OSError:
-            return Entry(arrays, cost)  # evicted by another process meanwhile: the content is in hand
         return Entry(arrays, cost)
 
     def put(self, stage: str, key: str, arrays: Mapping[str, NDArray[Any]], cost_s: float) -> None:
@@ -113,49 +113,42 @@ class StageCache:
 
     def prune(self) -> int:
         """Delete the least recently used entries if the cache is over its bound; returns the bytes freed."""
-        entries = self._entries()
-        total = sum(size for _, _, size in entries)
-        if total <= self.max_bytes:
-            return 0
-        freed = 0
-        for _, path, size in sorted(entries, key=lambda entry: entry[0]):
-            if total - freed <= _SHRINK_TO * self.max_bytes:
-                break
-            path.unlink(missing_ok=True)
-            freed += size
-        return freed
+        total = sum(size for _, _, size in self._entries())
+        return 0 if total <= self.max_bytes else self._shrink(_SHRINK_TO * self.max_bytes)
 
     def info(self) -> CacheInfo:
         """How full the cache is, by stage."""
-        sizes: dict[str, int] = {}
-        counts: dict[str, int] = {}
-        for _, path, size in self._entries():
-            stage = path.parent.parent.name
-            sizes[stage] = sizes.get(stage, 0) + size
-            counts[stage] = counts.get(stage, 0) + 1
-        return CacheInfo(self.folder, self.max_bytes, dict(sorted(sizes.items())), dict(sorted(counts.items())))
+        sizes, counts = Counter[str](), Counter[str]()
+        for _, path, size in sorted(self._entries(), key=itemgetter(1)):
+            sizes[path.parent.parent.name] += size
+            counts[path.parent.parent.name] += 1
+        return CacheInfo(self.folder, self.max_bytes, sizes, counts)
 
     def clear(self) -> int:
         """Delete every entry; returns the bytes freed. Entries that other processes write meanwhile stay."""
-        freed = 0
-        for _, path, size in self._entries():
+        return self._shrink(0)
+
+    def _shrink(self, most_bytes: float) -> int:
+        entries = sorted(self._entries(), key=itemgetter(0))
+        total = left = sum(size for _, _, size in entries)
+        for _, path, size in entries:
+            if left <= most_bytes:
+                break
             path.unlink(missing_ok=True)
-            freed += size
-        return freed
+            left -= size
+        return total - left
 
     def _path(self, stage: str, key: str) -> Path:
         return self.folder / stage / key[:2] / f"{key}.npz"
 
     def _entries(self) -> list[tuple[float, Path, int]]:
         """(last use, path, bytes) of every entry; files that vanish meanwhile are left out."""
-        found = []
+        entries = []
         for path in self.folder.glob("*/*/*.npz"):
-            try:
+            with contextlib.suppress(OSError):
                 status = path.stat()
-            except OSError:
-                continue
-            found.append((status.st_mtime, path, status.st_size))
-        return found
+                entries.append((status.st_mtime, path, status.st_size))
+        return entries
 
 
 def _unpack(data: bytes) -> Arrays | None:

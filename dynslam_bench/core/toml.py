@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .errors import DynslamError, SequenceError, SettingsError
-from .reading import read_text
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError
+from dynslam_bench.core.reading import read_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -93,7 +93,7 @@ def assignments(values: Mapping[str, Any]) -> list[str]:
 
 
 def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
+    items: list[tuple[str, Any]] = []
     for key, value in values.items():
-        found += _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else [(f"{prefix}{key}", value)]
-    return found
+        items += _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else [(f"{prefix}{key}", value)]
+    return items

@@ -1,1 +1,43 @@
-"""Dynamic feature filters: which keypoints lie on things that move? One file a building block."""
+"""Dynamic feature filters: one published rejection rule a module.
+
+The building blocks are numbered as in `docs/baselines.md` (B1 to B15). All filters receive the same keypoints and share
+the starvation guard (`guard`).
+"""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+from dynslam_bench.contracts.filter import DynamicFilter
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+S = TypeVar("S", bound=Settings)
+
+
+class Rule(DynamicFilter, Generic[S]):
+    """A rejection rule that keeps nothing between frames.
+
+    Args:
+        settings: Its thresholds.
+    """
+
+    def __init__(self, settings: S) -> None:
+        self.settings = settings
+
+    def reset(self, camera: Camera) -> None:
+        """A rule without memory has nothing to reset."""
+
+
+class ObjectRule(Rule[S]):
+    """A rejection rule that uses segmented objects.
+
+    Args:
+        settings: Its thresholds.
+        segmentation: Which objects count as dynamic.
+    """
+
+    def __init__(self, settings: S, segmentation: SegmentationSettings) -> None:
+        super().__init__(settings)
+        self.segmentation = segmentation

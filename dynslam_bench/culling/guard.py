@@ -1,4 +1,4 @@
-"""The starvation guard that all filters share, and its settings; no heavy import."""
+"""The starvation guard that all filters share: culling must leave enough features for tracking."""
 
 from __future__ import annotations
 
@@ -6,30 +6,27 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from dynslam_bench.core.settings import Settings, tunable
 
 
 class GuardSettings(Settings):
-    """The starvation guard: no filter may leave tracking without features (SG-SLAM restores below 10 %)."""
+    """The starvation guard (SG-SLAM restores all features below 10 %)."""
 
     min_features: int = tunable(
-        60,
-        low=10,
-        high=200,
-        limits=(0, 2000),
-        online=True,
-        meaning="fewest keypoints that culling must leave: as many as the back end needs to begin a map",
-    )
-    min_fraction: float = tunable(
-        0.05, low=0.0, high=0.3, limits=(0.0, 1.0), meaning="smallest share of the keypoints that culling must leave"
+        60, low=10, high=200, limits=(0, 2000), online=True,
+        meaning="fewest keypoints that culling must leave: as many as the back end needs to initialise a map",
+    )  # fmt: skip
+    min_fraction: float = Field(
+        0.05, ge=0.0, le=1.0, description="smallest share of the keypoints that culling must leave"
     )
 
 
 def restore_starved(verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings) -> tuple[NDArray[np.bool_], int]:
     """Combine the filters' verdicts, undoing the latest ones while too few features remain.
 
-    The first filter of a system is its surest (a semantic mask), the last its most speculative, so the last is undone
+    The first filter of a system is the most reliable (a semantic mask), the last the least, so the last is undone
     first. With every verdict undone all features are kept.
 
     Args:

@@ -1,14 +1,13 @@
 """Protocol, association, alignment, APE, RPE, coverage and mask quality."""
 
-from .compare_protocols import ComparisonRow, compare_protocols
-from .evaluate import Evaluation, evaluate, evaluate_files, pose_errors
-from .frames import common_frames, coverage, hold
-from .hint_tracks import Hint
-from .hints import hints
-from .masks import MaskCounts, compare_masks
-from .never_move import never_move
-from .online import OnlineError, OnlineSample
-from .protocol import PROTOCOLS, Protocol, RPESpec, get_protocol
+from dynslam_bench.evaluation.ape import static_camera
+from dynslam_bench.evaluation.compare_protocols import ComparisonRow, compare_protocols
+from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_files, pose_errors
+from dynslam_bench.evaluation.hints import Hint, hints
+from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
+from dynslam_bench.evaluation.online import OnlineError, OnlineSample
+from dynslam_bench.evaluation.prepare import common_frames, coverage, hold
+from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, RPESpec, get_protocol
 
 __all__ = [
     "PROTOCOLS",
@@ -29,6 +28,6 @@ __all__ = [
     "get_protocol",
     "hints",
     "hold",
-    "never_move",
     "pose_errors",
+    "static_camera",
 ]

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.evaluation.protocol import Alignment
 from dynslam_bench.geometry import se3
-
-from .conditioning import RELIABLE_DEG, rotation_uncertainty_deg
-from .protocol import Alignment
 
 Array = NDArray[np.float64]
 
@@ -40,7 +38,7 @@ class Similarity:
 
     @cached_property
     def uncertainty_deg(self) -> float | None:
-        """Standard error of the rotation, see `conditioning`; None where it does not come from enough positions."""
+        """Standard error of the rotation, see `rotation_uncertainty_deg`; None where too few positions determine it."""
         return None if self.fitted is None else rotation_uncertainty_deg(*self.fitted, self.rotation)
 
     @property
@@ -113,3 +111,60 @@ def _yaw(covariance: Array, orientation: Array) -> tuple[Array, bool]:
     angle = np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), bool(degenerate)
+
+
+# How well the positions determine the rotation of an alignment: the same fit on halves of the path.
+
+
+BLOCKS = 12
+RELIABLE_DEG = 10.0
+"""With a larger uncertainty of the alignment's rotation, absolute rotational errors say nothing of the tracker."""
+_GENERATOR = np.array([1, 1, -1, 1, 1, 1, -1, -1, -1, 1, -1])
+_DESIGN = np.array([np.append(np.roll(_GENERATOR, shift), -1) for shift in range(len(_GENERATOR))])
+_HALVES = np.vstack([_DESIGN, -_DESIGN]) > 0
+
+
+def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> float | None:
+    """Standard error in degrees of the rotation that moves `source` onto `target`, in the least-squares sense.
+
+    Args:
+        source: Estimated positions in metres ``[N, 3]``, in the order of time.
+        target: Their true counterparts ``[N, 3]``.
+        rotation: The rotation found from all of them ``[3, 3]``.
+
+    Returns:
+        From half-paths where there are two positions a block, else by leaving out one position at a time (the
+        jackknife); None for fewer than three positions.
+    """
+    if len(source) < 3:
+        return None
+    if len(source) < 2 * BLOCKS:
+        return _left_out(source, target, rotation)
+    size, more = divmod(len(source), BLOCKS)  # the first blocks are longer by one where it does not come out even
+    starts = np.arange(BLOCKS) * size + np.minimum(np.arange(BLOCKS), more)
+    source, target = source - source.mean(axis=0), target - target.mean(axis=0)
+    weights = _HALVES.astype(np.float64)
+    count = weights @ np.diff(starts, append=len(source))
+    sums = weights @ np.add.reduceat(source, starts)
+    target_sums = weights @ np.add.reduceat(target, starts)
+    together = np.add.reduceat(target[:, :, None] * source[:, None, :], starts)
+    products = (weights @ together.reshape(BLOCKS, 9)).reshape(-1, 3, 3)
+    covariances = products - target_sums[:, :, None] * sums[:, None, :] / count[:, None, None]
+    return float(np.sqrt((_turned_deg(covariances, rotation) ** 2).mean()))
+
+
+def _left_out(source: Array, target: Array, rotation: Array) -> float:
+    """The jackknife's standard error in degrees: every position is left out once."""
+    kept = ~np.eye(len(source), dtype=bool)
+    pairs = [(source[rows], target[rows]) for rows in kept]
+    covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
+    squares = _turned_deg(covariances, rotation) ** 2
+    return float(np.sqrt((len(source) - 1) / len(source) * squares.sum()))
+
+
+def _turned_deg(covariances: Array, rotation: Array) -> Array:
+    """Angles in degrees ``[K]`` between the rotations that covariances ``[K, 3, 3]`` stand for and `rotation`."""
+    u, _, vt = np.linalg.svd(covariances)
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    turned = np.einsum("kii->k", (u @ vt) @ rotation.T)
+    return np.asarray(np.rad2deg(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0))))

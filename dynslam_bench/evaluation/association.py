@@ -3,19 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core.records import Record
+from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.trajectory import Trajectory
 
-from .protocol import Protocol
-
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+
+class AssociationRecord(Record):
+    """What was compared and what was dropped, as records hold it.
+
+    Attributes:
+        n_estimate: Poses of the estimate.
+        n_ground_truth: Poses of the ground truth.
+        outside: Estimated poses dropped because they lie before the first or behind the last true pose.
+        in_holes: Estimated poses dropped because they lie in a hole of the ground truth.
+        taken: Estimated poses dropped because a closer one had already taken their true pose (or, for evo's rule,
+            because the ground truth is the shorter trajectory and no pose of it chose them).
+        median_dt_s: Median |dt| of the pairs.
+        largest_hole_s: Largest distance between true poses within the time of the estimate.
+        hole_at_s: Stamp at which that hole begins.
+    """
+
+    n_estimate: int
+    n_ground_truth: int
+    outside: int
+    in_holes: int
+    taken: int
+    median_dt_s: float
+    largest_hole_s: float
+    hole_at_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,50 +50,32 @@ class Association:
     Attributes:
         estimate: Indices into the estimate ``[K]``, ascending.
         ground_truth: Indices into the ground truth ``[K]``.
-        n_estimate: Poses of the estimate.
-        n_ground_truth: Poses of the ground truth.
-        outside: Estimated poses dropped because they lie before the first or behind the last true pose.
-        in_holes: Estimated poses dropped because they lie in a hole of the ground truth.
-        taken: Estimated poses dropped because a closer one had already taken their true pose (or, for evo's rule,
-            because the ground truth is the shorter trajectory and no pose of it chose them).
-        median_dt: Median |dt| of the pairs in seconds.
-        largest_hole: Largest distance in seconds between true poses within the time of the estimate.
-        hole_at: Stamp at which that hole begins.
+        record: What was dropped.
     """
 
     estimate: Index
     ground_truth: Index
-    n_estimate: int
-    n_ground_truth: int
-    outside: int
-    in_holes: int
-    taken: int
-    median_dt: float
-    largest_hole: float
-    hole_at: float
+    record: AssociationRecord
 
     def __len__(self) -> int:
         return len(self.estimate)
 
-    @cached_property
-    def dropped(self) -> int:
-        """Estimated poses that are compared with no true one."""
-        return self.n_estimate - len(np.unique(self.estimate))
-
     def describe(self, max_dt: float) -> str:
         """One line with the measured numbers; empty if nothing was dropped."""
-        dropped = self.dropped
+        record = self.record
+        dropped = record.n_estimate - len(np.unique(self.estimate))
         if not dropped:
             return ""
         reasons = [
-            (self.outside, f"{self.outside} outside the ground truth's time"),
-            (self.in_holes, f"{self.in_holes} in holes of it"),
-            (self.taken, f"{self.taken} not chosen, a closer one was there"),
+            (record.outside, f"{record.outside} outside the ground truth's time"),
+            (record.in_holes, f"{record.in_holes} in holes of it"),
+            (record.taken, f"{record.taken} not chosen, a closer one was there"),
         ]
         return (
-            f"no ground truth within {max_dt:g} s for {dropped} of {self.n_estimate} poses ("
+            f"no ground truth within {max_dt:g} s for {dropped} of {record.n_estimate} poses ("
             + ", ".join(text for count, text in reasons if count)
-            + f"; largest hole {self.largest_hole:.2f} s at t={self.hole_at:.6f}; median |dt| {self.median_dt:.4f} s)"
+            + f"; largest hole {record.largest_hole_s:.2f} s at t={record.hole_at_s:.6f}; median |dt| "
+            f"{record.median_dt_s:.4f} s)"
         )
 
 
@@ -76,7 +83,7 @@ def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) ->
     """Associate two trajectories under a protocol.
 
     Returns:
-        What was associated; nobody may write into it: all runs on one sequence share what is found for their stamps.
+        The association; its arrays are read-only, as equal stamps share one result.
 
     Raises:
         EvaluationError: A trajectory is empty or no pair is close enough; the message carries the measured gap.
@@ -103,7 +110,7 @@ def _matched(estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, 
     if not len(index_est):
         raise _nothing_matched(t_est, t_gt, max_dt)
     index_est.flags.writeable = index_gt.flags.writeable = False
-    return _report(t_est, t_gt, index_est, index_gt, max_dt, strict=strict)
+    return Association(index_est, index_gt, _record(t_est, t_gt, index_est, index_gt, max_dt, strict=strict))
 
 
 def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) -> tuple[Index, Index]:
@@ -125,41 +132,31 @@ def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) 
     chosen = np.where(right_dt < left_dt, right, left)
     dt = np.minimum(right_dt, left_dt)
     keep = dt < max_dt if strict else dt <= max_dt
-    inside = (stamps >= others[0] - max_dt) & (stamps <= others[-1] + max_dt)
-    keep &= inside
+    keep &= (stamps >= others[0] - max_dt) & (stamps <= others[-1] + max_dt)
     return np.flatnonzero(keep), chosen[keep]
 
 
-def _report(
+def _record(
     t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
-) -> Association:
+) -> AssociationRecord:
     unmatched = np.ones(len(t_est), dtype=bool)
     unmatched[index_est] = False
     gap = nearest_gap(t_est, t_gt)
     far = gap >= max_dt if strict else gap > max_dt
     outside = far & ((t_est < t_gt[0]) | (t_est > t_gt[-1]))
-    hole, hole_at = largest_hole(t_gt, t_est[0], t_est[-1])
-    return Association(
-        estimate=index_est,
-        ground_truth=index_gt,
+    within = t_gt[(t_gt > t_est[0]) & (t_gt < t_est[-1])]
+    edges = np.concatenate([t_est[:1], within, t_est[-1:]])
+    hole = int(np.argmax(np.diff(edges)))
+    return AssociationRecord(
         n_estimate=len(t_est),
         n_ground_truth=len(t_gt),
         outside=int((unmatched & outside).sum()),
         in_holes=int((unmatched & far & ~outside).sum()),
         taken=int((unmatched & ~far).sum()),
-        median_dt=float(np.median(np.abs(t_est[index_est] - t_gt[index_gt]))),
-        largest_hole=hole,
-        hole_at=hole_at,
+        median_dt_s=float(np.median(np.abs(t_est[index_est] - t_gt[index_gt]))),
+        largest_hole_s=float(edges[hole + 1] - edges[hole]),
+        hole_at_s=float(edges[hole]),
     )
-
-
-def largest_hole(stamps: Array, start: float, stop: float) -> tuple[float, float]:
-    """Length and beginning, in seconds, of the largest gap between stamps within ``[start, stop]``."""
-    inside = stamps[(stamps > start) & (stamps < stop)]
-    edges = np.concatenate([[start], inside, [stop]])
-    gaps = np.diff(edges)
-    at = int(np.argmax(gaps))
-    return float(gaps[at]), float(edges[at])
 
 
 def _nothing_matched(t_est: Array, t_gt: Array, max_dt: float) -> EvaluationError:

@@ -10,29 +10,20 @@ from pydantic import field_validator
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG, Similarity, align
+from dynslam_bench.evaluation.ape import absolute_errors, named, static_camera
+from dynslam_bench.evaluation.association import AssociationRecord, match
+from dynslam_bench.evaluation.prepare import apply_policy, compared, tracked_frames, truth_of_file
+from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
+from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_file import load_trajectory
-from dynslam_bench.geometry.tum_file import TumFile
-
-from . import frames
-from .alignment import Similarity, align
-from .ape import absolute_errors
-from .association import Association, match
-from .conditioning import RELIABLE_DEG
-from .error_statistics import named
-from .never_move import never_move
-from .prepare import apply_policy, compared, truth_of_file
-from .protocol import Alignment, Protocol, get_protocol
-from .relative import relative_metrics, segment_metrics
+from dynslam_bench.geometry.trajectory_files import TumFile, load_trajectory
 
 SCHEMA_VERSION = 1
 
 
 class AlignmentRecord(Record):
-    """The alignment that was applied: ``p_gt = scale * R p_est + t``; see `Similarity`.
-
-    Records of earlier versions lack `uncertainty_deg`.
-    """
+    """The alignment that was applied: ``p_gt = scale * R p_est + t``; see `Similarity`."""
 
     mode: Alignment
     rotation: list[list[float]]
@@ -45,19 +36,6 @@ class AlignmentRecord(Record):
     def rotation_reliable(self) -> bool:
         """Whether the metrics ``ape_rot_*`` are errors of the estimate rather than of the alignment."""
         return self.uncertainty_deg is None or self.uncertainty_deg <= RELIABLE_DEG
-
-
-class AssociationRecord(Record):
-    """What was compared and what was dropped; see `Association`."""
-
-    n_estimate: int
-    n_ground_truth: int
-    outside: int
-    in_holes: int
-    taken: int
-    median_dt_s: float
-    largest_hole_s: float
-    hole_at_s: float
 
 
 class Evaluation(Record):
@@ -79,7 +57,7 @@ class Evaluation(Record):
         coverage: Their ratio.
         alignment: How the estimate was aligned.
         association: What was associated and what was dropped.
-        diagnostics: One line for everything that a reader of the numbers ought to know.
+        diagnostics: One line for each fact that the numbers depend on.
     """
 
     schema_version: int = schema(SCHEMA_VERSION)
@@ -143,12 +121,25 @@ def evaluate(
     n_input = n_tracked = None
     if input_timestamps is not None:
         n_input = len(np.asarray(input_timestamps).reshape(-1))
-        n_tracked = int(frames.tracked_frames(estimate, input_timestamps).sum())
+        n_tracked = int(tracked_frames(estimate, input_timestamps).sum())
     estimate = apply_policy(estimate, protocol, input_timestamps, n_input, n_tracked, diagnostics)
     estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
-    association = _associate(estimate, ground_truth, protocol, diagnostics)
+    association = match(estimate, ground_truth, protocol)
+    dropped = association.describe(protocol.max_dt)
+    if len(association) < 2:
+        raise EvaluationError(
+            f"only {len(association)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s, "
+            "at least 2 are needed",
+            dropped,
+        )
+    if dropped:
+        diagnostics.append(dropped)
     matched, truth = estimate.T_world_cam[association.estimate], ground_truth.T_world_cam[association.ground_truth]
-    similarity = _align(matched, truth, protocol, diagnostics)
+    similarity = align(matched, truth, protocol.alignment)
+    if similarity.degenerate:
+        diagnostics.append("the estimated positions do not determine a rotation; it was taken from the orientations")
+    if not similarity.rotation_reliable:
+        diagnostics.append(_unreliable(similarity, truth))
     aligned = similarity.apply(matched)
     translation, rotation = absolute_errors(aligned, truth)
     metrics = {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
@@ -159,7 +150,12 @@ def evaluate(
     metrics.update(relative)
     if protocol.segments_m:
         metrics.update(segment_metrics(aligned, truth, protocol, diagnostics))
-    metrics["static_camera_ate_rmse_m"] = _never_move(ground_truth, association, protocol, input_timestamps)
+    if input_timestamps is None or protocol.thins:
+        static = static_camera(ground_truth.select(np.unique(association.ground_truth)))
+    else:
+        static = static_camera(ground_truth, input_timestamps, protocol.max_dt)
+    fit = "first" if protocol.alignment in ("none", "origin") else "constant"
+    metrics["static_camera_ate_rmse_m"] = static[f"{fit}_rmse_m"]
     return Evaluation(
         protocol_id=protocol.id,
         protocol_digest=protocol.digest(),
@@ -170,8 +166,15 @@ def evaluate(
         n_input=n_input,
         n_tracked=n_tracked,
         coverage=None if n_tracked is None or not n_input else n_tracked / n_input,
-        alignment=_alignment_record(protocol, similarity),
-        association=_association_record(association),
+        alignment=AlignmentRecord(
+            mode=protocol.alignment,
+            rotation=similarity.rotation.tolist(),
+            translation_m=similarity.translation.tolist(),
+            scale=similarity.scale,
+            degenerate=similarity.degenerate,
+            uncertainty_deg=similarity.uncertainty_deg,
+        ),
+        association=association.record,
         diagnostics=diagnostics,
     )
 
@@ -185,7 +188,7 @@ def evaluate_files(
 ) -> Evaluation:
     """Evaluate a trajectory file against a ground-truth file, each in TUM's format or, with stamps, in KITTI's.
 
-    What the files held in disorder (skipped, sorted and replaced lines) is added to the diagnostics.
+    The diagnostics count skipped, sorted and replaced lines.
 
     Args:
         estimate: The trajectory.
@@ -242,57 +245,8 @@ def pose_errors(
     )
 
 
-def _associate(
-    estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol, diagnostics: list[str]
-) -> Association:
-    association = match(estimate, ground_truth, protocol)
-    dropped = association.describe(protocol.max_dt)
-    if len(association) < 2:
-        raise EvaluationError(
-            f"only {len(association)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s, "
-            "at least 2 are needed",
-            dropped,
-        )
-    if dropped:
-        diagnostics.append(dropped)
-    return association
-
-
-def _align(matched: np.ndarray, truth: np.ndarray, protocol: Protocol, diagnostics: list[str]) -> Similarity:
-    similarity = align(matched, truth, protocol.alignment)
-    if similarity.degenerate:
-        diagnostics.append("the estimated positions do not determine a rotation; it was taken from the orientations")
-    if not similarity.rotation_reliable:
-        diagnostics.append(_unreliable(similarity, truth))
-    return similarity
-
-
-def _alignment_record(protocol: Protocol, similarity: Similarity) -> AlignmentRecord:
-    return AlignmentRecord(
-        mode=protocol.alignment,
-        rotation=similarity.rotation.tolist(),
-        translation_m=similarity.translation.tolist(),
-        scale=similarity.scale,
-        degenerate=similarity.degenerate,
-        uncertainty_deg=similarity.uncertainty_deg,
-    )
-
-
-def _association_record(association: Association) -> AssociationRecord:
-    return AssociationRecord(
-        n_estimate=association.n_estimate,
-        n_ground_truth=association.n_ground_truth,
-        outside=association.outside,
-        in_holes=association.in_holes,
-        taken=association.taken,
-        median_dt_s=association.median_dt,
-        largest_hole_s=association.largest_hole,
-        hole_at_s=association.hole_at,
-    )
-
-
 def _unreliable(similarity: Similarity, truth: np.ndarray) -> str:
-    """Says why the absolute rotational error is none of the tracker's."""
+    """Why the absolute rotational error is not the tracker's."""
     positions = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
     along, *across = np.linalg.svd(positions, compute_uv=False) / np.sqrt(len(positions))
     return (
@@ -300,16 +254,3 @@ def _unreliable(similarity: Similarity, truth: np.ndarray) -> str:
         f"alignment's rotation with such errors: +-{similarity.uncertainty_deg:.0f} degrees; the absolute rotational "
         "error (ape_rot) is unreliable, the translational and the relative ones are not affected"
     )
-
-
-def _never_move(
-    ground_truth: Trajectory, association: Association, protocol: Protocol, input_timestamps: ArrayLike | None
-) -> float:
-    """What not moving scores under the protocol's alignment, over the input frames where they are known."""
-    if input_timestamps is None or protocol.thins:
-        selected = ground_truth.select(np.unique(association.ground_truth))
-        errors = never_move(selected)
-    else:
-        errors = never_move(ground_truth, input_timestamps, protocol.max_dt)
-    joined = protocol.alignment in ("none", "origin")
-    return errors["first_rmse_m" if joined else "constant_rmse_m"]

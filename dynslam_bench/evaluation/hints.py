@@ -12,17 +12,19 @@ alignment.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from math import comb
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import FileNotes
-
-from .alignment import align
-from .hint_conventions import MIN_POSES, Motions
-from .hint_tracks import Array, Hint, Track, fit
-from .protocol import Protocol, get_protocol
+from dynslam_bench.geometry.trajectory_files import FileNotes
 
 FARTHEST_M = 1e12
 """Squares of larger numbers are no numbers any more."""
@@ -68,27 +70,27 @@ def hints(
         One hint a fault, by `Hint.id`; none where the estimate is healthy, or where nothing explains why it is bad.
     """
     sim3 = get_protocol(protocol).alignment == "sim3"
-    found = _several_recordings(estimate, ground_truth, notes)
+    faults = _several_recordings(estimate, ground_truth, notes)
     truth = Track(ground_truth.timestamps, ground_truth.T_world_cam)
     inside = truth.covers(estimate.timestamps)
     if inside.sum() < MIN_POSES or np.abs(estimate.positions).max() > FARTHEST_M:
-        return tuple(found)
+        return tuple(faults)
     stamps, poses = estimate.timestamps[inside], estimate.T_world_cam[inside]
     shift, left = _time_shift(stamps, poses, truth)
     motions = Motions(stamps, poses, truth)
     if (wrong := motions.wrong_convention(shift)) is not None:
         hint, poses = wrong
-        found.append(hint)
+        faults.append(hint)
         shift, left = _time_shift(stamps, poses, truth)
     if shift:
         late = _shift_hint(stamps, poses, truth, shift, left)
-        found += [late] if late else []
+        faults += [late] if late else []
         shift = shift if late else 0.0
     covered = truth.covers(stamps + shift)
     stamps, poses = stamps[covered] + shift, poses[covered]
     if not sim3 and left < MOSTLY:
-        found += _scale(stamps, poses, truth)
-    return (*found, *_below_noise(stamps, poses, truth))
+        faults += _scale(stamps, poses, truth)
+    return (*faults, *_below_noise(stamps, poses, truth))
 
 
 # -- several recordings --------------------------------------------------------------------------------------------
@@ -133,7 +135,7 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     most = int(min(LONGEST_SHIFT_S, span / 4) / step)
     grid = stamps[0] + step * np.arange(-most, int(span / step) + most + 1)
     track = Track(stamps, poses)
-    own, known = (_displacements(each, grid, window) for each in (track, truth))
+    own, expected = (_displacements(one, grid, window) for one in (track, truth))
     at = most + np.flatnonzero(np.isfinite(own[most : len(own) - most, 0]))
     at = at[:: 1 + len(at) // 128]
     length = np.linalg.norm(own[at], axis=1)
@@ -141,7 +143,7 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     if len(at) < MIN_POSES:
         return 0.0, 1.0
     lags = np.arange(-most, most + 1)
-    lag = int(lags[np.argmin(_unexplained(own[at], known[at + lags[:, None]]))])
+    lag = int(lags[np.argmin(_unexplained(own[at], expected[at + lags[:, None]]))])
     coarse = lag * step
     fine = coarse + np.linspace(-1, 1, 9) * step
     begin, moved = grid[at], own[at]
@@ -151,8 +153,8 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     shift, left = float(fine[best]), float(near[best])
     if 0 < best < len(fine) - 1 and (bend := near[best - 1] - 2 * left + near[best + 1]) > 0:
         shift += float(0.5 * (near[best - 1] - near[best + 1]) / bend * (fine[1] - fine[0]))
-    itself = _displacements(track, begin[None] + shift, window)
-    visible = float(_unexplained(moved, itself)[0])  # what such a shift does to a path of this shape
+    shifted_self = _displacements(track, begin[None] + shift, window)
+    visible = float(_unexplained(moved, shifted_self)[0])  # what such a shift does to a path of this shape
     clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
     return (shift, left) if clear else (0.0, now)
 
@@ -213,7 +215,7 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     window = min(DISPLACEMENT_S, (stamps[-1] - stamps[0]) / 6)
     moved, true = (_displacements(track, stamps, window) for track in (Track(stamps, poses), truth))
     both = np.isfinite(moved[:, 0]) & np.isfinite(true[:, 0])
-    varying, varied = (each[both] - each[both].mean(axis=0) for each in (moved, true))
+    varying, varied = (steps[both] - steps[both].mean(axis=0) for steps in (moved, true))
     steady = both.sum() < MIN_POSES or (varying**2).sum() < STEADY * (moved[both] ** 2).sum()
     if steady or _unexplained(varying, varied[None])[0] > MOSTLY:  # a steady motion fits many paths at some scale
         return []
@@ -238,7 +240,7 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     between = truth.at(stamps)
     nearest = truth.poses[truth.nearest(stamps)]
     fits = [fit(poses, true) for true in (between, nearest)]
-    error = min(each.sim3_m for each in fits)
+    error = min(one.sim3_m for one in fits)
     inside = (truth.stamps >= stamps[0]) & (truth.stamps <= stamps[-1])
     noise = _jitter(truth.positions[inside], 5) if truth.step < MEASURED_S else 0.0
     least = min(COPY_M if noise > NOISE_M else EXACT_M, COPY_SHARE * fits[0].extent_m)
@@ -263,3 +265,317 @@ def _jitter(positions: Array, order: int) -> float:
         return 0.0
     differences = np.diff(positions, order, axis=0)
     return float(np.median(np.abs(differences)) / (0.6745 * np.sqrt(comb(2 * order, order))))
+
+
+# What hints are made from: poses between their stamps, and how well positions can be aligned.
+
+Array = NDArray[np.float64]
+HintId = Literal[
+    "several-recordings",
+    "inverted-poses",
+    "quaternion-order",
+    "inverted-rotations",
+    "camera-axes",
+    "time-shift",
+    "scale",
+    "below-truth-noise",
+]
+
+
+@dataclass(frozen=True)
+class Hint:
+    """A probable fault of an estimate.
+
+    Attributes:
+        id: Which.
+        text: One line: what was measured, and the cure.
+        numbers: What was measured, by name with its unit.
+    """
+
+    id: HintId
+    text: str
+    numbers: dict[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.id}: {self.text}"
+
+
+class Track:
+    """Poses between their stamps.
+
+    Args:
+        stamps: Seconds ``[N]``, ascending.
+        poses: ``[N, 4, 4]``.
+    """
+
+    def __init__(self, stamps: Array, poses: Array) -> None:
+        self.stamps, self.poses = stamps, poses
+        self.positions = np.ascontiguousarray(poses[:, :3, 3])
+        steps = np.diff(self.stamps)
+        self.step = float(np.median(steps)) if len(steps) else 0.0
+        self._holes = np.append(steps > max(0.1, 3 * self.step), True)
+
+    def covers(self, stamps: Array) -> NDArray[np.bool_]:
+        """Whether stamps lie within its time and in no hole ``[...]``."""
+        after = np.searchsorted(self.stamps, stamps, side="right") - 1
+        exact = self.stamps[after.clip(0)] == stamps
+        return np.asarray((after >= 0) & (~self._holes[after] | exact))
+
+    def positions_at(self, stamps: Array) -> Array:
+        """Positions ``[..., 3]``, on straight lines between the stamps."""
+        axes = [np.interp(stamps, self.stamps, self.positions[:, axis]) for axis in range(3)]
+        return np.stack(axes, axis=-1)
+
+    def at(self, stamps: Array) -> Array:
+        """Poses ``[N, 4, 4]``: these positions, with the rotation of the pose that is nearest in time."""
+        poses = self.poses[self.nearest(stamps)]
+        poses[:, :3, 3] = self.positions_at(stamps)
+        return poses
+
+    def nearest(self, stamps: Array) -> NDArray[np.intp]:
+        """Which poses are nearest in time ``[N]``."""
+        after = np.searchsorted(self.stamps, stamps).clip(1, len(self.stamps) - 1)
+        return np.asarray(after - (stamps - self.stamps[after - 1] < self.stamps[after] - stamps))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well positions can be aligned, from their moments: Umeyama 1991, Eq. 40-43.
+
+    Attributes:
+        scale: Of the Sim(3) alignment.
+        se3_m: Root mean square error after the SE(3) alignment, metres; exact to 1e-8.
+        sim3_m: The same after the Sim(3) alignment.
+        extent_m: The same of a camera that stands still.
+    """
+
+    scale: float
+    se3_m: float
+    sim3_m: float
+    extent_m: float
+
+    @property
+    def misfit(self) -> float:
+        """The error after the Sim(3) alignment over that of a camera that stands still, in [0, 1]."""
+        return self.sim3_m / self.extent_m if self.extent_m > 0 else 1.0
+
+
+def fit(poses: Array, truth: Array) -> Fit:
+    """How well the positions of poses ``[N, 4, 4]`` can be aligned with those of the true ones."""
+    own, true = (matrices[:, :3, 3] - matrices[:, :3, 3].mean(axis=0) for matrices in (poses, truth))
+    u, singular, vt = np.linalg.svd(true.T @ own / len(own))
+    explained = singular[0] + singular[1] + np.sign(np.linalg.det(u) * np.linalg.det(vt)) * singular[2]
+    size, extent = float((own**2).sum() / len(own)), float((true**2).sum() / len(own))
+    scale = max(float(explained), 0.0) / size if size > 0 else 1.0
+    errors = (size + extent - 2 * explained, extent - scale * explained)
+    se3_m, sim3_m = (float(np.sqrt(max(error, 0.0))) for error in errors)
+    return Fit(scale, se3_m, sim3_m, float(np.sqrt(extent)))
+
+
+# Conventions of poses that an estimate may have in place of camera-to-world matrices, found by its motions.
+
+MIN_POSES = 8
+"""With fewer poses that have truth nothing is said of their motion."""
+PAIR_S = 2.0
+"""Motions from pose to pose are taken over a third of the trajectory, at most over this many seconds."""
+ROTATES_DEG, MOVES_M = 1.5, 0.01
+"""Motions smaller than this are not distinguished from noise."""
+EXPLAINED, UNEXPLAINED, CLEARLY = 0.4, 0.25, 4.0
+"""Median error of the motions over the motions themselves: below the first they may be explained, above the second they
+may be not; an undone fault has to be better than the trajectory as it stands by the third, a factor."""
+VARIES, TIE = 0.7, 0.1
+"""Least correlation of motions that are explained, and the errors between which the path does not tell."""
+
+_AXES = {
+    "y up, z back (OpenGL)": np.diag([1.0, -1.0, -1.0]),
+    "x forward, y left, z up (ROS)": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+}
+"""Axes that are not the camera's (x right, y down, z forward): rotations ``R_named_camera``."""
+
+
+class Motions:
+    """An estimate's motions from pose to pose beside the true ones."""
+
+    def __init__(self, stamps: Array, poses: Array, truth: Track) -> None:
+        self.stamps, self.poses, self.truth = stamps, poses, truth
+        span = stamps[-1] - stamps[0]
+        ends = np.searchsorted(stamps, stamps + min(PAIR_S, span / 3))
+        starts = np.flatnonzero(ends < len(stamps))
+        length = stamps[ends[starts]] - stamps[starts]
+        keep = length < 2 * min(PAIR_S, span / 3)  # no motions over holes
+        step = 1 + int(keep.sum()) // 300
+        self.pairs = starts[keep][::step], ends[starts[keep][::step]]
+        self.true = _relative(truth.at(stamps), self.pairs)
+
+    def compare(self, poses: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
+        """`_compare` with the true motions at the stamps."""
+        return _compare(_relative(poses, self.pairs), self.true, R_est_cam)
+
+    def wrong_convention(self, shift: float) -> tuple[Hint, Array] | None:
+        """The convention that explains motions which the poses as they stand do not, and the poses brought in order.
+
+        Args:
+            shift: A time shift that would explain them as well, seconds; the better explanation counts.
+        """
+        as_read, _ = self.compare(self.poses)
+        if as_read < UNEXPLAINED or not np.isfinite(as_read):
+            return None
+        limit = min(EXPLAINED, as_read / CLEARLY, self._shifted(shift) if shift else np.inf)
+        candidates: list[tuple[float, HintId, Array, str]] = []
+        for name, axes, undo in _CONVENTIONS:
+            poses = undo(self.poses)
+            error, varies = self.compare(poses)
+            if error < limit and varies > VARIES:
+                candidates.append((error, name, poses, axes))
+        if not candidates:
+            return self._other_axes(as_read)
+        true = self.truth.at(self.stamps)
+        misfit = [one[0] + fit(one[2], true).misfit for one in candidates]
+        best = [one for one, score in zip(candidates, misfit, strict=True) if score < min(misfit) + TIE]
+        error, name, poses, axes = best[0]
+        others = [_CURES[one[1]][0].format(axes=one[3]) for one in best[1:]]
+        return self._hint(name, as_read, error, axes, others), poses
+
+    def _shifted(self, shift: float) -> float:
+        """The error of the poses as they stand beside the true motions at another time."""
+        covered = self.truth.covers(self.stamps + shift)
+        keep = covered[self.pairs[0]] & covered[self.pairs[1]]
+        pairs = self.pairs[0][keep], self.pairs[1][keep]
+        true = _relative(self.truth.at(self.stamps + shift), pairs)
+        return _compare(_relative(self.poses, pairs), true)[0]
+
+    def _other_axes(self, as_read: float) -> tuple[Hint, Array] | None:
+        """The same where the truth is that of a body with axes of its own, such as a set of markers."""
+        as_turned, _ = self.compare(self.poses, R_est_cam=self._axes(self.poses))
+        true = self.truth.at(self.stamps)
+        before = fit(self.poses, true).misfit
+        for name, axes, undo in _CONVENTIONS[:2]:
+            poses = undo(self.poses)
+            error, varies = self.compare(poses, R_est_cam=self._axes(poses))
+            if error < min(EXPLAINED, as_turned / CLEARLY) and varies > VARIES:
+                if name == "inverted-poses" and 2 * fit(poses, true).misfit > before:
+                    continue
+                return self._hint(name, as_read, error, axes), poses
+        return None
+
+    def _axes(self, poses: Array) -> Array:
+        """Rotation from the truth's axes to the estimate's that explains most of the rotations."""
+        estimated, true = (_axis(motions) for motions in (_relative(poses, self.pairs), self.true))
+        u, _, vt = np.linalg.svd(estimated.T @ true)
+        return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+
+    def _hint(self, name: HintId, as_read: float, undone: float, axes: str = "", others: Sequence[str] = ()) -> Hint:
+        what, cure = _CURES[name]
+        text = (
+            f"{what.format(axes=axes)}: the motions are off by {100 * as_read:.0f} % of the true ones, "
+            f"by {100 * undone:.0f} % {cure}"
+        ) + "".join(f" (or {other}: the path does not tell)" for other in others)
+        return Hint(name, text, {"motion_error": as_read, "motion_error_undone": undone})
+
+
+def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
+    """How far the motions are from the true ones, and how well they vary with them.
+
+    Scales are left out. Of rotations and translations those count that are larger than noise.
+
+    Args:
+        motions: Of the estimate, ``[P, 4, 4]``.
+        true: The true ones.
+        R_est_cam: Rotation from the camera's axes to those that the motions are given in.
+
+    Returns:
+        Median error over the median motion, of the moving half of the pairs, rotations or translations, whichever
+        is worse: infinite if nothing moves. And the best correlation of the two about their means: low where the
+        motion is always the same, and then many wrong poses explain it.
+    """
+    if R_est_cam is not None:
+        motions = motions.copy()
+        motions[:, :3, :3] = R_est_cam.T @ motions[:, :3, :3] @ R_est_cam
+        motions[:, :3, 3] = motions[:, :3, 3] @ R_est_cam
+    if len(true) < MIN_POSES:
+        return np.inf, 0.0
+    scores = []
+    angle = np.rad2deg(se3.rotation_angle(true))
+    moving = angle >= np.median(angle)
+    if (turned := float(np.median(angle[moving]))) > ROTATES_DEG:
+        off = np.rad2deg(se3.rotation_angle(se3.inverse(motions[moving]) @ true[moving]))
+        scores.append((float(np.median(off)) / turned, _correlation(_axis(motions), _axis(true))))
+    length = np.linalg.norm(true[:, :3, 3], axis=1)
+    moving = length >= np.median(length)
+    moved, estimated = true[moving, :3, 3], motions[moving, :3, 3]
+    own_length = float(np.median(np.linalg.norm(estimated, axis=1)))
+    if (true_length := float(np.median(length[moving]))) > MOVES_M:
+        off = (
+            np.linalg.norm(estimated * (true_length / own_length) - moved, axis=1) if own_length > 0 else length[moving]
+        )
+        scores.append((float(np.median(off)) / true_length, _correlation(motions[:, :3, 3], true[:, :3, 3])))
+    return max((error for error, _ in scores), default=np.inf), max((good for _, good in scores), default=0.0)
+
+
+def _reordered(poses: Array) -> Array:
+    """The poses of a file whose quaternions stand as ``qw qx qy qz``."""
+    position, quaternion = se3.to_quaternion(poses)
+    return se3.from_quaternion(position, np.roll(quaternion, -1, axis=1))
+
+
+def _turned_back(poses: Array) -> Array:
+    turned = poses.copy()
+    turned[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    return turned
+
+
+def _other_camera(rotation: Array) -> Callable[[Array], Array]:
+    def turned(poses: Array) -> Array:
+        poses = poses.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ rotation
+        return poses
+
+    return turned
+
+
+_CONVENTIONS: tuple[tuple[HintId, str, Callable[[Array], Array]], ...] = (
+    ("inverted-poses", "", se3.inverse),
+    ("quaternion-order", "", _reordered),
+    ("inverted-rotations", "", _turned_back),
+    *(("camera-axes", axes, _other_camera(rotation)) for axes, rotation in _AXES.items()),
+)
+"""What poses may be in place of ``T_world_cam``, the likeliest first, and what brings them in order."""
+_CURES: dict[HintId, tuple[str, str]] = {
+    "inverted-poses": (
+        "the poses seem to be world to camera",
+        "after inverting each pose; give T_world_cam, camera to world: invert your matrices",
+    ),
+    "quaternion-order": (
+        "the quaternions seem to be in the order qw qx qy qz",
+        "after re-ordering; write them as qx qy qz qw",
+    ),
+    "inverted-rotations": (
+        "the rotations seem to be world to camera, the positions are not",
+        "after transposing each rotation; give those of T_world_cam, camera to world",
+    ),
+    "camera-axes": (
+        "the orientations seem to have the axes {axes}",
+        "after turning them; give those of a camera with x right, y down, z forward",
+    ),
+}
+
+
+def _relative(poses: Array, pairs: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Array:
+    return np.asarray(se3.inverse(poses[pairs[0]]) @ poses[pairs[1]])
+
+
+def _correlation(first: Array, second: Array) -> float:
+    """Correlation of vectors ``[N, 3]`` about their means, jumps left out; 0 where one does not vary."""
+    length = np.linalg.norm(first, axis=1)
+    usual = length <= 6 * np.median(length)
+    first, second = (vectors[usual] - vectors[usual].mean(axis=0) for vectors in (first, second))
+    sizes = np.linalg.norm(first), np.linalg.norm(second)
+    if sizes[0] <= 0.1 * np.linalg.norm(length[usual]) or not sizes[1] > 0:
+        return 0.0
+    return float((first * second).sum() / (sizes[0] * sizes[1]))
+
+
+def _axis(motions: Array) -> Array:
+    """Axes of rotation, as long as the sines of the angles ``[N, 3]``."""
+    r = motions[:, :3, :3]
+    return np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2

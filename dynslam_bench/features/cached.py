@@ -13,29 +13,27 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.records import digest
-from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.settings import Reconfigurable, Settings
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.core.steering import Steerable
+from dynslam_bench.features.registry import FEATURES
 
-from .registry import FEATURES
-
-_ROOMS = ("core", "contracts", "features")
-"""The rooms whose code decides what an extractor finds."""
+_PACKAGES = ("core", "contracts", "features")
+"""The packages whose code decides what an extractor returns."""
 
 
 class CachedExtractor:
     """An extractor whose results are stored, addressed by the image, the extractor's code and the settings.
 
     Args:
-        extractor: Who extracts; the one that the settings name.
+        extractor: The extractor that the settings name.
         settings: Its settings.
         cache: Where results are stored.
         threads: Threads of the extractor, part of the cost.
 
     Attributes:
-        hit: Whether the last call found its result stored.
-        saved_s: Seconds to add to the last call's wall time for what it costs without the cache: what computing it cost
-            less the look-up, or minus the time that storing it took.
+        hit: Whether the last call's result was stored.
+        saved_s: Difference in seconds between the last call's cost without the cache and its wall time: the stored cost
+            less the look-up, or minus the time of storing.
     """
 
     def __init__(self, extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int) -> None:
@@ -48,8 +46,8 @@ class CachedExtractor:
         self.saved_s = 0.0
 
     def configure(self, settings: Settings) -> None:
-        """Put other settings into force, the extractor's too."""
-        if isinstance(self._extractor, Steerable):
+        """Use other settings, in the extractor too."""
+        if isinstance(self._extractor, Reconfigurable):
             self._extractor.configure(settings)
         self._address(settings)
 
@@ -68,32 +66,32 @@ class CachedExtractor:
         self.hit = entry is not None
         if entry is not None:
             stored = entry.arrays
-            found = Keypoints(*(stored[name] for name in ("xy", "octave", "angle", "response", "descriptors")))
+            keypoints = Keypoints(*(stored[name] for name in ("xy", "octave", "angle", "response", "descriptors")))
             self.saved_s = entry.cost_s - (time.perf_counter() - begin)
-            return found
+            return keypoints
         start = time.perf_counter()
-        found = compute()
+        keypoints = compute()
         cost = time.perf_counter() - start
-        self._cache.put("features", key, vars(found), cost)
+        self._cache.put("features", key, vars(keypoints), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
-        return found
+        return keypoints
 
 
 class CachedMaskedExtractor(CachedExtractor):
-    """The same for an extractor that knows of masks."""
+    """The same for an extractor with masked extraction."""
 
     _extractor: MaskedExtractor
 
-    def extract_beside(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
-        """The keypoints of a uint8 ``[H, W]`` image beside a mask; see `MaskedExtractor`."""
+    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+        """The keypoints of a uint8 ``[H, W]`` image with a mask; see `MaskedExtractor`."""
         inputs = [content_digest(gray), content_digest(mask), share]
-        return self._answer(inputs, lambda: self._extractor.extract_beside(gray, mask, share))
+        return self._answer(inputs, lambda: self._extractor.extract_masked(gray, mask, share))
 
 
 def cached_extractor(
     extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int
 ) -> CachedExtractor:
-    """An extractor behind the cache, which knows of masks exactly if it does."""
+    """The extractor with a cache; with masked extraction if it has that."""
     kind = CachedMaskedExtractor if isinstance(extractor, MaskedExtractor) else CachedExtractor
     return kind(extractor, settings, cache, threads)
 
@@ -101,7 +99,7 @@ def cached_extractor(
 def code_of(settings: Settings) -> str:
     """Digest of the code of the extractor that feature settings name: this package's, and a plug-in's own.
 
-    It is read once a process, when the plug-in is loaded: a file that is edited later is not what runs here.
+    It is read once a process, when the plug-in is loaded: later edits of the file do not change the running code.
 
     Raises:
         PluginError: No such extractor, or its code cannot be read.
@@ -111,4 +109,4 @@ def code_of(settings: Settings) -> str:
 
 @cache
 def _code_behind(entry_point: str) -> str:
-    return code_digest(entry_point, _ROOMS)
+    return code_digest(entry_point, _PACKAGES)

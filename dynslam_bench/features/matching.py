@@ -32,21 +32,6 @@ def as_words(descriptors: NDArray[np.uint8]) -> Words:
     return padded.view(np.uint64)
 
 
-def popcount(words: Words) -> NDArray[np.uint8]:
-    """Number of set bits of each 64-bit word (numpy 2 counts them itself; older versions by halving)."""
-    if hasattr(np, "bitwise_count"):
-        return np.asarray(np.bitwise_count(words), dtype=np.uint8)
-    v = words - ((words >> _ONE) & _M1)
-    v = (v & _M2) + ((v >> _TWO) & _M2)
-    v = (v + (v >> _FOUR)) & _M4
-    return np.asarray((v * _H01) >> _TOP, dtype=np.uint8)
-
-
-def hamming(a: Words, b: Words) -> NDArray[np.int64]:
-    """Hamming distances of descriptors ``[..., W]`` that are broadcast against each other, int64 ``[...]``."""
-    return np.asarray(popcount(a ^ b).sum(axis=-1, dtype=np.int64))
-
-
 @spliced
 def distance(a: Words, b: Words) -> Scalar:
     """Hamming distance of two descriptors ``[W]``; for use inside compiled kernels."""
@@ -205,7 +190,7 @@ def search_in_radius(
     max_distance: int,
     ratio: float = 1.0,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """For each target position, the keypoint nearby whose descriptor is nearest; each keypoint is given once.
+    """For each target position, the keypoint nearby whose descriptor is nearest; a keypoint is matched once at most.
 
     Args:
         grid: The keypoints' cells.

@@ -7,6 +7,7 @@ intensity centroid and the descriptor the rotated BRIEF of Rublee et al. (2011).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -17,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.geometry.pixels import inside
-
-from ._centroid import orientations, patch_half_widths
-from .settings import FeatureSettings
+from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.geometry.camera import inside
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
@@ -35,7 +35,7 @@ class _Level:
 
     Attributes:
         image: uint8 ``[h, w]``.
-        scale: Pixels of the given image a pixel of the level.
+        scale: pixels of the given image a pixel of the level.
         xy: float32 ``[N, 2]``, pixels of the level.
         response: int16 ``[N]``, strengths.
         cells: int64 ``[N]``, cell of the grid that each lies in.
@@ -50,7 +50,7 @@ class _Level:
     n_cells: int
 
     def choose(self, quota: int, threshold: int, allowed: NDArray[np.bool_] | None) -> NDArray[np.int64]:
-        """Indices of up to `quota` corners, spread over the cells; weak ones count in cells without a strong one."""
+        """Indices of up to `quota` corners, spread over the cells; weak corners only in cells without a strong one."""
         strong = self.response >= threshold
         if allowed is not None:
             strong = strong & allowed
@@ -88,12 +88,12 @@ class OrbExtractor:
         self._half_widths = patch_half_widths(PATCH_RADIUS)
 
     def configure(self, settings: FeatureSettings) -> None:
-        """Put other FAST thresholds into force; a second threshold above the first leaves the second alone in force."""
+        """Use other FAST thresholds; with a second threshold above the first, the second alone applies."""
         self.settings = settings
         self._detector.setThreshold(settings.fast_threshold_min)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> OrbExtractor:
-        """An extractor of the same settings: OpenCV's detectors cannot be copied, and hold nothing of an image."""
+        """An extractor of the same settings: OpenCV's detectors cannot be copied, and store nothing of an image."""
         copied = copy(self)
         copied._detector = cv2.FastFeatureDetector.create(self._detector.getThreshold(), True)
         return copied
@@ -103,14 +103,16 @@ class OrbExtractor:
         levels = self._levels(gray)
         return self._describe(gray, levels, self._chosen(levels))
 
-    def extract_beside(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
-        """As `extract`; where less than a share of `n_features` lies outside the mask, so many are sought there too."""
+    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+        """As `extract`; with less than a share of `n_features` outside the mask, all of them are extracted there."""
         levels = self._levels(gray)
         chosen = self._chosen(levels)
-        free = [~inside(mask, level.xy * level.scale) for level in levels]
-        if sum(np.count_nonzero(f[c]) for f, c in zip(free, chosen, strict=True)) < share * self.settings.n_features:
-            beside = self._chosen(levels, free)
-            chosen = [np.concatenate([c[~f[c]], b]) for f, c, b in zip(free, chosen, beside, strict=True)]
+        outside = [~inside(mask, level.xy * level.scale) for level in levels]
+        count = sum(np.count_nonzero(out[index]) for out, index in zip(outside, chosen, strict=True))
+        if count < share * self.settings.n_features:
+            more = self._chosen(levels, outside)
+            triples = zip(outside, chosen, more, strict=True)
+            chosen = [np.concatenate([index[~out[index]], other]) for out, index, other in triples]
         return self._describe(gray, levels, chosen)
 
     def _levels(self, gray: NDArray[np.uint8]) -> list[_Level]:
@@ -128,7 +130,7 @@ class OrbExtractor:
         for i in reversed(range(len(levels))):
             among = None if allowed is None else allowed[i]
             index = levels[i].choose(quotas[i] + missing, self.settings.fast_threshold, among)
-            missing += quotas[i] - len(index)  # what a coarse level cannot give is sought in the next finer one
+            missing += quotas[i] - len(index)  # a coarse level's missing features are added to the next finer level
             chosen.append(index)
         return chosen[::-1]
 
@@ -147,8 +149,11 @@ class OrbExtractor:
         inner = image[EDGE - 3 : image.shape[0] - EDGE + 3, EDGE - 3 : image.shape[1] - EDGE + 3]
         cell = self.settings.cell_px
         columns, rows = -(-inner.shape[1] // cell), -(-inner.shape[0] // cell)
-        xy, response = _detect(self._detector, inner)
-        return _Level(image, scale, xy + np.float32(EDGE - 3), response, _cell_of(xy, cell, columns), rows * columns)
+        corners = self._detector.detect(inner)
+        xy = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float32).reshape(-1, 2)
+        response = np.array([corner.response for corner in corners], dtype=np.int16)
+        column, row = (xy * np.float32(1.0 / cell)).astype(np.int64).T
+        return _Level(image, scale, xy + np.float32(EDGE - 3), response, row * columns + column, rows * columns)
 
     def _describe(
         self, gray: NDArray[np.uint8], levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]
@@ -220,16 +225,45 @@ def spread(
     return np.asarray(index[np.argsort(rank, kind="stable")[: max(quota, 0)]], dtype=np.int64)
 
 
-def _detect(
-    detector: cv2.FastFeatureDetector, image: NDArray[np.uint8]
-) -> tuple[NDArray[np.float32], NDArray[np.int16]]:
-    if min(image.shape) < 7:
-        return np.zeros((0, 2), np.float32), np.zeros(0, np.int16)
-    found = detector.detect(image)
-    xy = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float32).reshape(-1, 2)
-    return xy, np.array([point.response for point in found], dtype=np.int16)
+def patch_half_widths(radius: int) -> NDArray[np.int64]:
+    """Half widths of the rows of a disc: row ``dy`` spans ``-w[|dy|] .. w[|dy|]``, int64 ``[radius + 1]``.
+
+    The disc holds the pixels with ``dx^2 + dy^2 <= radius^2``, so that it is the same after a quarter turn.
+    """
+    rows = np.arange(radius + 1)
+    return np.asarray(np.floor(np.sqrt(radius * radius - rows * rows)), dtype=np.int64)
 
 
-def _cell_of(xy: NDArray[np.float32], cell: int, columns: int) -> NDArray[np.int64]:
-    index = (xy * np.float32(1.0 / cell)).astype(np.int64)
-    return np.asarray(index[:, 1] * columns + index[:, 0])
+@kernel
+def orientations(
+    image: NDArray[np.uint8], xy: NDArray[np.float32], half_widths: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Orientations of patches by their intensity centroid (Rublee et al., 2011, Section 3.2), degrees in [0, 360).
+
+    Args:
+        image: uint8 ``[H, W]``.
+        xy: Integer-valued pixels, float32 ``[N, 2]``, at least the disc's radius away from the border.
+        half_widths: Of `patch_half_widths`.
+    """
+    out = np.zeros(len(xy), np.float32)
+    radius = len(half_widths) - 1
+    for i in range(len(xy)):
+        x0, y0 = int(xy[i, 0]), int(xy[i, 1])
+        m10, m01 = np.int64(0), np.int64(0)
+        for dy in range(-radius, radius + 1):
+            w = half_widths[abs(dy)]
+            row = np.int64(0)
+            for dx in range(-w, w + 1):
+                value = np.int64(image[y0 + dy, x0 + dx])
+                m10 += dx * value
+                row += value
+            m01 += dy * row
+        angle = math.degrees(math.atan2(float(m01), float(m10)))
+        if angle < 0.0:
+            angle += 360.0
+        if angle >= 360.0:
+            angle = 0.0
+        out[i] = angle
+        if out[i] >= 360.0:  # rounded up by float32
+            out[i] = 0.0
+    return out

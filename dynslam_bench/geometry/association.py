@@ -25,7 +25,7 @@ def associate(first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: boo
         strict: True for ``|dt| < max_dt`` (TUM), False for ``|dt| <= max_dt``.
 
     Returns:
-        Indices into `first` and into `second` ``[K]`` each, in order of the first stamp; nobody may write into them.
+        Indices into `first` and into `second` ``[K]`` each, in order of the first stamp; read-only.
 
     Raises:
         TrajectoryError: A stamp is not finite, or `max_dt` is negative or not a number.
@@ -45,7 +45,7 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
     if not max_dt >= 0:
         raise TrajectoryError(f"the largest time difference is {max_dt!r}, not a number of seconds >= 0")
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
-    if (np.diff(candidate_a) > 0).all() and (np.diff(candidate_b) > 0).all():  # nobody has two to choose from
+    if (np.diff(candidate_a) > 0).all() and (np.diff(candidate_b) > 0).all():  # no stamp has two candidates
         return _shared(order_a[candidate_a], order_b[candidate_b])
     free_a = np.ones(len(a), dtype=bool).tolist()
     free_b = np.ones(len(b), dtype=bool).tolist()

@@ -113,3 +113,14 @@ class Camera:
         xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         return np.stack([xd * self.fx + self.cx, yd * self.fy + self.cy], axis=-1)
+
+
+# Reading an image at points.
+
+
+def inside(mask: NDArray[np.bool_], xy: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Bool ``[N]``: which raw pixels ``[N, 2]`` lie on the mask ``[H, W]``; pixels outside the image do not."""
+    height, width = mask.shape
+    column, row = np.rint(xy).astype(np.intp).T
+    in_image = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return np.asarray(in_image & mask[row.clip(0, height - 1), column.clip(0, width - 1)])

@@ -123,7 +123,7 @@ def is_pose(pose: object, tolerance: float = 1e-4) -> bool:
 
 
 def _rotations() -> type[Rotation]:
-    """The rotations of scipy, loaded when first needed: whoever only hands poses on does not pay for them."""
+    """The rotations of scipy, loaded when first needed: code that only copies poses does not load them."""
     from scipy.spatial.transform import Rotation
 
     return Rotation

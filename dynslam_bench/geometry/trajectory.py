@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
-
-from . import se3
-from .stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +81,11 @@ class Trajectory:
 
     def with_exact(self, exact: Mapping[float, int]) -> Trajectory:
         """The same trajectory with the nanoseconds of those stamps that a table of seconds to nanoseconds holds."""
-        known = [exact.get(stamp) for stamp in self.timestamps.tolist()]
-        if all(ns is None for ns in known):
+        stamps = self.timestamps.tolist()
+        if exact.keys().isdisjoint(stamps):
             return self
-        stamps = [ns_of(s) if ns is None else ns for s, ns in zip(self.timestamps.tolist(), known, strict=True)]
-        return Trajectory(self.timestamps, self.T_world_cam, np.array(stamps, dtype=np.int64))
+        ns = [exact[stamp] if stamp in exact else ns_of(stamp) for stamp in stamps]
+        return Trajectory(self.timestamps, self.T_world_cam, np.array(ns, dtype=np.int64))
 
     def transformed(self, T_new_world: NDArray[np.float64]) -> Trajectory:
         """The same trajectory in another world frame: ``T_new_world @ T_world_cam``."""

@@ -10,37 +10,36 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .exchange.export import Exported, export_run
-    from .exchange.reading import read_trajectory
-    from .identity import ResolvedRun, resolve
-    from .many import RunEvent, run_many
-    from .one import run_one
-    from .spec import Limits, RunSpec
-    from .storage.frame_table import load_frames
-    from .storage.imported import import_trajectory
-    from .storage.record import FAILED, MetricRecord, RunRecord
-    from .storage.scoring import DEFAULT_PROTOCOL, score
-    from .storage.store import RunStore
+    from dynslam_bench.runs.exchange.export import Exported, export_run
+    from dynslam_bench.runs.exchange.formats import read_trajectory
+    from dynslam_bench.runs.frames import load_frames
+    from dynslam_bench.runs.identity import ResolvedRun, resolve
+    from dynslam_bench.runs.imported import import_trajectory
+    from dynslam_bench.runs.many import RunEvent, run_many
+    from dynslam_bench.runs.one import run_one
+    from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
+    from dynslam_bench.runs.spec import Limits, RunSpec
+    from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, score
 
 _HOMES = {
-    "DEFAULT_PROTOCOL": "storage.scoring",
+    "DEFAULT_PROTOCOL": "store",
     "export_run": "exchange.export",
     "Exported": "exchange.export",
-    "FAILED": "storage.record",
-    "import_trajectory": "storage.imported",
+    "FAILED": "record",
+    "import_trajectory": "imported",
     "Limits": "spec",
-    "load_frames": "storage.frame_table",
-    "MetricRecord": "storage.record",
-    "read_trajectory": "exchange.reading",
+    "load_frames": "frames",
+    "MetricRecord": "record",
+    "read_trajectory": "exchange.formats",
     "resolve": "identity",
     "ResolvedRun": "identity",
     "run_many": "many",
     "run_one": "one",
     "RunEvent": "many",
-    "RunRecord": "storage.record",
+    "RunRecord": "record",
     "RunSpec": "spec",
-    "RunStore": "storage.store",
-    "score": "storage.scoring",
+    "RunStore": "store",
+    "score": "store",
 }
 
 __all__ = [

@@ -3,37 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec
-from dynslam_bench.core.digests import contents_digest
-from dynslam_bench.core.errors import PluginError, RunError, did_you_mean
-from dynslam_bench.core.fingerprint import code_digest, distribution_of_module, named_digests, plugin_digest
-from dynslam_bench.core.machine import this_machine, versions
+from dynslam_bench.core.errors import PluginError, RunError, SettingsError, did_you_mean
+from dynslam_bench.core.fingerprint import (
+    code_digest,
+    contents_digest,
+    distribution_of_module,
+    named_digests,
+    plugin_digest,
+    this_machine,
+    versions,
+)
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.core.version import release
-from dynslam_bench.envs.degrade_frames import Degradation
-from dynslam_bench.envs.device import resolve_device
-from dynslam_bench.envs.source import check_frames, open_frames, preprocessing_of
+from dynslam_bench.envs.arguments import check_frames, open_frames, preprocessing_of, resolve_device
+from dynslam_bench.envs.wrappers import Degradation
 from dynslam_bench.features.registry import FEATURES
+from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.registry import FLOWS
-from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.segmentation.build_segmenter import weights_digest
-from dynslam_bench.segmentation.registry import SEGMENTERS
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
+from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.part import part_of
-from dynslam_bench.sequences.published.datasets import DATASETS
+from dynslam_bench.sequences.catalogue import DATASETS
+from dynslam_bench.sequences.view import part_of
+from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
+from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-from .spec import MAP_SETTING, RunSpec
-from .start_map import start_map_of
-from .storage.record import IDENTITY_SCHEME, StartMap
-
-_ROOMS = (
+_PACKAGES = (
     *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
     *("culling", "slam", "trackers", "envs"),
 )
@@ -97,6 +103,11 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     start_map = start_map_of(settings, sequence.camera, tracker.sensors, weights)
     by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
     part = part_of(sequence, spec.offset)
+    installed = versions()  # another version of what computes with the run's data may give other bits
+    libraries = [*LIBRARIES, *({"gtsam"} & {str(value) for value in flatten(settings).values()})]
+    datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
+    dataset = datasets.get(spec.sequence.partition("/")[0])
+    sequence_plugin = "" if dataset is None else plugin_digest(dataset.entry_point)
     identity = {
         "scheme": IDENTITY_SCHEME,
         "tracker": tracker.id,
@@ -107,7 +118,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "settings": flatten(settings) | by_content,
         "segmentation": source,
         "weights": weights,
-        **files_of(tracker, settings),
+        **({"files": _files_digest(tracker, settings)} if tracker.files else {}),
         "sequence": part.id,
         "content": part.content,
         "camera": part.camera,
@@ -122,28 +133,10 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         "drop_share": spec.drop_share,
         "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
-        "libraries": libraries_of(settings),
-        **sequence_plugin_of(spec.sequence),
+        "libraries": {name: installed.get(name, "") for name in libraries},
+        **({"sequence_plugin": sequence_plugin} if sequence_plugin else {}),
     }
     return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
-
-
-def libraries_of(settings: Settings) -> dict[str, str]:
-    """Versions of the libraries that compute with the run's data: another version may give other bits."""
-    known = versions()
-    names = [*LIBRARIES, *({"gtsam"} & {str(value) for value in flatten(settings).values()})]
-    return {name: known.get(name, "") for name in names}
-
-
-def sequence_plugin_of(sequence: str) -> dict[str, str]:
-    """``sequence_plugin``: digest of the code of the plug-in that reads the sequence; nothing for the readers here.
-
-    Raises:
-        PluginError: Its code cannot be read.
-    """
-    found = next((each.spec for each in DATASETS.all() if each.spec.id == sequence.partition("/")[0]), None)
-    code = "" if found is None else plugin_digest(found.entry_point)
-    return {"sequence_plugin": code} if code else {}
 
 
 def distribution_of(tracker: TrackerSpec) -> str:
@@ -165,27 +158,17 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
     Raises:
         PluginError: A plug-in is unknown, or its code cannot be read.
     """
-    points = {} if settings is None else entry_points_of(settings, source)
-    own = code_digest(tracker.entry_point, _ROOMS)
-    return digest([own, {name: plugin_digest(point) for name, point in sorted(points.items())}])
-
-
-def entry_points_of(settings: Settings, source: str = "") -> dict[str, str]:
-    """Entry points of the plug-ins that settings name, by the setting's name.
-
-    Raises:
-        PluginError: A plug-in is unknown.
-    """
     registries: dict[str, Registry[Any]] = {"features": FEATURES, "flow": FLOWS}
-    found = {
-        name: registries[kind].get(value).entry_point
-        for name, (kind, value) in named(settings).items()
+    names = {} if settings is None else named(settings)
+    plugins = {
+        name: plugin_digest(registries[kind].get(value).entry_point)
+        for name, (kind, value) in sorted(names.items())
         if kind in registries
     }
-    prefix, _, argument = source.partition(":")
+    prefix, _, segmenter = source.partition(":")
     if prefix == "plugin":
-        found["segmentation.source"] = SEGMENTERS.get(argument).entry_point
-    return found
+        plugins["segmentation.source"] = plugin_digest(SEGMENTERS.get(segmenter).entry_point)
+    return digest([code_digest(tracker.entry_point, _PACKAGES), plugins])
 
 
 def weights_of(settings: Settings, source: str) -> dict[str, str]:
@@ -194,30 +177,71 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
     Raises:
         PluginError: A file cannot be read.
     """
-    found = named_digests(settings)
+    digests = named_digests(settings)
     group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
-        found[source] = weights_digest(group.model_copy(update={"source": source}))
-    return found
+        digests[source] = weights_digest(group.model_copy(update={"source": source}))
+    return digests
 
 
-def files_of(tracker: TrackerSpec, settings: Settings) -> dict[str, str]:
-    """``files``: digest of what the tracker's spec says decides its results beside its settings; else nothing.
+def _files_digest(tracker: TrackerSpec, settings: Settings) -> str:
+    """Digest of the files that, by the tracker's spec, decide its results beside its settings.
 
     Raises:
         PluginError: One of the files cannot be read.
     """
-    if not tracker.files:
-        return {}
     try:
-        return {"files": contents_digest(load_object(tracker.files)(settings))}
+        return contents_digest(load_object(tracker.files)(settings))
     except OSError as error:
         raise PluginError(f"cannot read a file of tracker '{tracker.id}': {error}") from error
 
 
 def _check_degradation(strengths: dict[str, float]) -> None:
-    known = set(Degradation.__dataclass_fields__) - {"seed"}
-    unknown = sorted(set(strengths) - known)
+    fields = set(Degradation.__dataclass_fields__) - {"seed"}
+    unknown = sorted(set(strengths) - fields)
     if unknown:
-        raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], known))
+        raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], fields))
     Degradation(seed=0, **strengths)
+
+
+def check_unchanged(start_map: StartMap | None, settings: Settings) -> None:
+    """A run began in the map that was looked up for it, and in no other at its path.
+
+    Raises:
+        RunError: The file has changed since.
+        PluginError: It is gone.
+    """
+    if start_map is not None and named_digests(settings)[MAP_SETTING] != start_map.digest:
+        raise RunError(f"the map {start_map.file} has changed since the run was asked for", "the run is not stored")
+
+
+def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:
+    """The map that settings name; None where they name none.
+
+    Args:
+        settings: A tracker's complete settings.
+        camera: Of the sequence, as the tracker sees it.
+        sensors: Of the tracker.
+        digests: Of the files that the settings name, by the setting's name.
+
+    Raises:
+        SettingsError: The tracker has features of its own; the file is no map, or one of another camera, other features
+            or another sensor.
+    """
+    backend, features = getattr(settings, "backend", None), getattr(settings, "features", None)
+    if not isinstance(backend, BackendSettings) or not backend.map.file:
+        return None
+    if not isinstance(features, FeatureSettings):
+        raise SettingsError(f"'{MAP_SETTING}' is set, and the tracker's features are none that maps are made of")
+    path = Path(backend.map.file).expanduser()
+    saved = read_map(path)
+    made_of = MapFeatures(extractor=features.extractor, levels=features.levels, scale_factor=features.scale_factor)
+    saved.check(camera, made_of, sensors, str(path))
+    return StartMap(
+        digest=digests[MAP_SETTING],
+        file=str(path),
+        made_by=saved.header.made_by,
+        keyframes=len(saved.arrays["kf_id"]),
+        points=len(saved.arrays["id"]),
+        localisation_only=backend.map.localisation_only,
+    )

@@ -1,4 +1,4 @@
-"""The one loop: everything that is ever measured was measured by stepping an environment here."""
+"""The loop in which every run is made: it steps an environment and keeps what is recorded of each frame."""
 
 from __future__ import annotations
 
@@ -6,27 +6,35 @@ import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from dynslam_bench.envs.degrade_frames import DegradeFrames
-from dynslam_bench.envs.drop_frames import DropFrames
 from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.envs.wrappers import DegradeFrames, DropFrames
 from dynslam_bench.evaluation.masks import compare_masks
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry.tum_file import write_tum
-
-from .exchange.recording import RECORDING_FILE, RecordingWriter
-from .frame_row import FRAMES_FILE, FrameRow
-from .kept_map import keep_map
-from .process.failures import at
-from .sheet_collector import SHEET_FILE, SheetWriter
-from .snapshots import SnapshotWriter, taken
-from .spec import RunSpec
-from .truth import aligned_truth
-from .video import VideoWriter
+from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.runs.artifacts import (
+    SHEET_FILE,
+    SheetWriter,
+    SnapshotWriter,
+    VideoWriter,
+    aligned_truth,
+    keep_map,
+    snapshot_of,
+)
+from dynslam_bench.runs.exchange.recording import (
+    RECORDING_FILE,
+    RecordedFrame,
+    check_rerun,
+    encode,
+    write_recording,
+)
+from dynslam_bench.runs.frames import FRAMES_FILE, FrameRow
+from dynslam_bench.runs.process.child import at
+from dynslam_bench.runs.spec import RunSpec
 
 Send = Callable[[dict[str, Any]], None]
 
@@ -36,7 +44,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
 
     Args:
         job: ``spec``, ``folder``, ``protocol`` and ``progress_every``.
-        send: Tells the parent.
+        send: Sends a message to the parent.
         stopping: Whether the parent wants an early end.
 
     Returns:
@@ -46,12 +54,28 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         DynslamError: The environment cannot be made, or the tracker broke its contract.
     """
     spec = RunSpec.model_validate(job["spec"])
-    folder = Path(job["folder"])
-    protocol = Protocol.model_validate(job["protocol"])
-    base = _environment(spec, protocol)
-    env = _spoiled(base, spec)
-    send({"type": "started", "frames": len(base.sequence)})
-    recorder = _Recorder(base, spec, folder)
+    base = SlamEnv(
+        spec.sequence,
+        spec.tracker,
+        settings=spec.settings,
+        frames=spec.frames_seen,
+        stride=spec.stride,
+        device=spec.device,
+        threads=spec.threads,
+        cache=spec.cache,
+        data_root=spec.data_root,
+        camera=spec.camera,
+        protocol=Protocol.model_validate(job["protocol"]),
+        render_mode="rgb_array" if spec.video else None,
+    )
+    env: gym.Env[Any, Any] = base
+    if any(spec.degrade.values()):
+        env = DegradeFrames(env, seed=0, **spec.degrade)
+    if spec.realtime or spec.drop_share:
+        env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
+    total = len(base.sequence)
+    send({"type": "started", "frames": total})
+    recorder = _Recorder(base, spec, Path(job["folder"]))
     position = _Position(base)
     with contextlib.closing(recorder):
         with at(position):
@@ -60,7 +84,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         reported = 0
         while True:
             done = base.episode.next_index
-            with at(f"frame {done - 1} of {len(base.sequence)}"):
+            with at(f"frame {done - 1} of {total}"):
                 recorder.add()
             send({"type": "frame", "index": done - 1})
             if done - reported >= job["progress_every"] or over:
@@ -75,83 +99,9 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
                 _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
         with at("after the last frame"):
-            outcome = _finish(base, folder, recorder)
+            outcome = recorder.finish()
             env.close()
     return {"type": "done", **outcome}
-
-
-def _environment(spec: RunSpec, protocol: Protocol) -> SlamEnv:
-    return SlamEnv(
-        spec.sequence,
-        spec.tracker,
-        settings=spec.settings,
-        frames=spec.frames_seen,
-        stride=spec.stride,
-        device=spec.device,
-        threads=spec.threads,
-        cache=spec.cache,
-        data_root=spec.data_root,
-        camera=spec.camera,
-        protocol=protocol,
-        render_mode="rgb_array" if spec.video else None,
-    )
-
-
-def _spoiled(env: gym.Env[Any, Any], spec: RunSpec) -> gym.Env[Any, Any]:
-    """The environment with the degradation and the frame drops that were asked for."""
-    if any(spec.degrade.values()):
-        env = DegradeFrames(env, seed=0, **spec.degrade)
-    if spec.realtime or spec.drop_share:
-        env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
-    return env
-
-
-class _Recorder:
-    """Everything that is kept of a run frame by frame: the log, and the pictures that were asked for."""
-
-    def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
-        self.spec = spec
-        self._frames = _FrameWriter(env, (folder / FRAMES_FILE).open("w"))
-        self._snapshots = SnapshotWriter(folder, len(env.sequence))
-        self._env = env
-        self._video = VideoWriter(folder, env) if spec.video else None
-        self.sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
-        title = f"{env.tracker_spec.label} on {env.sequence.id}"
-        recording = folder / RECORDING_FILE
-        self.recording = RecordingWriter(recording, env.sequence.camera, title, apart=True) if spec.rrd else None
-
-    def add(self) -> None:
-        self._frames.write()
-        self._snapshots.add(self._env.episode.outcomes[-1], self._env.frame.rgb.shape, self._env.result)
-        if self._video is not None:
-            self._video.add()
-        if self.sheet is not None:
-            self.sheet.add()
-        if self.recording is not None:
-            _record(self.recording, self._env)
-
-    def close(self) -> None:
-        self._frames.close()
-        self._snapshots.write()
-        if self._video is not None:
-            self._video.close()
-        if self.recording is not None:
-            self.recording.close()
-
-
-def _record(recording: RecordingWriter, env: SlamEnv) -> None:
-    """Add the current frame to a recording."""
-    outcome, result, frame = env.episode.outcomes[-1], env.result, env.frame
-    seen = result.keypoints_xy is not None or result.dynamic_mask is not None
-    recording.add(
-        outcome.index,
-        outcome.timestamp,
-        frame.rgb,
-        outcome.T_world_cam,
-        taken(outcome.index, result) if seen else None,
-        state=outcome.state,
-        error_m=None if outcome.error is None else outcome.error.trans_m,
-    )
 
 
 class _Position:
@@ -177,60 +127,90 @@ def _partial(env: SlamEnv) -> dict[str, Any]:
     return partial if last is None else partial | {"pose_error_trans_m": last.trans_m}
 
 
-def _finish(env: SlamEnv, folder: Path, recorder: _Recorder) -> dict[str, Any]:
-    sheet = recorder.sheet
-    began = time.perf_counter()
-    final = env.final_trajectory()
-    outcome: dict[str, Any] = {"finalize_s": None, "gpu_memory_mb": None}
-    if final is not None:
-        outcome["finalize_s"] = time.perf_counter() - began
-        write_tum(folder / "trajectory_final.txt", final)
-    kept = keep_map(env, folder, recorder.spec)
-    outputs, notes = kept.outputs, [*kept.notes]
-    if sheet is not None:
-        if outputs is not None:
-            sheet.write(outputs, env.online_trajectory() if final is None else final)
-        else:
-            notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
-    if recorder.recording is not None:
-        track = env.online_trajectory() if final is None else final
-        truth = aligned_truth(env.sequence.ground_truth, track)[0] if len(track) else None
-        cloud = (None, None) if outputs is None else (outputs.positions, outputs.colours)
-        recorder.recording.finish(track, truth, *cloud)
-    if env.device.startswith("cuda"):
-        import torch
+class _Recorder:
+    """Everything that is kept of a run: the frame log, and the pictures that were asked for.
 
-        outcome["gpu_memory_mb"] = torch.cuda.max_memory_allocated(env.device) / 1e6
-        outcome["gpu"] = torch.cuda.get_device_name(env.device)
-    return outcome | kept.counts | {"notes": notes}
+    Each line of the log is complete before the next frame begins.
+    """
 
+    def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
+        self._env, self._spec, self._folder = env, spec, folder
+        self._title = f"{env.tracker_spec.label} on {env.sequence.id}"
+        self._log = (folder / FRAMES_FILE).open("w")
+        self._logged = 0
+        self._snapshots = SnapshotWriter(folder, len(env.sequence))
+        self._video = VideoWriter(folder, env) if spec.video else None
+        self._sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
+        self._recorded: list[RecordedFrame] = []
+        if spec.rrd:
+            check_rerun()
 
-class _FrameWriter:
-    """Appends the frames that are new to the log; each line is complete before the next frame begins."""
-
-    def __init__(self, env: SlamEnv, log: IO[str]) -> None:
-        self._env, self._log = env, log
-        self._written = 0
-
-    def write(self) -> None:
-        outcomes = self._env.episode.outcomes
-        for outcome in outcomes[self._written :]:
-            masked = self._masks(outcome.index) if outcome is outcomes[-1] else (None, None)
+    def add(self) -> None:
+        """Keep the frames since the last call: the one just tracked, and those that were dropped before it."""
+        env, result = self._env, self._env.result
+        outcomes = env.episode.outcomes
+        for outcome in outcomes[self._logged :]:
+            masked = self._compare_masks(outcome.index) if outcome is outcomes[-1] else (None, None)
             self._log.write(FrameRow.of(outcome, *masked).to_json())
         self._log.flush()
-        self._written = len(outcomes)
+        self._logged = len(outcomes)
+        outcome = outcomes[-1]
+        self._snapshots.add(outcome, env.frame.rgb.shape, result)
+        if self._video is not None:
+            self._video.add()
+        if self._sheet is not None:
+            self._sheet.add()
+        if self._spec.rrd:
+            shows = result.keypoints_xy is not None or result.dynamic_mask is not None
+            shot = snapshot_of(outcome.index, result) if shows else None
+            error_m = None if outcome.error is None else outcome.error.trans_m
+            image, pose = encode(env.frame.rgb), outcome.T_world_cam
+            self._recorded.append(
+                RecordedFrame(outcome.index, outcome.timestamp, image, pose, shot, outcome.state, error_m)
+            )
+
+    def finish(self) -> dict[str, Any]:
+        """Write what is known at the end; what the record says of it."""
+        env, folder = self._env, self._folder
+        began = time.perf_counter()
+        final = env.final_trajectory()
+        outcome: dict[str, Any] = {"finalize_s": None, "gpu_memory_mb": None}
+        if final is not None:
+            outcome["finalize_s"] = time.perf_counter() - began
+            write_tum(folder / "trajectory_final.txt", final)
+        outputs, counts, notes = keep_map(env, folder, self._spec)
+        track = env.online_trajectory() if final is None else final
+        if self._sheet is not None and outputs is not None:
+            self._sheet.write(outputs, track)
+        elif self._sheet is not None:
+            notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
+        if self._spec.rrd:
+            truth = aligned_truth(env.sequence.ground_truth, track)[0] if len(track) else None
+            path, camera = folder / RECORDING_FILE, env.sequence.camera
+            write_recording(path, camera, self._title, self._recorded, (track, truth), outputs)
+        if env.device.startswith("cuda"):
+            import torch
+
+            outcome["gpu_memory_mb"] = torch.cuda.max_memory_allocated(env.device) / 1e6
+            outcome["gpu"] = torch.cuda.get_device_name(env.device)
+        return outcome | counts | {"notes": notes}
 
     def close(self) -> None:
+        """Finish the files, also those of a run that ends early."""
         self._log.close()
+        self._snapshots.write()
+        if self._video is not None:
+            self._video.close()
 
-    def _masks(self, index: int) -> tuple[float | None, float | None]:
+    def _compare_masks(self, index: int) -> tuple[float | None, float | None]:
         """Overlap of the tracker's mask with the exact one of people, and the share of the image that shows people.
 
         None where a mask is missing; the overlap also where both are empty.
         """
-        if self._env.sequence.masks is None:
+        masks = self._env.sequence.masks
+        if masks is None:
             return None, None
-        truth = self._env.sequence.masks[index]
+        truth = masks[index]
         people = [number for number, name in truth.class_names.items() if name == "person"]
         exact, predicted = np.isin(truth.instances, people), self._env.result.dynamic_mask
         overlap = None if predicted is None else compare_masks(np.asarray(predicted, dtype=bool), exact).iou

@@ -6,30 +6,23 @@ import sys
 import time
 from collections.abc import Callable
 from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 
 from dynslam_bench.contracts.sequence import exact_stamps, timestamps_ns
 from dynslam_bench.core.errors import InfrastructureError, RunError
-from dynslam_bench.core.machine import git_revision, this_machine, versions
+from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.sequences.part import part_of
-
-from .frame_row import FRAMES_FILE
-from .identity import ResolvedRun, resolve
-from .process.child import LOG_FILE
-from .process.handle import start_child
-from .process.job import make_job
-from .process.log_file import LogFile
-from .process.supervise import Verdict, supervise
-from .spec import RunSpec, place_of
-from .start_map import check_unchanged
-from .storage.frames import FrameLog
-from .storage.record import LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
-from .storage.scoring import DEFAULT_PROTOCOL
-from .storage.store import RunStore
+from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
+from dynslam_bench.runs.identity import ResolvedRun, check_unchanged, resolve
+from dynslam_bench.runs.process.child import LOG_FILE
+from dynslam_bench.runs.process.fork_server import Child, make_job
+from dynslam_bench.runs.process.supervisor import LogFile, Verdict, supervise
+from dynslam_bench.runs.record import LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
+from dynslam_bench.runs.spec import RunSpec, place_of
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
+from dynslam_bench.sequences.view import part_of
 
 WORK = "dynslam_bench.runs.loop:run_loop"
 """What the child does."""
@@ -82,6 +75,11 @@ def run_one(
     run_id = resolved.run_id
     started = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
     clock = time.perf_counter()
+
+    def report(message: dict[str, Any]) -> bool:
+        partial = {key: value for key, value in message.items() if key != "type"}
+        return on_progress is None or on_progress(run_id, partial)
+
     with store.work_folder(run_id) as work:
         job = make_job(
             WORK,
@@ -90,13 +88,21 @@ def run_one(
             protocol=get_protocol(protocol).model_dump(mode="json"),
             progress_every=progress_every,
         )
-        listener = None if on_progress is None else (lambda message: on_progress(run_id, _partial(message)))
-        verdict = _watched(resolved, work, job, listener, cancelled, at_a_time)
+        log = LogFile(work / LOG_FILE)
+        watched: dict[str, Any] = {"cancelled": cancelled, "tick": log.look, "at_a_time": at_a_time}
+        child = Child()
+        try:
+            verdict = supervise(child, job, resolved.spec.limits, report, **watched)
+        except InfrastructureError:
+            if not child.lost:
+                raise
+            verdict = supervise(Child(), job, resolved.spec.limits, report, **watched)  # with a new fork server
         if verdict.refused:
             raise RunError(
                 f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
             )
         try:
+            log.finish()
             frames = FrameLog.read(work / FRAMES_FILE)
             title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
             frames.write(work, title, exact_stamps(resolved.sequence))
@@ -111,41 +117,15 @@ def run_one(
     return record
 
 
-def _watched(
-    resolved: ResolvedRun,
-    work: Path,
-    job: dict[str, Any],
-    listener: Callable[[dict[str, Any]], bool] | None,
-    cancelled: Callable[[], bool] | None,
-    at_a_time: int,
-) -> Verdict:
-    """The child's end; where the fork server was ended under it, that of a second one.
-
-    Raises:
-        InfrastructureError: What the run needs broke; nothing is known of the run.
-    """
-    log = LogFile(work / LOG_FILE)
-    child = start_child()
-    try:
-        return supervise(child, job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
-    except InfrastructureError:
-        if not child.lost:
-            raise
-        child = start_child()
-        return supervise(child, job, resolved.spec.limits, listener, cancelled, tick=log.look, at_a_time=at_a_time)
-    finally:
-        log.finish()
-
-
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
     """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
-    seen, stamps = part_of(sequence, offset), sequence.timestamps
+    input_part, stamps = part_of(sequence, offset), sequence.timestamps
     return SequenceInfo(
         id=sequence.id,
         content=content,
         part=part,
-        block=seen.block,
-        noise=seen.noise,
+        block=input_part.block,
+        noise=input_part.noise,
         frames=len(sequence),
         duration_s=float(stamps[-1] - stamps[0]),
         fps=sequence.fps,
@@ -162,16 +142,14 @@ def part_digest(identity: dict[str, Any]) -> str:
     return digest({key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16)
 
 
-def _partial(message: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in message.items() if key != "type"}
-
-
 def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: str, wall_s: float) -> RunRecord:
     spec, identity, final = resolved.spec, resolved.identity, verdict.final
     total = len(resolved.sequence)
     status, reason = _judge(verdict, frames, total)
     if status == "ok" and spec.realtime and (dropped := frames.count("dropped")):
         reason = f"{dropped} of {total} frames dropped while the tracker was busy"
+    cached = [CACHED_TIMES] if spec.cache else []
+    begun = [] if resolved.start_map is None else [resolved.start_map.describe()]
     return RunRecord(
         run_id=resolved.run_id,
         status=status,
@@ -185,14 +163,11 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         degrade=identity["degrade"],
         segmentation=resolved.segmentation,
         **_counts(frames, total),
-        keyframes=final.get("keyframes"),
-        map_points=final.get("map_points"),
-        maps=final.get("maps"),
+        **{name: final.get(name) for name in ("keyframes", "map_points", "maps", "finalize_s")},
         start_map=resolved.start_map,
         epipolar_skipped=frames.epipolar_skipped(),
         mask_iou=frames.mask_iou(),
         timings=frames.timings(),
-        finalize_s=final.get("finalize_s"),
         started=started,
         wall_s=wall_s,
         peak_memory_mb=verdict.peak_memory_mb or None,
@@ -202,15 +177,9 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         git=git_revision(),
         command=list(sys.argv),
         identity=identity,
-        notes=[*_notes(resolved), *final.get("notes", [])],
+        notes=[*cached, *begun, *final.get("notes", [])],
         place=place_of(spec.sequence),
     )
-
-
-def _notes(resolved: ResolvedRun) -> list[str]:
-    """What a reader should know before the run."""
-    begun = [] if resolved.start_map is None else [resolved.start_map.describe()]
-    return ([CACHED_TIMES] if resolved.spec.cache else []) + begun
 
 
 _AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share", "study")

@@ -111,13 +111,17 @@ class RunSpec(Record):
 
     def absolute(self) -> RunSpec:
         """The same run, named independently of the working folder."""
+        camera = None if self.camera is None else Path(self.camera).expanduser()
+        settings = self.settings
+        if settings.get(MAP_SETTING):  # with its links followed: ``latest`` is another run's folder soon
+            settings = settings | {MAP_SETTING: str(Path(settings[MAP_SETTING]).expanduser().resolve())}
         return self.model_copy(
             update={
                 "tracker": absolute_target(self.tracker),
                 "sequence": _absolute_folder(self.sequence),
                 "data_root": None if self.data_root is None else str(Path(self.data_root).expanduser().absolute()),
-                "camera": _absolute_file(self.camera),
-                "settings": {name: _absolute_map(name, value) for name, value in self.settings.items()},
+                "camera": str(camera.absolute()) if camera is not None and camera.is_file() else self.camera,
+                "settings": settings,
             }
         )
 
@@ -136,17 +140,8 @@ def absolute_target(tracker: str) -> str:
 def _absolute_folder(sequence: str) -> str:
     if sequence.startswith((".", "~", os.sep)):
         return str(Path(sequence).expanduser().absolute())
-    known = sequence.startswith("synthetic/") or entry_of(sequence) is not None
-    return str(Path(sequence).absolute()) if not known and Path(sequence).is_dir() else sequence
-
-
-def _absolute_file(name: str | None) -> str | None:
-    return str(Path(name).expanduser().absolute()) if name is not None and Path(name).expanduser().is_file() else name
-
-
-def _absolute_map(name: str, value: Any) -> Any:
-    """A map's path with its links followed: ``latest`` is another run's folder soon."""
-    return str(Path(value).expanduser().resolve()) if name == MAP_SETTING and value else value
+    catalogued = sequence.startswith("synthetic/") or entry_of(sequence) is not None
+    return str(Path(sequence).absolute()) if not catalogued and Path(sequence).is_dir() else sequence
 
 
 def place_of(sequence: str) -> str:

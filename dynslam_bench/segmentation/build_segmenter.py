@@ -1,28 +1,57 @@
-"""Choose and construct the segmenter that the settings ask for."""
+"""Segmenters: the registry, the choice of a source for a sequence, and construction."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import cached_property, lru_cache
 from pathlib import Path
 
-from dynslam_bench.contracts.segmenter import Instances, Segmenter
-from dynslam_bench.contracts.sequence import Frame, MaskSource
-from dynslam_bench.core.digests import path_digest
+from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
+from dynslam_bench.contracts.sequence import Frame, MaskSource, Sequence
 from dynslam_bench.core.errors import DynslamError, SegmentationError
-from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.fingerprint import path_digest
+from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.segmentation.networks.checkpoints import (
+    COCO,
+    Checkpoint,
+    cached_checkpoint,
+    embedded_weights,
+    fetch_checkpoint,
+    require_embedded_weights,
+)
+from dynslam_bench.segmentation.settings import SegmentationSettings
 
-from .masks.postprocess import select
-from .networks.checkpoints import COCO, Checkpoint, cached_checkpoint, embedded_weights, fetch_checkpoint
-from .registry import SEGMENTERS, SegmenterContext
-from .settings import SegmentationSettings
+__all__ = ["SEGMENTERS", "SegmenterContext", "SegmenterSpec"]
 
-SYNTHETIC = "synthetic/"
 LOWEST_CONFIDENCE = 0.1
 """Networks report detections down to this score, so that the confidence may be changed while a run lasts."""
 
 
+def _builtin() -> Iterable[SegmenterSpec]:
+    here = "dynslam_bench.segmentation.build_segmenter"
+    mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"
+    return (
+        SegmenterSpec("oracle", f"{here}:build_oracle", "exact masks of rendered sequences"),
+        SegmenterSpec("oracle-classes", f"{here}:build_oracle",
+                      "exact masks of rendered sequences, by class alone: a perfect network"),
+        SegmenterSpec("recorded", f"{here}:build_recorded", "PNG masks from a folder (recorded:DIR)"),
+        SegmenterSpec("onnx", f"{here}:build_onnx", "YOLO-seg, semantic or torchvision networks (onnx:PATH)"),
+        SegmenterSpec("embedded", f"{here}:build_embedded", "small CFPN Mask R-CNN trained on rendered sequences",
+                      "MIT", mask_rcnn),
+        SegmenterSpec("coco", f"{here}:build_coco", "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights",
+                      "BSD-3-Clause (weights)", mask_rcnn),
+        SegmenterSpec("weights", f"{here}:build_weights", "Mask R-CNN with weights of your own (weights:PATH)",
+                      "", mask_rcnn),
+    )  # fmt: skip
+
+
+SEGMENTERS: Registry[SegmenterSpec] = Registry("segmenters", SegmenterSpec, _builtin)
+"""Segmenters by id: built in, from entry points ``dynslam_bench.segmenters``, from the environment variable."""
+
+
 class NetworkNotFetched(SegmentationError):
-    """``auto`` needs a network that is not in the cache: fetching it cures that, and is to be agreed to first."""
+    """``auto`` needs a network that is not in the cache; the user is asked before it is downloaded."""
 
     checkpoint: Checkpoint = COCO
 
@@ -33,20 +62,20 @@ def resolve_source(
     """What `settings.source` means for a sequence; the label stored with results.
 
     Args:
-        settings: Whose `source` is resolved.
+        settings: The settings with the source.
         sequence_id: Id of the sequence, for ``auto``.
-        masks: Its exact masks, if it has them.
-        optional: Whether who asks also works without masks, for the hint.
+        masks: Exact masks of the sequence, if it has them.
+        optional: Whether the tracker also works without masks, for the hint.
 
     Returns:
         ``auto`` becomes ``embedded``, ``oracle`` or ``coco``; everything else stays as it is.
 
     Raises:
-        NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; says what else there is.
+        NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; lists the alternatives.
     """
     if settings.source != "auto":
         return settings.source
-    if sequence_id.startswith(SYNTHETIC):
+    if sequence_id.startswith("synthetic/"):
         if embedded_weights() is not None:
             return "embedded"
         if masks is not None:
@@ -60,16 +89,80 @@ def resolve_source(
     ]
     if masks is not None:
         options.append("segmentation.source=oracle takes the sequence's exact masks")
-    without = (
-        "segmentation.source=none" if optional else "a system that needs none, e.g. emfoa-oft-no-masks or orb-slam2"
-    )
+    without = "segmentation.source=none" if optional else "a tracker such as 'emfoa-oft?masks=none' or orb-slam2"
     options.append(f"without masks: {without}")
-    what = f"'{sequence_id}'" if sequence_id else "this sequence"
     raise NetworkNotFetched(
-        f"no masks for {what}: segmentation.source=auto needs "
+        f"no masks for '{sequence_id or 'this sequence'}': segmentation.source=auto needs "
         f"the COCO checkpoint ({COCO.megabytes} MB), which is not in the cache",
         options=options,
     )
+
+
+def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool = True) -> str:
+    """The source of a tracker's masks on a sequence, checked before anything runs.
+
+    Args:
+        settings: A tracker's settings.
+        sequence: The sequence it will run on.
+        fetch: Download the COCO checkpoint now if that is the source and it is not in the cache.
+
+    Returns:
+        The resolved source; empty for a tracker without a semantic stage.
+
+    Raises:
+        SegmentationError: The file is missing or holds no network, masks of frames are missing, the sequence has no
+            exact masks, or ``auto`` has no source.
+        PluginError: ``plugin:ID`` names no segmenter.
+    """
+    group = getattr(settings, "segmentation", None)
+    if not isinstance(group, SegmentationSettings):
+        return ""
+    default = type(settings).model_fields["segmentation"].get_default(call_default_factory=True)
+    optional = isinstance(default, SegmentationSettings) and default.source == "none"
+    source = resolve_source(group, sequence.id, sequence.masks, optional=optional)
+    kind, _, argument = source.partition(":")
+    path = Path(argument).expanduser()
+    if kind in ("oracle", "oracle-classes"):
+        build_oracle(group, SegmenterContext(sequence.id, sequence.masks))
+    elif kind == "recorded":
+        _check_recorded(path, group, sequence)
+    elif kind in ("onnx", "weights"):
+        stat = path.stat() if path.is_file() else None
+        _check_network(kind, path, group, stat and (stat.st_size, stat.st_mtime_ns))
+    elif kind == "embedded":
+        require_embedded_weights()
+    elif kind == "coco" and fetch:
+        fetch_checkpoint(COCO)
+    elif kind == "plugin":
+        SEGMENTERS.get(argument)
+    return source
+
+
+def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequence) -> None:
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter
+
+    missing = RecordedSegmenter(folder).missing(sequence.timestamps)
+    if settings.schedule == "every_nth" and settings.crowded_share >= 1:  # the only schedule that is known beforehand
+        missing = [index for index in missing if index % settings.n == 0]
+    if missing:
+        raise SegmentationError(
+            f"the folder of recorded masks {folder} has none for {len(missing)} of {len(sequence)} frames of "
+            f"'{sequence.id}', the first is frame {missing[0]} ({sequence.timestamps[missing[0]]:.6f} s)",
+            "is it of another sequence, or of another part?",
+        )
+
+
+@lru_cache(maxsize=16)
+def _check_network(kind: str, path: Path, settings: SegmentationSettings, stamp: tuple[int, int] | None) -> None:
+    """Load a network once a process, as long as size and time of its file (`stamp`) stay."""
+    if kind == "onnx":
+        from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
+
+        OnnxSegmenter(path, settings)
+    else:
+        from dynslam_bench.segmentation.networks.loading import load_network
+
+        load_network(path)
 
 
 def build_segmenter(
@@ -90,8 +183,8 @@ def build_segmenter(
         masks: Exact masks of the sequence, for ``oracle``.
         device: ``cpu`` or ``cuda:N``, for networks that run in torch.
         threads: Threads a network may use.
-        also: Names of further classes whose objects are wanted, though nobody holds them for dynamic by themselves.
-        deferred: Load a network whose file is there only once a frame needs it; with the stage cache none may.
+        deferred: Load a network whose file exists only when a frame needs it: with the stage cache none may.
+        also: Further classes whose objects are returned, although they are not dynamic by themselves.
 
     Raises:
         SegmentationError: The source is not available here, or its file does not fit.
@@ -109,16 +202,16 @@ def build_segmenter(
 
     def load() -> Segmenter:
         try:
-            built = load_object(spec.entry_point)(settings, context)
+            segmenter = load_object(spec.entry_point)(settings, context)
         except DynslamError:
             raise
-        except Exception as error:  # a foreign factory may raise anything; our own raise DynslamError
+        except Exception as error:  # a plug-in's factory may raise anything
             raise SegmentationError(
                 f"segmenter '{spec.id}' cannot be built: {type(error).__name__}: {error}"
             ) from error
-        if not isinstance(built, Segmenter):
-            raise SegmentationError(f"'{spec.entry_point}' gave a {type(built).__name__} without segment()")
-        return built
+        if not isinstance(segmenter, Segmenter):
+            raise SegmentationError(f"'{spec.entry_point}' gave a {type(segmenter).__name__} without segment()")
+        return segmenter
 
     waits = deferred and prefix in ("embedded", "coco", "onnx", "weights") and weights_digest(settings, sequence_id)
     return ConfiguredSegmenter(DeferredSegmenter(load) if waits else load(), settings, source, also)
@@ -128,64 +221,57 @@ class DeferredSegmenter:
     """A segmenter that is loaded when the first frame asks for it.
 
     Args:
-        load: Loads it.
+        load: Loads it; raises `SegmentationError` if the network's file does not fit.
     """
 
     def __init__(self, load: Callable[[], Segmenter]) -> None:
         self._load = load
-        self._segmenter: Segmenter | None = None
 
-    def loaded(self) -> Segmenter:
-        """The segmenter itself, loaded now if it was not before.
-
-        Raises:
-            SegmentationError: The network's file does not fit.
-        """
-        if self._segmenter is None:
-            self._segmenter = self._load()
-        return self._segmenter
+    @cached_property
+    def segmenter(self) -> Segmenter:
+        """The segmenter itself."""
+        return self._load()
 
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame."""
-        return self.loaded().segment(frame)
+        return self.segmenter.segment(frame)
 
 
 class ConfiguredSegmenter:
     """A segmenter whose objects are selected by the settings in force.
 
     Args:
-        inner: Finds objects.
-        settings: Selects among them; the attribute `settings` may be replaced while a run lasts.
+        inner: Segments.
+        settings: Selects among the objects; may be replaced while a run lasts.
         source: Label stored with results.
-        also: Names of further classes that are let through.
+        also: Names of further classes that pass.
     """
 
     def __init__(
         self, inner: Segmenter, settings: SegmentationSettings, source: str, also: frozenset[str] = frozenset()
     ) -> None:
-        self.inner = inner
-        self.settings = settings
-        self.source = source
-        self.also = also
+        self.inner, self.settings, self.source, self.also = inner, settings, source, also
 
     def segment(self, frame: Frame) -> Instances:
-        """The objects of the frame that count: see `select`.
+        """The objects of the frame that count: see `postprocess.select`.
 
         Raises:
             SegmentationError: The segmenter gave masks of another size than the frame.
         """
-        found = self.inner.segment(frame)
-        if found.masks.shape[1:] != frame.rgb.shape[:2] or len(found.masks) != len(found):
+        from dynslam_bench.segmentation.postprocess import select  # needs OpenCV, which the registry does not
+
+        instances = self.inner.segment(frame)
+        if instances.masks.shape[1:] != frame.rgb.shape[:2] or len(instances.masks) != len(instances):
             raise SegmentationError(
-                f"{self.source} gave {len(found)} objects with masks of shape {found.masks.shape}, the frame is "
-                f"{frame.rgb.shape[1]}x{frame.rgb.shape[0]}",
+                f"{self.source} gave {len(instances)} objects with masks of shape {instances.masks.shape}, the frame "
+                f"is {frame.rgb.shape[1]}x{frame.rgb.shape[0]}",
                 "masks must be [K, H, W] at the frame's size",
             )
-        return select(found, self.settings, self.also)
+        return select(instances, self.settings, self.also)
 
 
 def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None) -> str:
-    """Digest of the file that decides what the segmenter sees; part of a run's identity.
+    """Digest of the segmenter's file; part of a run's identity.
 
     Returns:
         The first 12 hexadecimal digits of the SHA-256 of the network's file, or of the names and contents of recorded
@@ -194,32 +280,29 @@ def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks:
     Raises:
         SegmentationError: The file cannot be read.
     """
-    source = resolve_source(settings, sequence_id, masks)
-    prefix, _, argument = source.partition(":")
-    path: Path | None = Path(argument).expanduser()
+    prefix, _, argument = resolve_source(settings, sequence_id, masks).partition(":")
+    path: Path | None = None
     if prefix == "embedded":
         path = embedded_weights()
     elif prefix == "coco":
         path = cached_checkpoint(COCO)
         if path is None:
             return COCO.sha256_prefix
-    elif prefix not in ("onnx", "weights", "recorded"):
-        return ""
-    if path is None or not path.exists():
-        return ""
+    elif prefix in ("onnx", "weights", "recorded"):
+        path = Path(argument).expanduser()
     try:
-        return path_digest(path)[:12]
+        return path_digest(path)[:12] if path is not None and path.exists() else ""
     except OSError as error:
         raise SegmentationError(f"cannot read {error.filename}: {error.strerror}") from error
 
 
 def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """Exact masks of the sequence; with ``oracle`` also of what moves, whatever its class.
+    """Exact masks of the sequence; ``oracle`` also returns what moves, whatever its class.
 
     Raises:
         SegmentationError: The sequence has no exact masks.
     """
-    from .masks.oracle import OracleSegmenter
+    from dynslam_bench.segmentation.recorded import OracleSegmenter
 
     if context.masks is None:
         raise SegmentationError(
@@ -231,28 +314,21 @@ def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> S
 
 def build_recorded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
     """Masks from a folder."""
-    from .masks.recorded import RecordedSegmenter
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
     return RecordedSegmenter(Path(context.argument))
 
 
 def build_onnx(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
     """A network from an ONNX file."""
-    from .networks.onnx.segmenter import OnnxSegmenter
+    from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
 
     return OnnxSegmenter(Path(context.argument), settings, threads=context.threads, floor=context.floor)
 
 
 def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """The small network in this package.
-
-    Raises:
-        SegmentationError: This installation lacks its weights.
-    """
-    path = embedded_weights()
-    if path is None:
-        raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
-    return _mask_rcnn(path, settings.model_copy(update={"network_side": 0}), context)
+    """The small network in this package, at the input size that it was trained with."""
+    return _mask_rcnn(require_embedded_weights(), settings.model_copy(update={"network_side": 0}), context)
 
 
 def build_coco(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
@@ -266,7 +342,7 @@ def build_weights(settings: SegmentationSettings, context: SegmenterContext) -> 
 
 
 def _mask_rcnn(path: Path, settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    from .networks.mask_rcnn.segmenter import MaskRCNNSegmenter
+    from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
 
     return MaskRCNNSegmenter.from_file(
         path, settings, device=context.device, threads=context.threads, floor=context.floor

@@ -1,4 +1,4 @@
-"""Masks from the stage cache."""
+"""Masks in the stage cache, addressed by the image and by the identity of the segmenter."""
 
 from __future__ import annotations
 
@@ -12,30 +12,33 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.stage_cache import Arrays, StageCache
-
-from .build_segmenter import LOWEST_CONFIDENCE, ConfiguredSegmenter, DeferredSegmenter, weights_digest
-from .masks.schedule import MaskScheduler
-from .registry import SEGMENTERS
+from dynslam_bench.segmentation.build_segmenter import (
+    LOWEST_CONFIDENCE,
+    SEGMENTERS,
+    ConfiguredSegmenter,
+    DeferredSegmenter,
+    weights_digest,
+)
+from dynslam_bench.segmentation.schedule import MaskScheduler
 
 NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
 """Sources whose masks depend on the colour image alone."""
-_ROOMS = ("core", "contracts", "sequences", "segmentation")
-"""The rooms whose code decides what a network sees."""
+_PACKAGES = ("core", "contracts", "sequences", "segmentation")
+"""The packages whose code decides what a network finds."""
 
 
 class CachedSegmenter:
-    """A segmenter whose results are stored, addressed by the image and by what the segmenter is.
+    """A segmenter whose results are stored.
 
     Args:
-        segmenter: Who segments.
+        segmenter: The segmenter.
         identity: JSON-able description of code, network, weights and settings that change its masks.
         cache: Where results are stored.
         threads: Threads of the network, part of the cost.
 
     Attributes:
-        hit: Whether the last call found its result stored.
-        saved_s: Seconds to add to the last call's wall time for what it costs without the cache: what computing it cost
-            less the look-up, or minus the time that storing it took.
+        hit: Whether the result of the last call came from the cache.
+        saved_s: Seconds to add to the last call's wall time to get its cost without the cache.
     """
 
     def __init__(self, segmenter: Segmenter, identity: object, cache: StageCache, threads: int) -> None:
@@ -52,29 +55,28 @@ class CachedSegmenter:
         entry = self._cache.get("masks", key)
         self.hit = entry is not None
         if entry is not None:
-            found = _unpack(entry.arrays)
-            self.saved_s = entry.cost_s - (time.perf_counter() - begin)
-            return found
-        segmenter = self._segmenter
-        if isinstance(segmenter, DeferredSegmenter):
-            segmenter = segmenter.loaded()  # loading is no part of the frame's cost
-        start = time.perf_counter()
-        found = segmenter.segment(frame)
-        cost = time.perf_counter() - start
-        self._cache.put("masks", key, _pack(found), cost)
+            instances, cost = _unpack(entry.arrays), entry.cost_s
+        else:
+            segmenter = self._segmenter
+            if isinstance(segmenter, DeferredSegmenter):
+                segmenter = segmenter.segmenter  # loading is no part of the frame's cost
+            start = time.perf_counter()
+            instances = segmenter.segment(frame)
+            cost = time.perf_counter() - start
+            self._cache.put("masks", key, _pack(instances), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
-        return found
+        return instances
 
 
-def _pack(found: Instances) -> Arrays:
+def _pack(instances: Instances) -> Arrays:
     arrays: Arrays = {
-        "masks": np.packbits(found.masks),
-        "shape": np.array(found.masks.shape),
-        "boxes": found.boxes,
-        "class_names": np.array(found.class_names, dtype=np.str_),
-        "scores": found.scores,
+        "masks": np.packbits(instances.masks),
+        "shape": np.array(instances.masks.shape),
+        "boxes": instances.boxes,
+        "class_names": np.array(instances.class_names, dtype=np.str_),
+        "scores": instances.scores,
     }
-    return arrays if found.moving is None else {**arrays, "moving": found.moving}
+    return arrays if instances.moving is None else {**arrays, "moving": instances.moving}
 
 
 def _unpack(stored: Arrays) -> Instances:
@@ -102,7 +104,7 @@ def cache_segmenter(
         "confidence": min(LOWEST_CONFIDENCE, settings.confidence),
         "settings": {
             name: getattr(settings, name)
-            for name in ("mask_threshold", "nms_iou", "classes", "network_side", "onnx_normalisation")
+            for name in ("mask_threshold", "classes", "network_side", "onnx_normalisation")
         },
         "device": device,
     }
@@ -111,18 +113,14 @@ def cache_segmenter(
     return cached
 
 
+@cache
 def code_of(source: str) -> str:
-    """Digest of the code behind a semantic source: this package's, and a plug-in's own.
+    """Digest of the code of a source: this package's, and a plug-in's own.
 
-    It is read once a process, when the plug-in is loaded: a file that is edited later is not what runs here.
+    It is read once a process, when the plug-in is loaded: later edits of its file do not act in this process.
 
     Raises:
         PluginError: No such segmenter, or its code cannot be read.
     """
     prefix, _, argument = source.partition(":")
-    return _code_behind(SEGMENTERS.get(argument if prefix == "plugin" else prefix).entry_point)
-
-
-@cache
-def _code_behind(entry_point: str) -> str:
-    return code_digest(entry_point, _ROOMS)
+    return code_digest(SEGMENTERS.get(argument if prefix == "plugin" else prefix).entry_point, _PACKAGES)

@@ -1,11 +1,9 @@
 """Frames and sequences: readers, catalogue, download, preprocessing and the synthetic renderer."""
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
-
-from .catalogue import open_sequence, sequence_ids
-from .published.datasets import DATASETS, DatasetSpec
-from .settings import PreprocessingSettings
-from .view import SequenceView
+from dynslam_bench.contracts.sequence import DatasetSpec, Frame, FrameMasks, MaskSource, Sequence
+from dynslam_bench.sequences.catalogue import DATASETS, open_sequence, sequence_ids
+from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences.view import SequenceView
 
 __all__ = [
     "DATASETS",

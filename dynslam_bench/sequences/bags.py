@@ -12,16 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError, SequenceError
 from dynslam_bench.core.files import atomic_folder
+from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.stamps import parse_ns
-
-from .catalogue import open_folder
-from .published.cameras import CAMERA_FILE, write_camera
-from .readers import bag_messages as messages
+from dynslam_bench.sequences.cameras import CAMERA_FILE, write_camera
+from dynslam_bench.sequences.catalogue import open_folder
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -90,7 +90,7 @@ def unpack_bag(
             }
             write_camera(work / CAMERA_FILE, topics.camera(chosen_colour))
             if chosen_truth:
-                lines = [messages.pose_line(found) for found in _read(reader, topics.connection(chosen_truth))]
+                lines = [pose_line(message) for message in _read(reader, topics.connection(chosen_truth))]
                 (work / "groundtruth.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
             count = len(open_folder(work))
     notes = []
@@ -118,7 +118,7 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
         with _opened(source) as reader:
             topics = _Topics(reader, source)
             chosen = topics.pose(topic, "--topic")
-            lines = [messages.pose_line(found) for found in _read(reader, topics.connection(chosen))] if chosen else []
+            lines = [pose_line(message) for message in _read(reader, topics.connection(chosen))] if chosen else []
     except OSError as error:  # e.g. a file that its metadata name is missing
         raise SequenceError(f"bag {source} cannot be read: {error.strerror or error}") from error
     table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
@@ -132,20 +132,20 @@ class _Topics:
 
     def __init__(self, reader: Any, source: Path) -> None:
         self.reader, self.source = reader, source
-        self.found: dict[str, list[Any]] = {}
+        self.connections: dict[str, list[Any]] = {}
         for connection in reader.connections:
-            self.found.setdefault(connection.topic, []).append(connection)
+            self.connections.setdefault(connection.topic, []).append(connection)
 
     def connection(self, topic: str) -> list[Any]:
-        return self.found[topic]
+        return self.connections[topic]
 
     def of_types(self, types: Sequence[str]) -> list[str]:
-        return sorted(topic for topic, found in self.found.items() if found[0].msgtype in types)
+        return sorted(topic for topic, connections in self.connections.items() if connections[0].msgtype in types)
 
     def image(self, kind: str, wanted: str | None) -> str:
         candidates = self.of_types(IMAGES)
         if wanted is None:
-            candidates = [topic for topic in candidates if messages.kind_of(self._first(topic)) == kind]
+            candidates = [topic for topic in candidates if kind_of(self._first(topic)) == kind]
         return self._one(f"{kind} images", candidates, wanted, f"--{kind}")
 
     def pose(self, wanted: str | None, option: str = "--truth (or --truth none)") -> str:
@@ -160,10 +160,10 @@ class _Topics:
         beside = [topic for topic in infos if namespace.startswith(topic.rpartition("/")[0])] or infos
         if len(beside) != 1:
             raise SequenceError(f"{self.source} has {len(beside)} topics of calibration for {colour}, expected 1")
-        return messages.camera_of(self._first(beside[0]), f"{beside[0]} of {self.source}")
+        return camera_of(self._first(beside[0]), f"{beside[0]} of {self.source}")
 
     def _first(self, topic: str) -> Any:
-        for message in _read(self.reader, self.found[topic]):
+        for message in _read(self.reader, self.connections[topic]):
             return message
         raise SequenceError(f"topic {topic} of {self.source} has no message")
 
@@ -188,11 +188,11 @@ def _write_images(reader: Any, connections: list[Any], work: Path, name: str) ->
     for index, message in enumerate(_read(reader, connections)):
         where = f"image {index} of {connections[0].topic}"
         if name == "rgb":
-            suffix, data = messages.colour_file(message, where)
+            suffix, data = colour_file(message, where)
             (work / name / f"{index:06d}{suffix}").write_bytes(data)
         else:
-            suffix = _write_depth(work / name / f"{index:06d}", messages.depth_array(message, where))
-        rows.append(f"{messages.stamp_text(message)} {name}/{index:06d}{suffix}")
+            suffix = _write_depth(work / name / f"{index:06d}", depth_array(message, where))
+        rows.append(f"{stamp_text(message)} {name}/{index:06d}{suffix}")
         frame = frame or str(message.header.frame_id)
     (work / f"{name}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
     return frame
@@ -236,3 +236,105 @@ def _reader() -> Callable[[Path], Any]:
     except ImportError as error:
         raise SequenceError("bags are read with rosbags, which is not installed", "pip install rosbags") from error
     return lambda path: AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+
+
+# Messages of ROS as images, stamps, poses and cameras; ROS 1 and 2 name a few fields otherwise.
+
+COLOURS: dict[str, int | None] = {
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "bgr8": None,
+    "rgba8": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "mono8": None,
+    "8UC3": None,
+    "8UC1": None,
+}
+DEPTHS: dict[str, np.dtype[Any]] = {
+    "16UC1": np.dtype(np.uint16),
+    "mono16": np.dtype(np.uint16),
+    "32FC1": np.dtype(np.float32),
+}
+MILLIMETRES = 1000.0
+"""Units a metre of a 16-bit depth image, as REP 118 of ROS has it; one of floating-point numbers is in metres."""
+
+
+def stamp_text(message: Any) -> str:
+    """The header's stamp in seconds, to the nanosecond."""
+    stamp = message.header.stamp
+    return f"{int(stamp.sec)}.{int(stamp.nanosec):09d}"
+
+
+def kind_of(message: Any) -> str:
+    """``colour``, ``depth`` or empty, of an image message, compressed or not."""
+    if hasattr(message, "encoding"):
+        return "depth" if message.encoding in DEPTHS else "colour" if message.encoding in COLOURS else ""
+    return "" if "compressedDepth" in message.format else "colour"
+
+
+def colour_file(message: Any, where: str) -> tuple[str, bytes]:
+    """Suffix and content of a file that holds the colour image: as it came where it is compressed, else a PNG.
+
+    Raises:
+        SequenceError: It is no such image.
+    """
+    if not hasattr(message, "encoding"):
+        data = bytes(message.data)
+        return (".png" if data.startswith(b"\x89PNG") else ".jpg"), data
+    if message.encoding not in COLOURS:
+        raise SequenceError(f"{where} is of '{message.encoding}', expected one of {', '.join(COLOURS)}")
+    pixels = _pixels(message, np.dtype(np.uint8), where)
+    code = COLOURS[message.encoding]
+    return ".png", cv2.imencode(".png", pixels if code is None else cv2.cvtColor(pixels, code))[1].tobytes()
+
+
+def depth_array(message: Any, where: str) -> NDArray[np.generic]:
+    """The depth image ``[H, W]``: uint16 millimetres or float32 metres.
+
+    Raises:
+        SequenceError: It is no such image.
+    """
+    kind = DEPTHS.get(getattr(message, "encoding", ""))
+    if kind is None:
+        raise SequenceError(f"{where} holds no depth image of {', '.join(DEPTHS)}", "choose another topic with --depth")
+    return _pixels(message, kind, where)
+
+
+def _pixels(message: Any, kind: np.dtype[Any], where: str) -> NDArray[Any]:
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if min(height, width) < 1 or len(data) != height * step or step < width * kind.itemsize:
+        raise SequenceError(f"{where} is {width}x{height} in {len(data)} bytes, {step} a row")
+    channels = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}.get(message.encoding, 1)
+    used = width * channels * kind.itemsize
+    if used > step:
+        raise SequenceError(f"{where} has rows of {step} bytes, too short for {width} pixels of {message.encoding}")
+    rows = np.ascontiguousarray(data.reshape(height, step)[:, :used])
+    order = kind.newbyteorder(">" if message.is_bigendian else "<")
+    values = rows.view(order).astype(kind)
+    return values.reshape(height, width, channels) if channels > 1 else values
+
+
+def camera_of(message: Any, where: str) -> Camera:
+    """The camera of a ``CameraInfo``.
+
+    Raises:
+        SequenceError: Its distortion is not the radial-tangential one of five coefficients, or it is none.
+    """
+    k, d = (np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float).ravel() for name in "kd")
+    if len(k) != 9 or not np.isfinite(k).all() or min(k[0], k[4], message.width, message.height) <= 0:
+        raise SequenceError(f"{where} holds no calibration (K = {k.tolist()})", "the camera was not calibrated")
+    if message.distortion_model not in ("", "plumb_bob", "rational_polynomial") or d[5:].any():
+        raise SequenceError(f"{where} has the distortion '{message.distortion_model}', only plumb_bob is read")
+    coefficients = [*d[:5].tolist(), *[0.0] * 5][:5]
+    size = int(message.width), int(message.height)
+    return Camera(*size, k[0], k[4], k[2], k[5], tuple(coefficients), MILLIMETRES)
+
+
+def pose_line(message: Any) -> str:
+    """A line ``timestamp tx ty tz qx qy qz qw`` of a stamped pose, transformation or odometry."""
+    inner = getattr(message, "pose", None) or message.transform
+    inner = getattr(inner, "pose", inner)  # with covariance
+    position = getattr(inner, "position", None) or inner.translation
+    rotation = getattr(inner, "orientation", None) or inner.rotation
+    values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
+    return " ".join([stamp_text(message), *[repr(float(value)) for value in values]])

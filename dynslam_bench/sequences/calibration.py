@@ -24,9 +24,7 @@ from scipy.stats import t as student
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
-
-from .continuous_time import LEAST_POINTS, Unusable, Window
-from .keypoint_tracks import corners, track
+from dynslam_bench.sequences.continuous_time import LEAST_POINTS, Unusable, Window, corners, track
 
 Array = NDArray[np.float64]
 
@@ -63,7 +61,7 @@ class Quantity:
         low: Lower end of the 95 % interval.
         high: Its upper end.
         written: What a ``camera.toml`` should state; None to leave it as it is.
-        observable: False where the recording does not tell the quantity.
+        observable: False where the recording does not determine the quantity.
         reason: What that rests on, one phrase.
     """
 
@@ -149,7 +147,9 @@ def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] | None
         _delay(delay, sequence.camera),
         _factor(windows, sequence),
     )
-    values: dict[str, Any] = {each.name: each.written for each in quantities if each.written is not None}
+    values: dict[str, Any] = {
+        quantity.name: quantity.written for quantity in quantities if quantity.written is not None
+    }
     noise = float(np.median([window.noise[0] for window in windows]))
     return Calibration(replace(sequence.camera, **values), quantities, len(windows), length, noise)
 
@@ -168,7 +168,7 @@ def window_of(sequence: Sequence, first: int, length: int) -> Window:
         raise Unusable("the depth images are empty")
     deep = [cv2.erode((frame.depth > 0).astype(np.uint8), np.ones((9, 9))) for frame in frames]
     grey = [cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY) for frame in frames]
-    pixels = track([np.asarray(each, np.uint8) for each in grey], [np.asarray(each, np.uint8) for each in deep])
+    pixels = track([np.asarray(image, np.uint8) for image in grey], [np.asarray(mask, np.uint8) for mask in deep])
     if len(pixels) < LEAST_POINTS:
         raise Unusable("too few points can be followed")
     return Window(sequence.camera, stamps, pixels, np.stack([frame.depth for frame in frames]), offsets)
@@ -212,15 +212,15 @@ def _change(sequence: Sequence, first: int, last: int) -> float:
         now, later = (
             cv2.resize(cv2.cvtColor(sequence[j].rgb, cv2.COLOR_RGB2GRAY), None, fx=0.5, fy=0.5) for j in (i, i + 1)
         )
-        found_at = corners(np.asarray(now, np.uint8), np.ones(now.shape, np.uint8), np.zeros((0, 2)), 40)
-        if len(found_at) < LEAST_POINTS:
+        start_pixels = corners(np.asarray(now, np.uint8), np.ones(now.shape, np.uint8), np.zeros((0, 2)), 40)
+        if len(start_pixels) < LEAST_POINTS:
             return 0.0
-        start = found_at.reshape(-1, 1, 2)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(now, later, start, start.copy(), winSize=(21, 21), maxLevel=3)
-        good = found[:, 0] > 0
+        start = start_pixels.reshape(-1, 1, 2)
+        there, status, _ = cv2.calcOpticalFlowPyrLK(now, later, start, start.copy(), winSize=(21, 21), maxLevel=3)
+        good = status[:, 0] > 0
         if good.sum() < LEAST_POINTS:
             return 0.0
-        flows.append(np.median(there[good, 0] - found_at[good], axis=0))
+        flows.append(np.median(there[good, 0] - start_pixels[good], axis=0))
     return float(np.linalg.norm(flows[1] - flows[0]))
 
 
@@ -238,7 +238,7 @@ class Estimate:
 
     @property
     def resolved(self) -> bool:
-        """Whether a time in seconds is told well enough to be used."""
+        """Whether a time in seconds is determined well enough to be used."""
         return self.half <= max(RESOLVED_S, RESOLVED_SHARE * abs(self.value))
 
 
@@ -305,18 +305,18 @@ def _over_windows(
     return Estimate(mean, float(np.hypot(student.ppf(0.975, k - 1) * np.sqrt(variance), 1.96 * systematic)))
 
 
-def _readout(found: Estimate, windows: list[Window], camera: Camera) -> Quantity:
+def _readout(estimate: Estimate, windows: list[Window], camera: Camera) -> Quantity:
     interval_s = float(np.median([np.median(np.diff(window.stamps)) for window in windows]))
-    low, high = found.value - found.half, found.value + found.half
-    about = Quantity("readout_s", found.value, low, high)
-    if not found.resolved:
+    low, high = estimate.value - estimate.half, estimate.value + estimate.half
+    about = Quantity("readout_s", estimate.value, low, high)
+    if not estimate.resolved:
         change = float(np.median([window.turning_change() for window in windows]))
         return replace(
             about,
-            reason=f"interval of +- {1e3 * found.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: the turning rate "
+            reason=f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: the turning rate "
             f"changes by {change:.2f} rad/s within a window; turn the camera to and fro faster",
         )
-    if high < 0 or found.value > interval_s + RESOLVED_S:
+    if high < 0 or estimate.value > interval_s + RESOLVED_S:
         return replace(about, reason=f"outside of 0 to {1e3 * interval_s:.0f} ms, a frame's interval: check the stamps")
     about = replace(about, observable=True)
     if low <= 0:
@@ -324,26 +324,26 @@ def _readout(found: Estimate, windows: list[Window], camera: Camera) -> Quantity
         return replace(about, written=0.0 if camera.readout_s > high else None, reason=agrees)
     if low <= camera.readout_s <= high:
         return replace(about, reason=f"agrees with the camera's {1e3 * camera.readout_s:g} ms")
-    return replace(about, written=round(found.value, 4), reason="a rolling shutter")
+    return replace(about, written=round(estimate.value, 4), reason="a rolling shutter")
 
 
-def _delay(found: Estimate, camera: Camera) -> Quantity:
+def _delay(estimate: Estimate, camera: Camera) -> Quantity:
     """The stamps that the reader gives have the camera's own delay added already."""
-    low, high = found.value - found.half, found.value + found.half
+    low, high = estimate.value - estimate.half, estimate.value + estimate.half
     own = camera.depth_delay_s
-    about = Quantity("depth_delay_s", own + found.value, own + low, own + high)
-    if not found.resolved:
+    about = Quantity("depth_delay_s", own + estimate.value, own + low, own + high)
+    if not estimate.resolved:
         return replace(
             about,
-            reason=f"interval of +- {1e3 * found.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: too slow a motion",
+            reason=f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: too slow a motion",
         )
-    if abs(found.value) > LARGEST_DELAY_S:
+    if abs(estimate.value) > LARGEST_DELAY_S:
         return replace(about, reason=f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?")
     about = replace(about, observable=True)
-    if low <= 0 <= high or abs(found.value) < SMALLEST_DELAY_S:
+    if low <= 0 <= high or abs(estimate.value) < SMALLEST_DELAY_S:
         return replace(about, reason="colour and depth are exposed as their stamps say, to a sixth of a frame")
-    late = "later" if found.value > 0 else "earlier"
-    written = round(camera.depth_delay_s + found.value, 4)
+    late = "later" if estimate.value > 0 else "earlier"
+    written = round(camera.depth_delay_s + estimate.value, 4)
     return replace(about, written=written, reason=f"depth is exposed {late} than its stamps say")
 
 
@@ -352,7 +352,7 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
     about = Quantity("depth_factor")
     truth = sequence.ground_truth
     if truth is None or len(truth) < 2:
-        return replace(about, reason="there is no ground truth: images alone do not tell the unit of length")
+        return replace(about, reason="there is no ground truth: images alone do not determine the unit of length")
     used, scales, information = [], [], []
     for window in windows:
         stamps = window.start + window.stamps - window.stamps[0]
@@ -373,14 +373,20 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
             information.append(length / max(error, 1e-12))
     if len(scales) < LEAST_WINDOWS:
         return replace(about, reason=f"the ground truth covers {len(scales)} of {len(windows)} windows")
-    found = _over_windows(used, np.array(scales), np.array(information), SYSTEMATIC_FACTOR * float(np.median(scales)))
-    if found.half > RESOLVED_FACTOR * found.value:
-        share = found.half / max(found.value, 1e-9)
+    estimate = _over_windows(
+        used, np.array(scales), np.array(information), SYSTEMATIC_FACTOR * float(np.median(scales))
+    )
+    if estimate.half > RESOLVED_FACTOR * estimate.value:
+        share = estimate.half / max(estimate.value, 1e-9)
         return replace(
             about, reason=f"interval of +- {share:.0%}, wanted +- {RESOLVED_FACTOR:.0%}: the camera's path is too short"
         )
     factor = sequence.camera.depth_factor
-    value, low, high = factor / found.value, factor / (found.value + found.half), factor / (found.value - found.half)
+    value, low, high = (
+        factor / estimate.value,
+        factor / (estimate.value + estimate.half),
+        factor / (estimate.value - estimate.half),
+    )
     about = replace(about, value=value, low=low, high=high, observable=True)
     if low <= factor <= high:
         return replace(about, reason=f"agrees with the camera's {factor:g}")

@@ -2,36 +2,132 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
+from collections.abc import Iterator
+from collections.abc import Sequence as PySequence
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
-from dynslam_bench.contracts.sequence import Sequence
+from pydantic import Field
+
+from dynslam_bench.contracts.sequence import DatasetSpec, Sequence
 from dynslam_bench.core.code_files import leads_back
-from dynslam_bench.core.digests import is_settled
 from dynslam_bench.core.errors import SequenceError, did_you_mean
+from dynslam_bench.core.fingerprint import is_settled
 from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
-from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.settings import Settings, build
+from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.cameras import CAMERAS, MARKER_TO_CAMERA, chosen_camera, find_camera
+from dynslam_bench.sequences.readers.layouts import layout_of
+from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
+from dynslam_bench.sequences.view import SequenceView
 
-from .published.cameras import MARKER_TO_CAMERA, chosen_camera, find_camera
-from .published.datasets import DATASETS
-from .published.entries import CatalogueEntry, by_folder, catalogue, entry_of, public_datasets
-from .settings import PreprocessingSettings
-from .synthetic import open_synthetic
-from .view import SequenceView
+Tag = Literal["static", "low-dynamic", "high-dynamic"]
+Split = Literal["tune", "held-out", ""]
+_FILES = ("tum", "bonn", "wild_slam", "eth3d", "icl", "seven_scenes", "shibuya", "openloris")
 
-__all__ = [
-    "CatalogueEntry",
-    "catalogue",
-    "entry_of",
-    "open_folder",
-    "open_public",
-    "open_rendered",
-    "open_sequence",
-    "parse_frames",
-    "sequence_ids",
-]
+
+class CatalogueEntry(Settings):
+    """One public sequence.
+
+    A number or checksum that is not known is None, never a guess.
+    """
+
+    id: str = Field(description="for example tum/fr3/walking_xyz")
+    folder: str = Field(description="published folder name, an alias of the id")
+    camera: str = Field(default="", description="name of the camera; empty where the folder or the layout states it")
+    layout: str = Field(default="tum", description="name of the layout, see dynslam_bench.sequences.readers.layouts")
+    url: str = Field(description="archive")
+    verified: bool = Field(default=False, description="whether the publisher's own files were read with it")
+    more_urls: tuple[str, ...] = Field(default=(), description="further archives that belong to the same folder")
+    by_hand: str = Field(default="", description="why this program cannot fetch it; empty where it can")
+    distinctive: bool = Field(default=True, description="whether the folder's name alone identifies the sequence")
+    title: str = Field(description="name of the data set")
+    page: str = Field(default="", description="web page of the data set")
+    size_bytes: int | None = Field(default=None, description="exact size of the archive")
+    size_stated: str = Field(default="", description="size as the data set's page states it")
+    sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", description="checksum of the archive")
+    license: str = Field(description="licence of the data")
+    citation: str = Field(description="what to cite")
+    ground_truth: bool = Field(default=True, description="whether the ground truth is public")
+    tags: tuple[Tag, ...] = Field(default=(), description="how much of the scene moves")
+    split: Split = Field(default="", description="whether studies may tune on it")
+    fps: float = Field(default=30.0, gt=0, description="nominal frame rate in Hz")
+    remark: str = Field(default="", description="anything else worth knowing")
+
+    @property
+    def dataset(self) -> str:
+        """First part of the id, ``tum`` for example."""
+        return self.id.partition("/")[0]
+
+    def folders(self, data_root: Path) -> tuple[Path, ...]:
+        """Where the sequence may lie below a data root, the place `fetch` puts it first."""
+        inside = data_root / self.dataset
+        if not self.distinctive:
+            return inside / self.folder, data_root / self.id
+        places = (inside / self.folder, data_root / self.folder, data_root / self.id)
+        return (*places, data_root / self.folder.removeprefix("rgbd_")) if data_root.name == self.dataset else places
+
+    def find(self, data_root: Path) -> Path | None:
+        """The folder in which the sequence lies, None if it does not."""
+        layout = layout_of(self.layout)
+        return next((folder for folder in self.folders(data_root) if layout.fits(folder)), None)
+
+    def how_to_get(self) -> str:
+        """What a user does to have it, for the end of a message."""
+        if self.by_hand:
+            return f"get it by hand from {self.page} ({self.by_hand}) and put it there"
+        return f"fetch it with: dynslam-bench sequences fetch {self.id}"
+
+    def size_text(self) -> str:
+        """The archive's size for people."""
+        if self.size_bytes is not None:
+            return f"{self.size_bytes / 1e9:.2f} GB"
+        return self.size_stated or "size unknown"
+
+    def intrinsics(self) -> Camera | None:
+        """The camera; None where only the sequence's own files state it."""
+        return CAMERAS[self.camera] if self.camera else None
+
+
+@cache
+def catalogue() -> dict[str, CatalogueEntry]:
+    """All public sequences by id, in the order of the data files."""
+    entries: dict[str, CatalogueEntry] = {}
+    for name in _FILES:
+        document = read_toml(Path(__file__).parent / "published" / f"{name}.toml")
+        common: dict[str, Any] = document["common"]
+        for row in document["sequence"]:
+            entry = build(CatalogueEntry, {**common, **row})
+            entries[entry.id] = entry
+    return entries
+
+
+def entry_of(name: str) -> CatalogueEntry | None:
+    """The catalogue's entry of an id or published folder name, None if there is none."""
+    entries = catalogue()
+    return entries.get(name) or by_folder().get(name)
+
+
+@cache
+def by_folder() -> dict[str, CatalogueEntry]:
+    """The public sequences whose published folder name is like no other, by that name."""
+    return {entry.folder: entry for entry in catalogue().values() if entry.distinctive}
+
+
+@cache
+def public_datasets() -> dict[str, CatalogueEntry]:
+    """The public data sets by name, each with its first sequence, in the order of the data files."""
+    first: dict[str, CatalogueEntry] = {}
+    for entry in catalogue().values():
+        first.setdefault(entry.dataset, entry)
+    return first
 
 
 _OPENED: dict[str, tuple[list[tuple[str, int, int, int, int]], Sequence]] = {}
@@ -41,7 +137,7 @@ _MOST_OPENED = 64
 
 def sequence_ids() -> list[str]:
     """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins."""
-    return [name for found in DATASETS.all() for name in found.spec.sequences]
+    return [name for dataset in DATASETS.all() for name in dataset.spec.sequences]
 
 
 def open_sequence(
@@ -76,7 +172,7 @@ def open_sequence(
     root = find_data_root(data_root)
     sequence = _open_whole(str(name), root, camera, settings)
     if settings.changes_images:
-        from .preprocessing import Preprocessed
+        from dynslam_bench.sequences.preprocessing import Preprocessed
 
         sequence = cast("Sequence", Preprocessed(sequence, settings))
     return _part(sequence, frames, stride)
@@ -141,8 +237,8 @@ def open_folder(
     chosen = chosen_camera(folder, camera)
     wanted = repr((folder.absolute(), entry and entry.id, str(camera), chosen, settings))
     state = _state_of(folder)
-    known, sequence = _OPENED.get(wanted, (None, None))
-    if sequence is None or known != state:
+    earlier, sequence = _OPENED.get(wanted, (None, None))
+    if sequence is None or earlier != state:
         sequence = _open_folder(folder, entry, camera, chosen, settings)
         while len(_OPENED) >= _MOST_OPENED:
             _OPENED.pop(next(iter(list(_OPENED)), ""), None)  # another thread may do the same
@@ -158,14 +254,14 @@ def _open_folder(
     chosen: tuple[Camera, float | None] | None,
     settings: PreprocessingSettings,
 ) -> Sequence:
-    from .readers.layouts import find_layout, layout_of
-    from .readers.recorded import Description, RecordedSequence
+    from dynslam_bench.sequences.readers.layouts import find_layout, layout_of
+    from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
 
     layout = find_layout(folder) if entry is None else layout_of(entry.layout)
-    stated = None if chosen is None else chosen[1]
-    contents = layout.read(folder, stated or (None if entry is None else entry.fps))
+    chosen_fps = None if chosen is None else chosen[1]
+    contents = layout.read(folder, chosen_fps or (None if entry is None else entry.fps))
     otherwise = None if entry is None else entry.camera
-    intrinsics, fps = chosen or find_camera(folder, told=contents.camera, otherwise=otherwise)
+    intrinsics, fps = chosen or find_camera(folder, stated=contents.camera, otherwise=otherwise)
     body = MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera)
     if entry is None:
         description = Description(f"folder/{folder.resolve().name}", intrinsics, fps or contents.fps, R_body_cam=body)
@@ -202,14 +298,14 @@ def _state_of(folder: Path) -> list[tuple[str, int, int, int, int]]:
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
-    from .readers.layouts import is_bag
+    from dynslam_bench.sequences.readers.layouts import is_bag
 
     path = Path(name).expanduser()
     entry = None if _is_path(name) else entry_of(name)
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
     prefix = name.partition("/")[0]
-    datasets = {found.spec.id: found.spec for found in DATASETS.all()}
+    datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all()}
     if not _is_path(name) and "/" in name and prefix in datasets and prefix not in public_datasets():
         if camera is not None:
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
@@ -223,8 +319,8 @@ def _open_whole(
             f"there is no sequence folder {path.absolute()}",
             "a path names a folder, see docs/sequences.md",
         )
-    known = [*sequence_ids(), *by_folder()]
-    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", did_you_mean(name, known))
+    names = [*sequence_ids(), *by_folder()]
+    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", did_you_mean(name, names))
 
 
 def _is_path(name: str) -> bool:
@@ -268,3 +364,153 @@ def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int 
     if start < 0 or (stop is not None and stop <= start):
         raise SequenceError(f"frames {start}:{'' if stop is None else stop} is no range of frames", "0 <= A < B")
     return start, stop
+
+
+# Data sets as plug-ins: each serves the sequences below one prefix, ``tum/...`` for example.
+
+
+OPENERS = "dynslam_bench.sequences.catalogue"
+"""The module that opens sequences of the built-in data sets; loaded when the first one is opened."""
+
+
+def _builtin() -> Iterator[DatasetSpec]:
+    """The data sets that come with the package."""
+    for name, first in public_datasets().items():
+        ids = tuple(entry.id for entry in catalogue().values() if entry.dataset == name)
+        yield DatasetSpec(name, f"{OPENERS}:open_public", ids, first.title, first.license, first.citation)
+    summary = "rendered scenes with exact poses, masks and flow"
+    yield DatasetSpec("synthetic", f"{OPENERS}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
+
+
+DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
+
+
+# Lists and descriptions for people.
+
+KNOWN = "known: another archive is refused"
+FIRST_USE = "not published: the first fetch takes it, every later one has to bring the same"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One line of the list of sequences.
+
+    Attributes:
+        id: Its id.
+        here: Whether it is on this machine; rendered ones are always.
+        size: Size of the archive, for people.
+        tags: For example ``high-dynamic``.
+        split: ``tune``, ``held-out`` or empty.
+        ground_truth: Whether the ground truth is public.
+        license: Licence of the data.
+        url: Where the archive lies.
+        dataset: Name of the data set.
+        layout: How its files were known when the reader was written: ``verified``, ``not verified`` on the publisher's
+            files, or empty where there are none.
+        by_hand: Why this program cannot fetch it; empty where it can.
+        checksum: Whether its checksum is known before it is fetched; None for what is rendered.
+    """
+
+    id: str
+    here: bool
+    size: str = ""
+    tags: tuple[str, ...] = ()
+    split: str = ""
+    ground_truth: bool = True
+    license: str = ""
+    url: str = ""
+    dataset: str = ""
+    layout: str = ""
+    by_hand: str = ""
+    checksum: bool | None = None
+
+
+def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
+    """All listed sequences.
+
+    Args:
+        data_root: Folder of the sequences.
+    """
+    root, rows = find_data_root(data_root), []
+    for dataset in DATASETS.all():
+        for name in dataset.spec.sequences:
+            entry = catalogue().get(name)
+            if entry is not None:
+                layout = "verified" if entry.verified else "not verified"
+                row = Summary(
+                    name, entry.find(root) is not None, entry.size_text(), entry.tags, entry.split, entry.ground_truth,
+                    entry.license, entry.url, entry.title, layout, entry.by_hand, entry.sha256 is not None,
+                )  # fmt: skip
+            else:
+                row = Summary(name, True, license=dataset.spec.license, dataset=dataset.spec.summary or dataset.spec.id)
+                if dataset.spec.id == "synthetic":
+                    parsed = parse_synthetic_id(name)
+                    row = replace(row, size="rendered", tags=parsed.tags, split=parsed.split)
+            rows.append(row)
+    return rows
+
+
+def describe(name: str, *, data_root: str | Path | None = None, camera: str | Path | None = None) -> dict[str, Any]:
+    """Everything known of a sequence: the catalogue's entry, and what it holds if it is here.
+
+    Args:
+        name: Id, published folder name or path.
+        data_root: Folder of the sequences.
+        camera: In place of what the catalogue or the folder says.
+
+    Raises:
+        SequenceError: Unknown name, or it is here but damaged.
+    """
+    root, entry = find_data_root(data_root), entry_of(name)
+    facts: dict[str, Any] = {}
+    if entry is not None:
+        facts = {
+            "id": entry.id, "alias": entry.folder, "url": entry.url, "page": entry.page, "size": entry.size_text(),
+            "size_bytes": entry.size_bytes, "sha256": entry.sha256, "license": entry.license,
+            "checksum": KNOWN if entry.sha256 else FIRST_USE,
+            "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
+            "ground_truth": "public" if entry.ground_truth else "not public",
+            "camera": repr(entry.intrinsics() or "as its files or its layout state"),
+            "layout": f"{entry.layout}: {'' if entry.verified else 'not '}verified on the publisher's files",
+            "remark": entry.remark,
+        }  # fmt: skip
+        if entry.find(root) is None:
+            return facts | {"here": False, "fetch": entry.how_to_get()}
+    sequence = open_sequence(name, data_root=data_root, camera=camera)
+    truth = sequence.ground_truth
+    dropped, folder = getattr(sequence, "dropped", None), getattr(sequence, "folder", None)
+    stamps = sequence.timestamps
+    return facts | {
+        "id": sequence.id,
+        "here": True,
+        "folder": None if folder is None else str(folder),
+        "frames": len(sequence),
+        "duration_s": round(float(stamps[-1] - stamps[0]), 3),
+        "fps": round(sequence.fps, 3),
+        "camera": repr(sequence.camera),
+        "ground_truth_poses": 0 if truth is None else len(truth),
+        "path_length_m": None if truth is None else round(truth.path_length_m, 3),
+        "masks": "exact" if sequence.masks is not None else "none",
+        "license": sequence.license,
+        "citation": sequence.citation,
+        "association": None if dropped is None else dropped.describe(),
+        "digest": sequence.digest(),
+    }
+
+
+def expand(names: PySequence[str]) -> list[str]:
+    """Ids that match patterns such as ``bonn/*``; everything else stays as it is.
+
+    Raises:
+        SequenceError: A pattern matches nothing.
+    """
+    expanded: list[str] = []
+    for name in names:
+        if any(character in name for character in "*[") and not Path(name).exists():
+            matching = fnmatch.filter(catalogue(), name)
+            if not matching:
+                raise SequenceError(f"no public sequence matches '{name}'", "see: dynslam-bench sequences list")
+            expanded += matching
+        else:
+            expanded.append(name)
+    return list(dict.fromkeys(expanded))

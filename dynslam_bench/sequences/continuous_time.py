@@ -1,12 +1,13 @@
 """Bundle adjustment of a window of frames whose camera moves continuously: every row and depth image has its own time.
 
-After Kerl, Stueckler and Cremers, Dense Continuous-Time Tracking and Mapping with Rolling Shutter RGB-D Cameras, ICCV
-2015, with keypoints in place of their dense images, and poses interpolated from the frames' in place of a spline.
+Corners are tracked through the window. Kerl, Stueckler and Cremers, "Dense continuous-time tracking and mapping with
+rolling shutter RGB-D cameras", ICCV 2015.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,9 +17,87 @@ from scipy.spatial.transform import Rotation
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.se3 import hat
 
-from .keypoint_tracks import inverse_depth
-
 Array = NDArray[np.float64]
+
+POINTS = 110
+"""So many corners are followed at a time."""
+
+
+def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> Array:
+    """Corners followed from image to image by Lucas and Kanade, pixels ``[L, n, 2]``; NaN where they are not seen.
+
+    A corner that is tracked back more than half a pixel off is lost. New ones are detected where few are left and
+    `allowed` is not 0.
+    """
+    n, (height, width) = len(images), images[0].shape
+    tracks = np.full((0, n, 2), np.nan)
+    window: dict[str, Any] = {
+        "winSize": (21, 21),
+        "maxLevel": 4,
+        "criteria": (3, 30, 0.01),
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }
+    for i in range(n - 1):
+        alive = np.isfinite(tracks[:, i, 0])
+        if alive.sum() < POINTS and i < n - 3:
+            fresh = corners(images[i], allowed[i], tracks[alive, i], POINTS - int(alive.sum()))
+            new = np.full((len(fresh), n, 2), np.nan)
+            new[:, i] = fresh
+            tracks = np.concatenate([tracks, new])
+            alive = np.isfinite(tracks[:, i, 0])
+        here = tracks[alive, i].astype(np.float32)
+        if not len(here):
+            continue
+        flow = here - tracks[alive, i - 1] if i else np.full(here.shape, np.nan)
+        valid = np.isfinite(flow[:, 0])
+        flow[~valid] = np.median(flow[valid], axis=0) if valid.any() else 0.0
+        guess, start = (pixels.astype(np.float32).reshape(-1, 1, 2) for pixels in (here + flow, here))
+        there, status, _ = cv2.calcOpticalFlowPyrLK(images[i], images[i + 1], start, guess, **window)
+        back, again, _ = cv2.calcOpticalFlowPyrLK(images[i + 1], images[i], there, start.copy(), **window)
+        there, back = np.asarray(there)[:, 0], np.asarray(back)[:, 0]
+        good = (
+            (np.asarray(status)[:, 0] > 0) & (np.asarray(again)[:, 0] > 0) & (np.linalg.norm(back - here, axis=1) < 0.5)
+        )
+        good &= (there >= 8).all(axis=1) & (there < (width - 8, height - 8)).all(axis=1)
+        tracks[np.flatnonzero(alive)[good], i + 1] = there[good]
+    return np.asarray(tracks[np.isfinite(tracks[..., 0]).sum(axis=1) >= 4])
+
+
+def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, count: int) -> NDArray[np.float32]:
+    """Corners ``[N, 2]`` spread over the cells of a grid, away from those that there are."""
+    height, width = image.shape
+    free = allowed.copy()
+    for x, y in taken:
+        cv2.circle(free, (int(x), int(y)), 12, 0, -1)
+    rows, columns = 4, 5
+    per_cell = int(np.ceil(1.5 * count / (rows * columns)))
+    pixels = [np.zeros((0, 2), np.float32)]
+    for r in range(rows):
+        for c in range(columns):
+            ys = slice(r * height // rows, (r + 1) * height // rows)
+            xs = slice(c * width // columns, (c + 1) * width // columns)
+            in_cell = cv2.goodFeaturesToTrack(image[ys, xs], per_cell, 0.02, 12, mask=free[ys, xs])
+            if in_cell is not None:
+                pixels.append(np.asarray(in_cell.reshape(-1, 2) + np.array([xs.start, ys.start]), np.float32))
+    return np.concatenate(pixels)
+
+
+def inverse_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
+    """Mean inverse depth ``[N]`` of the 5x5 pixels around `pixels` ``[N, 2]``; NaN at edges, holes and outside."""
+    height, width = depth.shape
+    place: Array = np.asarray(np.round(pixels))
+    ahead, before = (place >= 2).all(axis=1), (place < (width - 2, height - 2)).all(axis=1)
+    inside = np.asarray(np.isfinite(place).all(axis=1) & ahead & before)
+    u, v = np.where(inside[:, None], place, 2).astype(np.intp).T
+    around = np.arange(-2, 3)
+    patch = depth[v[:, None, None] + around[:, None], u[:, None, None] + around].reshape(len(u), 25).astype(np.float64)
+    measured = patch > 0
+    inverse = 1 / np.where(measured, patch, 1.0)
+    count = measured.sum(axis=1)
+    mean = (inverse * measured).sum(axis=1) / np.maximum(count, 1)
+    spread = np.where(measured, inverse, -np.inf).max(axis=1) - np.where(measured, inverse, np.inf).min(axis=1)
+    return np.where(inside & (count >= 20) & (spread < 0.12 * mean), mean, np.nan)
+
 
 LEAST_POINTS = 15
 LARGEST_NOISE_PX = 3.0
@@ -89,17 +168,17 @@ class Window:
             if usable.sum() < LEAST_POINTS:
                 raise Unusable("too few points with depth can be followed")
             points = self.camera.unproject(self.xy[usable, i], 1 / self.inverse_depth[usable, i])
-            seen = self.xy[usable, i + 1]
-            found, turn, shift, inliers = cv2.solvePnPRansac(
-                points, seen, matrix, None, iterationsCount=200, reprojectionError=3.0, flags=cv2.SOLVEPNP_EPNP
+            pixels = self.xy[usable, i + 1]
+            success, turn, shift, inliers = cv2.solvePnPRansac(
+                points, pixels, matrix, None, iterationsCount=200, reprojectionError=3.0, flags=cv2.SOLVEPNP_EPNP
             )
-            if not found or inliers is None or len(inliers) < max(LEAST_POINTS // 2, 0.4 * len(points)):
+            if not success or inliers is None or len(inliers) < max(LEAST_POINTS // 2, 0.4 * len(points)):
                 raise Unusable("the points do not move as one rigid scene")
             chosen = inliers[:, 0]
-            turn, shift = cv2.solvePnPRefineLM(points[chosen], seen[chosen], matrix, None, turn, shift)
+            turn, shift = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], matrix, None, turn, shift)
             step = np.eye(4)
             step[:3, :3], step[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-            error = np.linalg.norm(self.camera.project(points @ step[:3, :3].T + step[:3, 3]) - seen, axis=1)
+            error = np.linalg.norm(self.camera.project(points @ step[:3, :3].T + step[:3, 3]) - pixels, axis=1)
             moving = np.flatnonzero(usable)[~(error < 6.0)]
             self.xy[moving, i + 1 :] = self.inverse_depth[moving, i + 1 :] = np.nan
             T.append(step @ T[-1])
@@ -128,7 +207,7 @@ class Window:
             & (times < 1.5 * self.stamps[-1] - 0.5 * self.stamps[-2]),
         )
 
-    def _seen(self, moment: _Moment) -> Array:
+    def _in_camera(self, moment: _Moment) -> Array:
         """The points ``[L, n, 3]`` in the camera at a moment."""
         return np.asarray((moment.R @ (self.points[:, None] - moment.centre)[..., None])[..., 0])
 
@@ -140,11 +219,11 @@ class Window:
 
     def measure_noise(self, readout_s: float) -> None:
         """Take the noise of pixels and of inverse depth from the median residuals."""
-        residuals = self._residuals(self._seen(self._at(self.late * readout_s)))
+        residuals = self._residuals(self._in_camera(self._at(self.late * readout_s)))
         error, depth = np.hypot(residuals[..., 0], residuals[..., 1]), np.abs(residuals[..., 2])
-        seen, deep = np.isfinite(error), np.isfinite(depth)
-        if seen.any() and deep.any():
-            self.noise = max(np.median(error[seen]) / 1.177, 0.05), max(1.4826 * np.median(depth[deep]), 1e-6)
+        valid, deep = np.isfinite(error), np.isfinite(depth)
+        if valid.any() and deep.any():
+            self.noise = max(np.median(error[valid]) / 1.177, 0.05), max(1.4826 * np.median(depth[deep]), 1e-6)
 
     def turning_change(self) -> float:
         """Root mean square change of the turning rate within the window, rad/s."""
@@ -152,13 +231,13 @@ class Window:
         return float(np.sqrt(((rates - rates.mean(0)) ** 2).sum(1).mean()))
 
     def move_depth(self, readout_s: float, delay_s: float) -> None:
-        """Carry each depth from its image's time to its pixel's, with the motion as it is known.
+        """Carry each depth from its image's time to its pixel's, with the motion as estimated so far.
 
         Args:
             readout_s: Readout time; the depth image's rows are taken to be read as the colour image's are.
             delay_s: By which the depth images are exposed later than their stamps say.
         """
-        now = self._seen(self._at(self.late * readout_s))
+        now = self._in_camera(self._at(self.late * readout_s))
         self.inverse_depth, before, after = (
             self._depth_at(now, readout_s, delay_s + step) for step in (0.0, -_DIFFERENCE_S, _DIFFERENCE_S)
         )
@@ -169,16 +248,16 @@ class Window:
     def _depth_at(self, now: Array, readout_s: float, delay_s: float) -> Array:
         """Inverse depth ``[L, n]`` at the pixels' time of images exposed `delay_s` after their stamps."""
         moment = self._at(self.late * readout_s + self.offsets + delay_s)
-        then = self._seen(moment)
+        then = self._in_camera(moment)
         inverse_now, inverse_then = 1 / np.maximum(now[..., 2:], 1e-3), 1 / np.maximum(then[..., 2:], 1e-3)
         shift = (then[..., :2] * inverse_then - now[..., :2] * inverse_now) * (self.camera.fx, self.camera.fy)
         place = np.where(moment.within[..., None] & np.isfinite(self.xy), self.raw + shift, np.nan)
-        found = np.stack([inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)], axis=1)
-        return np.asarray(found - (inverse_then - inverse_now)[..., 0])
+        observed = np.stack([inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)], axis=1)
+        return np.asarray(observed - (inverse_then - inverse_now)[..., 0])
 
     def depth_cost(self, readout_s: float, delay_s: float) -> tuple[float, int]:
         """Robust cost of the depth images under a delay, and how many depths it sums."""
-        now = self._seen(self._at(self.late * readout_s))
+        now = self._in_camera(self._at(self.late * readout_s))
         error = (1 / np.maximum(now[..., 2], 1e-3) - self._depth_at(now, readout_s, delay_s)) / self.noise[1]
         valid = np.isfinite(error)
         return float(np.log1p((error[valid] / CAUCHY) ** 2).sum()), int(valid.sum())
@@ -187,7 +266,7 @@ class Window:
         """Gauss-Newton's normal equations about the state, the points eliminated."""
         L, n = len(self.xy), len(self.stamps)
         moment = self._at(self.late * readout_s)
-        points = self._seen(moment)
+        points = self._in_camera(moment)
         residuals = self._residuals(points)
         pixels, depth = self.noise
         error = np.hypot(residuals[..., 0], residuals[..., 1]) / pixels

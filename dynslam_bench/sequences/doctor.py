@@ -11,15 +11,13 @@ import numpy as np
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
 from dynslam_bench.geometry.camera import Camera
-
-from .finding import Finding
-from .rgbd_motion import RgbdPair, rgbd_pairs
-from .stream_checks import Streams, stream_findings
-from .truth_checks import RESAVE, truth_findings
+from dynslam_bench.sequences.rgbd_motion import RgbdPair, rgbd_pairs
+from dynslam_bench.sequences.stream_checks import Finding, Streams, fault, note, stream_findings
+from dynslam_bench.sequences.truth_checks import RESAVE, truth_findings
 
 MOST_FRAMES = 240
 FEWEST = 10
-"""Frames below which nothing but single images is judged."""
+"""Frames below which only single images are checked."""
 STRETCH = 40
 """Frames that are read one after the other: more than a second, for delays and shifts in time."""
 
@@ -73,7 +71,7 @@ def diagnose(
         most_frames: Frames that are read at most, in stretches spread over the recording.
         progress: Called with the frames done and the frames to do.
     """
-    from .catalogue import open_sequence
+    from dynslam_bench.sequences.catalogue import open_sequence
 
     try:
         sequence = open_sequence(name, data_root=data_root, camera=camera)
@@ -118,15 +116,15 @@ def examine(
     if unreadable:
         text = f"{len(unreadable)} of {todo} frames cannot be read; {unreadable[0]}"
         cure = "export or fetch these files again, or remove them from the lists"
-        findings.append(Finding("unreadable", "fault", float(len(unreadable)), "frames", text, cure))
+        findings.append(fault("unreadable", len(unreadable), "frames", text, cure))
     if not streams.frames:
         return Diagnosis(sequence.id, 0, tuple(findings))
     if streams.frames < FEWEST:
         text = f"too few frames ({streams.frames}): motion, delays and truth cannot be compared"
-        findings.append(Finding("too-short", "note", float(streams.frames), "frames", text, "check a longer part"))
-    found = stream_findings(streams, with_depth)
-    findings += found
-    if streams.frames >= FEWEST and not any(finding.severity == "fault" for finding in found):
+        findings.append(note("too-short", streams.frames, "frames", text, "check a longer part"))
+    in_streams = stream_findings(streams, with_depth)
+    findings += in_streams
+    if streams.frames >= FEWEST and not any(finding.severity == "fault" for finding in in_streams):
         findings += truth_findings(sequence.timestamps, sequence.ground_truth, sequence.camera, pairs)
     findings.sort(key=lambda finding: finding.severity != "fault")
     return Diagnosis(sequence.id, streams.frames, tuple(findings))
@@ -145,8 +143,8 @@ def _unopened(
     name: str | Path, data_root: str | Path | None, camera: str | Path | Camera | None, error: Exception
 ) -> Finding:
     """Why a recording cannot be opened: depth of another size is a fault of its own, the rest is said as it is."""
-    from .catalogue import open_sequence
-    from .settings import PreprocessingSettings
+    from dynslam_bench.sequences.catalogue import open_sequence
+    from dynslam_bench.sequences.settings import PreprocessingSettings
 
     any_size = PreprocessingSettings(width=64, height=48)
     try:
@@ -156,17 +154,17 @@ def _unopened(
     except (DynslamError, OSError, ValueError):
         text, cure = _message(error), getattr(error, "hint", "")
         if isinstance(error, TrajectoryError):
-            return Finding("unreadable", "fault", None, "", text, cure or RESAVE)
+            return fault("unreadable", None, "", text, cure or RESAVE)
         kind = "unreadable"
         if isinstance(error, SequenceError) and text.startswith("depth image"):
             kind = "depth-format"
         elif text.endswith("nor a folder depth"):
             kind, cure = "no-depth", "record or export depth images: a folder is read only with depth"
-        return Finding(kind, "fault", None, "", text, cure or "docs/sequences.md says what a folder holds")
+        return fault(kind, None, "", text, cure or "docs/sequences.md says what a folder holds")
     (height, width), (rows, columns) = frame.rgb.shape[:2], frame.depth.shape
     text = f"depth images are {columns}x{rows}, colour images {width}x{height}"
     cure = "register the depth to the colour images, pixel by pixel; resizing serves only if both have one view"
-    return Finding("depth-size", "fault", columns / width, "", text, cure)
+    return fault("depth-size", columns / width, "", text, cure)
 
 
 def _message(error: Exception) -> str:

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from dynslam_bench.core.download import MOST_BYTES, Report, download, file_sha256
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.harmless import inside, is_inside
-from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core.reading import read_lines, read_text
 from dynslam_bench.core.records import Record, schema
-
-from . import first_use
-from .catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
-from .published.archives import extract
-from .published.cameras import find_camera
-from .readers.diagnostics import Dropped
-from .readers.layouts import TUM, find_layout, layout_of
+from dynslam_bench.core.sanitise import inside, is_inside, without_passwords
+from dynslam_bench.sequences.archives import extract
+from dynslam_bench.sequences.cameras import find_camera
+from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
+from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of
+from dynslam_bench.sequences.readers.lists import Dropped
 
 RECEIPT = "fetched.json"
 MANIFEST = "manifest.sha256"
@@ -76,15 +75,8 @@ class Verification:
         return not self.faults
 
 
-@dataclass(frozen=True)
-class Part:
-    """An archive that was downloaded.
-
-    Attributes:
-        address: Where it came from.
-        archive: The file.
-        sha256: Its checksum.
-    """
+class Download(NamedTuple):
+    """An archive that was downloaded: its address, the file and its checksum."""
 
     address: str
     archive: Path
@@ -130,7 +122,7 @@ def fetch(
 ) -> Path:
     """Download and extract a public sequence; one that is here already is left alone.
 
-    Whatever goes wrong, no half sequence appears, and the next call goes on where this one stopped.
+    After any failure no partial sequence is left, and the next call resumes where this one stopped.
 
     Args:
         name: Id or published folder name.
@@ -150,52 +142,64 @@ def fetch(
     Raises:
         SequenceError: Unknown id, one that has to be got by hand, or a faulty download or archive.
     """
-    found = status(name, data_root=data_root)
-    if found.folder is not None:
-        return found.folder
-    entry, root = found.entry, find_data_root(data_root)
+    entry, root = _known(name), find_data_root(data_root)
+    folder = entry.find(root)
+    if folder is not None:
+        return folder
     if entry.by_hand:
         raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
-    how: dict[str, Any] = {"attempts": attempts, "wait_s": wait_s, "timeout_s": timeout_s, "progress": progress}
-    parts = _downloaded(entry, (url or entry.url, *entry.more_urls), root, checksum, how)
-    unstated = [part for part in parts if part is not parts[0] or entry.sha256 is None]
-    for part in unstated if checksum else ():
-        first_use.compare(root, part.address, part.archive, part.sha256)
-    _take(found, parts, checksum and entry.sha256 is not None, progress)
-    for part in unstated:
-        first_use.remember(root, part.address, part.sha256)
-    for part in () if keep_archive else parts:
-        part.archive.unlink(missing_ok=True)
-    return found.place
-
-
-def _downloaded(
-    entry: CatalogueEntry, addresses: tuple[str, ...], root: Path, checksum: bool, how: dict[str, Any]
-) -> list[Part]:
-    """The archives of a sequence; the checksum that the catalogue may know is the first one's."""
-    how["most_bytes"] = (entry.size_bytes if checksum else None) or MOST_BYTES
-    parts: list[Part] = []
-    for address in addresses:
+    parts: list[Download] = []
+    for address in (url or entry.url, *entry.more_urls):
+        expected = entry.sha256 if checksum and not parts else None  # the catalogue knows the first archive's only
         archive = root / ".downloads" / _archive_name(address, entry)
-        expected = entry.sha256 if checksum and not parts else None
+        most_bytes = (entry.size_bytes if checksum else None) or MOST_BYTES
         try:
-            sha256 = download(address, archive, sha256=expected, **how)
+            sha256 = download(
+                address, archive, sha256=expected, most_bytes=most_bytes, attempts=attempts, wait_s=wait_s,
+                timeout_s=timeout_s, progress=progress,
+            )  # fmt: skip
         except DownloadError as error:
             raise SequenceError(str(error.args[0]), error.hint) from error
-        parts.append(Part(address, archive, sha256))
-    return parts
+        parts.append(Download(address, archive, sha256))
+    unstated = parts if entry.sha256 is None else parts[1:]
+    for part in unstated if checksum else ():
+        _compare_checksum(root, part)
+    place = entry.folders(root)[0]
+    _install(entry, place, parts, checksum and entry.sha256 is not None, progress)
+    for part in unstated:  # only of archives whose sequence could be opened
+        write_atomic(_checksum_file(root, part), f"{part.sha256}  {without_passwords(part.address)}\n")
+    for part in () if keep_archive else parts:
+        part.archive.unlink(missing_ok=True)
+    return place
 
 
-def _take(found: Status, parts: list[Part], checked: bool, progress: Report | None) -> None:
-    """Let the sequence appear; an archive that is at fault goes, so that the next call fetches it anew."""
+def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked: bool, progress: Report | None) -> None:
+    """Let the sequence appear if it can be opened; a faulty archive is deleted, so that the next call fetches it."""
     first = parts[0].archive
     try:
-        _extract(found, parts, checked, progress)
+        with atomic_folder(place) as work:
+            sums = _unpack(parts, work, progress)
+            top = _top(work, entry, first)
+            prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
+            files = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
+            receipt = Receipt(
+                id=entry.id,
+                url=parts[0].address,
+                sha256=parts[0].sha256,
+                size_bytes=first.stat().st_size,
+                checked=checked,
+                files=len(files),
+            )
+            write_atomic(top / RECEIPT, receipt.to_json())
+            write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(files.items())))
+            open_folder(top, entry=entry)
+            if top != work:
+                _lift(top, work)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise SequenceError(f"cannot extract {first.name} into {found.place.parent}: {error.strerror}") from error
+            raise SequenceError(f"cannot extract {first.name} into {place.parent}: {error.strerror}") from error
         raise SequenceError(
-            f"no room to extract {first.name} ({first.stat().st_size / 1e9:.2f} GB) into {found.place.parent}",
+            f"no room to extract {first.name} ({first.stat().st_size / 1e9:.2f} GB) into {place.parent}",
             "make room and run the same command again, the archive is kept",
         ) from error
     except SequenceError:
@@ -204,29 +208,7 @@ def _take(found: Status, parts: list[Part], checked: bool, progress: Report | No
         raise
 
 
-def _extract(found: Status, parts: list[Part], checked: bool, progress: Report | None) -> None:
-    """Unpack archives, note where they are from and what is in them; the sequence appears if it can be opened."""
-    with atomic_folder(found.place) as work:
-        sums = _unpack(parts, work, progress)
-        top = _top(work, found.entry, parts[0].archive)
-        prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
-        inside = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
-        receipt = Receipt(
-            id=found.entry.id,
-            url=parts[0].address,
-            sha256=parts[0].sha256,
-            size_bytes=parts[0].archive.stat().st_size,
-            checked=checked,
-            files=len(inside),
-        )
-        write_atomic(top / RECEIPT, receipt.to_json())
-        write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(inside.items())))
-        open_folder(top, entry=found.entry)
-        if top != work:
-            _lift(top, work)
-
-
-def _unpack(parts: list[Part], work: Path, progress: Report | None) -> dict[str, str]:
+def _unpack(parts: list[Download], work: Path, progress: Report | None) -> dict[str, str]:
     """Unpack archives over one another; SHA-256 of each file by its path. What two of them hold has to be the same."""
     sums = extract(parts[0].archive, work, progress)
     for part in parts[1:]:
@@ -336,3 +318,22 @@ def _known(name: str) -> CatalogueEntry:
             raise SequenceError(f"'{name}' needs no fetching", "rendered sequences appear when they are first read")
         raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, catalogue()))
     return entry
+
+
+def _compare_checksum(root: Path, part: Download) -> None:
+    """Refuse and delete an archive that is not what its address gave before, where no publisher states a checksum."""
+    path = _checksum_file(root, part)
+    if not path.is_file():
+        return
+    first = (read_text(path, kind=SequenceError).split() or ["none"])[0]
+    if first != part.sha256:
+        part.archive.unlink(missing_ok=True)  # the next call fetches it again
+        raise SequenceError(
+            f"{without_passwords(part.address)} has the checksum {part.sha256}, but gave {first} before",
+            f"the file has changed; --no-checksum takes it all the same, and {path} says what came first",
+        )
+
+
+def _checksum_file(root: Path, part: Download) -> Path:
+    """One file an address, so that several processes may fetch at a time."""
+    return root / ".downloads" / f"{hashlib.sha256(without_passwords(part.address).encode()).hexdigest()[:16]}.sha256"

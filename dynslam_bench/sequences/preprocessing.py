@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.camera import Camera
-
-from .settings import PreprocessingSettings
+from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences.view import Masks
 
 Image = NDArray[np.integer | np.floating]
 
@@ -24,29 +24,33 @@ class Preprocessed:
         base: The sequence as recorded. Its depth images may differ in size from its colour images if a common
             resolution is asked for.
         settings: What to do.
+
+    Attributes:
+        camera: Intrinsics of the images after preprocessing.
     """
 
     def __init__(self, base: Sequence, settings: PreprocessingSettings) -> None:
         self.base = base
         self.settings = settings
-        self._camera = preprocessed_camera(base.camera, settings)
+        self.camera = preprocessed_camera(base.camera, settings)
         self._maps: dict[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
 
     def __getattr__(self, name: str) -> object:
-        if name.startswith("__") or name in ("base", "settings", "_camera", "_maps"):  # not yet set while unpickling
+        if name.startswith("__") or name in ("base", "settings", "camera", "_maps"):  # not yet set while unpickling
             raise AttributeError(name)
         return getattr(self.base, name)
-
-    @property
-    def camera(self) -> Camera:
-        """Intrinsics of the images after preprocessing."""
-        return self._camera
 
     @property
     def masks(self) -> MaskSource | None:
         """Masks of the base sequence, undistorted and resized like the depth image."""
         source = self.base.masks
-        return None if source is None else _PreprocessedMasks(source, self)
+        return None if source is None else Masks(lambda index: self._masks_of(source[index]))
+
+    def _masks_of(self, masks: FrameMasks) -> FrameMasks:
+        kind = masks.instances.dtype
+        narrow = kind if kind in (np.uint8, np.int16, np.uint16) else np.int16  # what OpenCV can remap
+        instances = self._geometry(masks.instances.astype(narrow), colour=False).astype(kind)
+        return FrameMasks(instances, masks.class_names, masks.moving)
 
     def digest(self) -> str:
         """Digest of the base sequence and of the settings."""
@@ -65,7 +69,7 @@ class Preprocessed:
             maps = self._undistortion((image.shape[1], image.shape[0]))
             interpolation = cv2.INTER_LINEAR if colour else cv2.INTER_NEAREST
             image = cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return resize(image, self._camera.width, self._camera.height, colour=colour)
+        return resize(image, self.camera.width, self.camera.height, colour=colour)
 
     def _undistortion(self, size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         if size not in self._maps:
@@ -75,19 +79,6 @@ class Preprocessed:
             )
             self._maps[size] = (np.asarray(map_x, dtype=np.float32), np.asarray(map_y, dtype=np.float32))
         return self._maps[size]
-
-
-class _PreprocessedMasks:
-    def __init__(self, source: MaskSource, owner: Preprocessed) -> None:
-        self._source = source
-        self._owner = owner
-
-    def __getitem__(self, index: int) -> FrameMasks:
-        masks = self._source[index]
-        kind = masks.instances.dtype
-        narrow = kind if kind in (np.uint8, np.int16, np.uint16) else np.int16  # what OpenCV can remap
-        instances = self._owner._geometry(masks.instances.astype(narrow), colour=False).astype(kind)
-        return FrameMasks(instances, masks.class_names, masks.moving)
 
 
 def preprocessed_camera(camera: Camera, settings: PreprocessingSettings) -> Camera:

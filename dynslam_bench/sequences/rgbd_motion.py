@@ -1,8 +1,12 @@
-"""The camera's motion between frames of one RGB-D sequence, measured by tracked corners and their depth."""
+"""The camera's motion between frames of an RGB-D sequence, and the agreement of a ground truth with it.
+
+The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from collections.abc import Sequence as PySequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.float32]
@@ -109,10 +115,10 @@ def relative_pose(
     nothing = np.zeros(len(pixels_first), bool)
     points = camera.unproject(pixels_first, depth_first)
     cv2.setRNGSeed(0)
-    found, rotation, translation, index = cv2.solvePnPRansac(
+    success, rotation, translation, index = cv2.solvePnPRansac(
         points, pixels_second, camera.matrix, None, iterationsCount=200, reprojectionError=INLIER_PX, confidence=0.999
     )
-    if not found or index is None or len(index) < max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points)):
+    if not success or index is None or len(index) < max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points)):
         return nothing, None
     inliers = nothing.copy()
     inliers[np.asarray(index).reshape(-1)] = True
@@ -130,14 +136,14 @@ def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
     window = np.ones((5, 5), np.uint8)
     near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
     mask = ((near > 0) & (far - near < _DEPTH_EDGE * near)).astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(6, gray.shape[1] // 60), mask=mask)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
+    corners = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(6, gray.shape[1] // 60), mask=mask)
+    return np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners, np.float32).reshape(-1, 2)
 
 
 def _track(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Pixels) -> tuple[Pixels, NDArray[np.bool_]]:
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.empty_like(points), maxLevel=4)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(points), maxLevel=4)
-    good = (found.reshape(-1) == 1) & (found_back.reshape(-1) == 1)
+    there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.empty_like(points), maxLevel=4)
+    back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(points), maxLevel=4)
+    good = (status.reshape(-1) == 1) & (status_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < _BACK_AND_FORTH_PX
     height, width = after.shape
     good &= (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
@@ -147,3 +153,191 @@ def _track(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Pixels) 
 def _at(depth: NDArray[np.float32], pixels: Pixels) -> Array:
     x, y = np.round(pixels).astype(int).T
     return np.asarray(depth[y, x], dtype=np.float64)
+
+
+# Motions of a ground truth, read in several conventions, compared with the measured ones.
+
+
+READINGS = ("as stored", "inverted", "w first", "w first, inverted", "rotations inverted")
+ROTATION_NOISE = np.radians(0.25)
+TRANSLATION_NOISE = 0.006
+"""Of a measured motion: as a part of the median depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Measured motions between pairs of frames.
+
+    Attributes:
+        start: Stamps of the first frames ``[N]``.
+        end: Stamps of the second frames ``[N]``.
+        rotation: Rotation vectors ``[N, 3]`` in rad.
+        translation: Translations ``[N, 3]`` in metres of the depth images.
+        depth_m: Median depth of the corners.
+    """
+
+    start: Array
+    end: Array
+    rotation: Array
+    translation: Array
+    depth_m: float
+
+    def select(self, index: NDArray[np.bool_]) -> Motions:
+        """Some of them."""
+        return Motions(self.start[index], self.end[index], self.rotation[index], self.translation[index], self.depth_m)
+
+
+def motions_of(pairs: PySequence[RgbdPair], stamps: Array) -> Motions:
+    """The motions of pairs that have one."""
+    twists = se3.log(np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4))
+    poses = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
+    first, second = [pair.first for pair in pairs], [pair.second for pair in pairs]
+    depths = [float(np.median(pair.depth_first[pair.inliers])) for pair in pairs]
+    median = float(np.median(depths)) if depths else 1.0
+    return Motions(stamps[first], stamps[second], twists[:, 3:], poses[:, :3, 3], median)
+
+
+class TruthMotion:
+    """A truth that is asked for motions at any stamps: poses between its own are interpolated.
+
+    Args:
+        truth: Poses at their stamps.
+        reading: How to read them, one of `READINGS`.
+    """
+
+    def __init__(self, truth: Trajectory, reading: str = READINGS[0]) -> None:
+        self.stamps = truth.timestamps
+        self.poses = read_as(truth.T_world_cam, reading)
+        steps = se3.inverse(self.poses[:-1]) @ self.poses[1:]
+        self._turns = se3.log(steps)[:, 3:] if len(steps) else np.zeros((0, 3))
+        gaps = np.diff(self.stamps)
+        self._widest = max(0.12, 2.5 * float(np.median(gaps))) if len(gaps) else 0.0
+
+    def at(self, stamps: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses ``[N, 4, 4]`` and whether the truth has them: not beyond its ends nor in its holes."""
+        if len(self.stamps) < 2:
+            return np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
+        index = np.clip(np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2)
+        low, high = self.stamps[index], self.stamps[index + 1]
+        share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
+        poses = self.poses[index].copy()
+        turn = np.zeros((len(stamps), 6))
+        turn[:, 3:] = share * self._turns[index]
+        poses[:, :3, :3] = poses[:, :3, :3] @ se3.exp(turn)[:, :3, :3]
+        poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
+        slack = 0.005
+        inside = (stamps >= self.stamps[0] - slack) & (stamps <= self.stamps[-1] + slack)
+        return poses, inside & (high - low <= self._widest)
+
+    def between(self, start: Array, end: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Poses at `start`, relative poses from there to `end`, their rotation vectors, and which of them there are."""
+        first, valid = self.at(start)
+        second, valid_too = self.at(end)
+        relative = se3.inverse(first) @ second
+        return first, relative, se3.log(relative)[:, 3:], valid & valid_too
+
+
+def read_as(poses: Array, reading: str) -> Array:
+    """Poses ``[N, 4, 4]`` of a file that was written in the convention `reading` and read as if in TUM's."""
+    if reading == READINGS[0]:
+        return poses
+    if reading == "inverted":
+        return se3.inverse(poses)
+    if reading == "rotations inverted":
+        turned = poses.copy()
+        turned[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+        return turned
+    position, quaternion = se3.to_quaternion(poses)
+    turned = se3.from_quaternion(position, quaternion[:, [1, 2, 3, 0]])
+    return se3.inverse(turned) if reading == "w first, inverted" else turned
+
+
+def agreement(measured: Array, true: Array, gain: float) -> float:
+    """How well vectors ``[N, 3]`` agree up to a gain: 1 - the weighted median of their relative differences.
+
+    1 is perfect; independent directions give some 0.3; less is the opposite.
+    """
+    true = gain * true
+    size = np.linalg.norm(measured, axis=1) + np.linalg.norm(true, axis=1)
+    off = np.linalg.norm(measured - true, axis=1) / np.maximum(size, 1e-12)
+    order = np.argsort(off)
+    total = np.cumsum(size[order])
+    if not len(total) or total[-1] <= 0:
+        return 0.0
+    return 1.0 - float(off[order][np.searchsorted(total, total[-1] / 2)])
+
+
+def best_gain(measured: Array, true: Array, low: float, high: float) -> float:
+    """The ratio of the lengths of vectors, by their weighted sums, within bounds."""
+    a, b = np.linalg.norm(measured, axis=1).sum(), np.linalg.norm(true, axis=1).sum()
+    return float(np.clip(a / max(b, 1e-12), low, high))
+
+
+def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Array:
+    """The orthogonal matrix ``[3, 3]`` that turns `measured` ``[N, 3]`` into `true` best, by three robust rounds."""
+    weight = np.ones(len(measured))
+    X = np.eye(3)
+    gain = 1.0 / best_gain(measured, true, 1e-6, 1e6)
+    for _ in range(4):
+        left, _, right = np.linalg.svd((true * weight[:, None]).T @ measured)
+        sign = np.linalg.det(left @ right) if proper else 1.0
+        X = left @ np.diag([1.0, 1.0, sign]) @ right
+        off = np.linalg.norm(true - gain * measured @ X.T, axis=1)
+        weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-12)) ** 2)
+    return np.asarray(X)
+
+
+@dataclass(frozen=True)
+class Match:
+    """How well a truth, read in one convention and shifted in time, agrees with the measured motions.
+
+    Attributes:
+        reading: One of `READINGS`.
+        shift_s: What is added to the images' stamps to find their poses.
+        rotation: `agreement` of the rotations.
+        translation: `agreement` of the translations.
+        weights: What either counts: near 1 where the motion is far above the noise.
+        gain: Ratio of the lengths of the measured translations to the true ones.
+        share: Part of the motions for which the truth has poses.
+    """
+
+    reading: str
+    shift_s: float
+    rotation: float
+    translation: float
+    weights: tuple[float, float]
+    gain: float
+    share: float
+
+    @property
+    def total(self) -> float:
+        """Weighted mean of both agreements."""
+        w = self.weights
+        return (w[0] * self.rotation + w[1] * self.translation) / max(w[0] + w[1], 1e-9)
+
+    @property
+    def clearest(self) -> float:
+        """The same, or the rotations' agreement where it is better and they are clear: people spoil it least."""
+        return max(self.total, self.rotation) if self.weights[0] >= 0.5 else self.total
+
+
+def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) -> Match:
+    """Compare the motions with those of a truth under a shift in time."""
+    _, relative, turns, valid = truth.between(motions.start + shift_s, motions.end + shift_s)
+    share = float(valid.mean()) if len(valid) else 0.0
+    if valid.sum() < 5:
+        return Match(reading, shift_s, 0.0, 0.0, (0.0, 0.0), 1.0, share)
+    v, tau = motions.rotation[valid], motions.translation[valid]
+    rho, turns = relative[valid, :3, 3], turns[valid]
+    snr = float(np.median(np.linalg.norm(v, axis=1))) / ROTATION_NOISE
+    snr_t = float(np.median(np.linalg.norm(tau, axis=1))) / (TRANSLATION_NOISE * motions.depth_m)
+    gain = best_gain(tau, rho, 1e-6, 1e6)
+    return Match(
+        reading,
+        shift_s,
+        agreement(v, turns, best_gain(v, turns, 0.4, 2.5)),
+        agreement(tau, rho, gain),
+        (snr**2 / (4 + snr**2), snr_t**2 / (4 + snr_t**2)),
+        gain,
+        share,
+    )

@@ -34,34 +34,17 @@ class PreprocessingSettings(Settings):
         default=False, description="remove the lens distortion (colour bilinear, depth nearest neighbour)"
     )
     normalisation: Normalisation = tunable("none", meaning="brightness and contrast normalisation of the colour image")
-    clahe_clip: float = tunable(
-        2.0, low=1.0, high=8.0, scale="log", limits=(0.01, 100.0), when={"normalisation": ["clahe"]},
-        meaning="contrast limit of the adaptive histogram equalisation",
+    clahe_clip: float = Field(
+        2.0, ge=0.01, le=100.0, description="contrast limit of the adaptive histogram equalisation (`clahe`)"
+    )
+    clahe_tiles: int = Field(8, ge=1, le=64, description="tiles along each side of the image (`clahe`)")
+    target_mean: float = Field(
+        0.45, ge=0.0, le=1.0, description="mean luminance after normalisation, of [0, 1] (`mean-std`)"
+    )
+    target_std: float = Field(
+        0.22, ge=0.001, le=1.0,
+        description="standard deviation of the luminance after normalisation, of [0, 1] (`mean-std`)",
     )  # fmt: skip
-    clahe_tiles: int = tunable(
-        8,
-        low=2,
-        high=16,
-        limits=(1, 64),
-        when={"normalisation": ["clahe"]},
-        meaning="tiles along each side of the image in the adaptive histogram equalisation",
-    )
-    target_mean: float = tunable(
-        0.45,
-        low=0.3,
-        high=0.6,
-        limits=(0.0, 1.0),
-        when={"normalisation": ["mean-std"]},
-        meaning="mean luminance after normalisation, of [0, 1]",
-    )
-    target_std: float = tunable(
-        0.22,
-        low=0.1,
-        high=0.35,
-        limits=(0.001, 1.0),
-        when={"normalisation": ["mean-std"]},
-        meaning="standard deviation of the luminance after normalisation, of [0, 1]",
-    )
 
     @field_validator("height")
     @classmethod

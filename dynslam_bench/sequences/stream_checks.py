@@ -8,6 +8,7 @@ are synchronous.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,7 +16,37 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame
 
-from .finding import Finding
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check of a recording found.
+
+    Attributes:
+        id: Stable name, for example ``truth-time-shift``.
+        severity: ``fault``: results on the recording are wrong until it is mended; ``note``: good to know.
+        value: The measured number; None where nothing is measured.
+        unit: Its unit, for example ``s``; empty for a ratio or where nothing is measured.
+        text: One line that says what was measured.
+        cure: What to change, and in which file.
+    """
+
+    id: str
+    severity: Literal["fault", "note"]
+    value: float | None
+    unit: str
+    text: str
+    cure: str
+
+
+def fault(id: str, value: float | None, unit: str, text: str, cure: str) -> Finding:
+    """A finding that makes results on the recording wrong."""
+    return Finding(id, "fault", None if value is None else float(value), unit, text, cure)
+
+
+def note(id: str, value: float | None, unit: str, text: str, cure: str) -> Finding:
+    """A finding that is good to know."""
+    return Finding(id, "note", None if value is None else float(value), unit, text, cure)
+
 
 Map = NDArray[np.float32]
 
@@ -89,8 +120,8 @@ class Streams:
 
     def _correlate(self, colour_maps: list[Map], depth_maps: list[Map]) -> None:
         shape = colour_maps[0].shape
-        colours = [np.fft.rfft2(each) for each in colour_maps]
-        depths = [np.conj(np.fft.rfft2(each)) for each in depth_maps]
+        colours = [np.fft.rfft2(colour) for colour in colour_maps]
+        depths = [np.conj(np.fft.rfft2(depth)) for depth in depth_maps]
         sums = np.zeros((2 * MOST_DELAY + 1, *colours[0].shape), np.complex128)
         for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
             for index in range(0, len(colours), 2):
@@ -106,7 +137,7 @@ class Streams:
             )
             surface = np.fft.irfft2(flipped, s=shape).astype(np.float32)
             self.by_flip[name] = self.by_flip.get(name, np.zeros_like(surface)) + surface
-        smooth = [np.stack([cv2.GaussianBlur(each, (0, 0), 1.0).ravel() for each in maps])
+        smooth = [np.stack([cv2.GaussianBlur(contours, (0, 0), 1.0).ravel() for contours in maps])
                   for maps in (colour_maps, depth_maps)]  # fmt: skip
         products = smooth[0] @ smooth[1].T
         scores = np.full((len(products), 2 * MOST_DELAY + 1), np.nan)
@@ -145,10 +176,9 @@ def _depth_contours(depth: Map, cell: int) -> Map:
     near = cv2.erode(
         np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3)).astype(np.float32), np.ones((3, 3), np.uint8)
     )
-    known = (far > 0) & np.isfinite(near)
-    return np.where(known, np.minimum(np.log(np.where(known, far / np.where(known, near, 1), 1)), 0.3), 0).astype(
-        np.float32
-    )
+    valid = (far > 0) & np.isfinite(near)
+    steps = np.log(np.where(valid, far / np.where(valid, near, 1), 1))
+    return np.where(valid, np.minimum(steps, 0.3), 0).astype(np.float32)
 
 
 def _standardised(values: Map) -> Map:
@@ -175,42 +205,33 @@ def stream_findings(streams: Streams, with_depth: bool = True) -> list[Finding]:
         streams: Statistics of the frames that were read.
         with_depth: Whether the sequence announces depth images.
     """
-    if not with_depth:
-        text = "the sequence has no depth images: only the colour images were checked"
-        blank = _no_contrast(streams)
-        return [blank] if blank else [Finding("no-depth", "note", None, "", text, "add depth images to check more")]
-    for check in (_no_contrast, _no_depth, _frozen, _swapped, _units, _flipped, _asynchronous, _shifted):
+    text = "the sequence has no depth images: only the colour images were checked"
+    no_depth = [] if with_depth else [note("no-depth", None, "", text, "add depth images to check more")]
+    for check in (_empty, _frozen, _swapped, _units, _flipped, _asynchronous, _shifted) if with_depth else (_empty,):
         finding = check(streams)
         if finding is not None:
-            return [finding]
-    return []
+            return [finding] if with_depth or finding.id == "colour-blank" else no_depth
+    return no_depth
 
 
-def _no_contrast(streams: Streams) -> Finding | None:
-    if streams.dark < 0.5 * streams.frames:
-        return None
-    text = f"{streams.dark} of {streams.frames} colour images hold one brightness only"
-    return Finding(
-        "colour-blank", "fault", streams.dark / streams.frames, "", text, "record or export the colour again"
-    )
-
-
-def _no_depth(streams: Streams) -> Finding | None:
-    if streams.empty < 0.5 * streams.frames:
-        return None
-    text = f"{streams.empty} of {streams.frames} depth images hold no depth"
-    cure = "record or export the depth again, or use trackers that need none"
-    return Finding("depth-empty", "fault", streams.empty / streams.frames, "", text, cure)
+def _empty(streams: Streams) -> Finding | None:
+    for id, count, text, cure in (
+        ("colour-blank", streams.dark, "colour images hold one brightness only", "record or export the colour again"),
+        ("depth-empty", streams.empty, "depth images hold no depth",
+         "record or export the depth again, or use trackers that need none"),
+    ):  # fmt: skip
+        if count >= 0.5 * streams.frames:
+            return fault(id, count / streams.frames, "", f"{count} of {streams.frames} {text}", cure)
+    return None
 
 
 def _frozen(streams: Streams) -> Finding | None:
     colour, depth = streams.colour_run >= FROZEN_FRAMES, streams.depth_run >= FROZEN_FRAMES
     if colour == depth:  # a rendered camera at rest repeats both; the truth says whether it rests
         return None
-    run, name = (streams.colour_run, "colour") if colour else (streams.depth_run, "depth")
-    other = "depth" if colour else "colour"
+    run, name, other = (streams.colour_run, "colour", "depth") if colour else (streams.depth_run, "depth", "colour")
     text = f"one {name} image is repeated in {run} or more successive frames while the {other} changes"
-    return Finding(f"{name}-frozen", "fault", float(run), "frames", text, f"export the {name} images again")
+    return fault(f"{name}-frozen", run, "frames", text, f"export the {name} images again")
 
 
 def _swapped(streams: Streams) -> Finding | None:
@@ -222,19 +243,17 @@ def _swapped(streams: Streams) -> Finding | None:
         "each value swapped"
     )
     cure = "write the 16-bit depth images in the machine's byte order (PNG stores big-endian by itself)"
-    return Finding("depth-byte-order", "fault", float(stated), "", text, cure)
+    return fault("depth-byte-order", stated, "", text, cure)
 
 
 def _units(streams: Streams) -> Finding | None:
-    median = float(np.median(streams.medians))
+    median, factor = float(np.median(streams.medians)), streams.depth_factor
     if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
         return None
-    text = f"the median depth is {median:.3g} m with {streams.depth_factor:g} raw units a metre"
-    likely = next(
-        (f for f in (1.0, 100.0, 1000.0, 5000.0) if 0.4 < median * streams.depth_factor / f < 8), streams.depth_factor
-    )
+    text = f"the median depth is {median:.3g} m with {factor:g} raw units a metre"
+    likely = next((f for f in (1.0, 100.0, 1000.0, 5000.0) if 0.4 < median * factor / f < 8), factor)
     cure = f"set depth_factor in camera.toml (here perhaps {likely:g}), or store arrays in metres"
-    return Finding("depth-units", "fault", median, "m", text, cure)
+    return fault("depth-units", median, "m", text, cure)
 
 
 def _flipped(streams: Streams) -> Finding | None:
@@ -246,9 +265,7 @@ def _flipped(streams: Streams) -> Finding | None:
         f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard "
         f"deviations so, by {peaks['']:.0f} as stored"
     )
-    return Finding(
-        "colour-flipped", "fault", peaks[best], "sigma", text, "turn the colour images as the depth images are"
-    )
+    return fault("colour-flipped", peaks[best], "sigma", text, "turn the colour images as the depth images are")
 
 
 def _asynchronous(streams: Streams) -> Finding | None:
@@ -279,7 +296,7 @@ def _asynchronous(streams: Streams) -> Finding | None:
         f"({abs(seconds):.2f} s): their contours agree {mean[column] / max(mean[MOST_DELAY], 0.01):.1f} times as well"
     )
     cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt"
-    return Finding("depth-delay", "fault", seconds, "s", text, cure)
+    return fault("depth-delay", seconds, "s", text, cure)
 
 
 def _shifted(streams: Streams) -> Finding | None:
@@ -287,20 +304,19 @@ def _shifted(streams: Streams) -> Finding | None:
         streams.by_shift[MOST_DELAY - 1 : MOST_DELAY + 2]
         / np.maximum(streams.shifted[MOST_DELAY - 1 : MOST_DELAY + 2], 1)[:, None, None]
     )
-    found = [(*_peak(surface, 30), float(surface[y, x])) for surface in middle
-             for y, x in [_peak(surface, 30)[1]]]  # fmt: skip
-    clear, (row, column), height = max(found, key=lambda each: each[2])
+    peaks = [(*_peak(surface, 30), surface) for surface in middle]
+    clear, (row, column), surface = max(peaks, key=lambda peak: float(peak[2][peak[1]]))
     shape = middle.shape[1:]
     down, right = (row + shape[0] // 2) % shape[0] - shape[0] // 2, (column + shape[1] // 2) % shape[1] - shape[1] // 2
     size = float(np.hypot(down, right)) * streams.cell_px
     rolled = np.roll(middle, (2, 2), (1, 2))[:, :5, :5]
-    if size < LEAST_SHIFT_PX or clear < CLEAR_PEAK or height < 1.4 * rolled.max():
+    if size < LEAST_SHIFT_PX or clear < CLEAR_PEAK or surface[row, column] < 1.4 * rolled.max():
         return None
     text = (
         f"the depth lies {size:.0f} pixels beside the colour ({-right * streams.cell_px:+d} right, "
         f"{-down * streams.cell_px:+d} down)"
     )
-    return Finding("depth-not-registered", "fault", size, "px", text, "register the depth to the colour camera")
+    return fault("depth-not-registered", size, "px", text, "register the depth to the colour camera")
 
 
 def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:

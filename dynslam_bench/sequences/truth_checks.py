@@ -1,12 +1,14 @@
-"""Does the ground truth of a recording tell the motion that its images show?
+"""Does the ground truth of a recording agree with the motion that its images show?
 
-The motion between frames (`rgbd_motion`) is compared with that of the truth: as it stands, shifted in time, inverted,
+The motion between frames (`rgbd_motion`) is compared with that of the truth: as stored, shifted in time, inverted,
 with its quaternions read in the other order, in other axes. Where the two agree, camera and depth are measured by them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence as PySequence
+from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +17,12 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import nearest_gap
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .camera_fit import Fit, fit_camera
-from .finding import Finding
-from .rgbd_motion import RgbdPair
-from .truth_motion import (
+from dynslam_bench.sequences.rgbd_motion import (
     READINGS,
     ROTATION_NOISE,
     Match,
     Motions,
+    RgbdPair,
     TruthMotion,
     agreement,
     best_gain,
@@ -31,8 +30,10 @@ from .truth_motion import (
     motions_of,
     rotation_between,
 )
+from dynslam_bench.sequences.stream_checks import Finding, fault, note
 
 Array = NDArray[np.float64]
+total = attrgetter("total")
 
 LARGEST_SHIFT_S = 2.0
 SAME_FRAME_S = 0.02
@@ -40,7 +41,7 @@ LEAST_COVERAGE = 0.15
 LEAST_PAIRS = 8
 REST_PX = 2.0
 GOOD = 0.75
-"""`Match.total` of a truth that tells the motion: healthy recordings have 0.78 to 0.98, other readings up to 0.5."""
+"""`Match.total` of a truth that agrees with the motion; 0.78 to 0.98 in healthy recordings, else up to 0.5."""
 SURE = 0.86
 """The same for a shift in time of a recording that is shorter than the range of shifts searched, or has few pairs: one
 of 160 shifts fits by chance to 0.84."""
@@ -81,10 +82,20 @@ def truth_findings(
     """
     if truth is None:
         text = "there is no ground truth: units of the depth, intrinsics and time were not compared with any"
-        return [Finding("no-truth", "note", None, "", text, "add groundtruth.txt to check more")]
-    uncovered = _coverage(stamps, truth)
-    if uncovered is not None:
-        return [uncovered]
+        return [note("no-truth", None, "", text, "add groundtruth.txt to check more")]
+    begin, end = truth.timestamps[[0, -1]]
+    apart = max(begin - stamps[-1], stamps[0] - end)
+    if apart > 0:
+        text = (
+            f"truth and images share no time: {begin:.3f} to {end:.3f} s and {stamps[0]:.3f} to {stamps[-1]:.3f} s, "
+            f"{apart:.3f} s apart"
+        )
+        cure = "take the groundtruth.txt of this recording, or put its stamps on the images' clock"
+        return [fault("truth-other-sequence", float(apart), "s", text, cure)]
+    covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
+    if covered < max(LEAST_COVERAGE * len(stamps), 3):
+        text = f"{covered} of {len(stamps)} frames have a true pose within {SAME_FRAME_S} s"
+        return [fault("truth-sparse", covered, "frames", text, "export the truth of all frames again")]
     usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
     displacement = float(np.median([pair.displacement_px for pair in usable])) if usable else np.inf
     if displacement < REST_PX and len(usable) >= 3:
@@ -94,28 +105,8 @@ def truth_findings(
             f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: "
             "truth and camera were not compared"
         )
-        return [
-            Finding("motion-unmeasured", "note", float(len(usable)), "pairs", text, "check a part with more texture")
-        ]
-    return _compared(stamps, truth, camera, [p for p in usable if p.displacement_px >= REST_PX], len(pairs))
-
-
-def _coverage(stamps: Array, truth: Trajectory) -> Finding | None:
-    """A truth of another time, or of a few frames."""
-    begin, end = truth.timestamps[[0, -1]]
-    apart = max(begin - stamps[-1], stamps[0] - end)
-    if apart > 0:
-        text = (
-            f"truth and images share no time: {begin:.3f} to {end:.3f} s and {stamps[0]:.3f} to {stamps[-1]:.3f} s, "
-            f"{apart:.3f} s apart"
-        )
-        cure = "take the groundtruth.txt of this recording, or put its stamps on the images' clock"
-        return Finding("truth-other-sequence", "fault", float(apart), "s", text, cure)
-    covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
-    if covered >= max(LEAST_COVERAGE * len(stamps), 3):
-        return None
-    text = f"{covered} of {len(stamps)} frames have a true pose within {SAME_FRAME_S} s"
-    return Finding("truth-sparse", "fault", float(covered), "frames", text, "export the truth of all frames again")
+        return [note("motion-unmeasured", len(usable), "pairs", text, "check a part with more texture")]
+    return _compared(stamps, truth, camera, [pair for pair in usable if pair.displacement_px >= REST_PX], len(pairs))
 
 
 def _at_rest(
@@ -128,23 +119,24 @@ def _at_rest(
     expected = camera.fx * float(np.median(moves[valid])) if valid.any() else 0.0
     if expected > 10 * REST_PX:
         text = f"the truth moves the image by {expected:.0f} pixels between frames that move by {displacement:.1f}"
-        return Finding("truth-other-sequence", "fault", expected, "px", text, "take the truth of this recording")
+        return fault("truth-other-sequence", expected, "px", text, "take the truth of this recording")
     text = f"the camera rests (the image moves by {displacement:.1f} pixels): truth and intrinsics cannot be compared"
-    return Finding("no-motion", "note", displacement, "px", text, "check a part in which the camera moves")
+    return note("no-motion", displacement, "px", text, "check a part in which the camera moves")
 
 
 def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair], tried: int) -> list[Finding]:
     motions = motions_of(pairs, stamps)
     readings = {reading: TruthMotion(truth, reading) for reading in READINGS}
-    shifts = np.arange(-LARGEST_SHIFT_S, LARGEST_SHIFT_S + _STEP_S / 2, _STEP_S)
+    steps = round(LARGEST_SHIFT_S / _STEP_S)
+    shifts = _STEP_S * np.arange(-steps, steps + 1)  # exact multiples: the same limits early and late
     matches = [match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts]
-    matches = [each for each in matches if each.share >= 0.5]
-    near = [each for each in matches if each.reading == READINGS[0] and abs(each.shift_s) < LEAST_TIME_S]
+    matches = [candidate for candidate in matches if candidate.share >= 0.5]
+    near = [one for one in matches if one.reading == READINGS[0] and abs(one.shift_s) < LEAST_TIME_S]
     if not near or sum(near[0].weights) < 0.4:
         text = f"only {len(pairs)} pairs of frames with a small motion share time with the truth: it cannot be compared"
-        return [Finding("motion-unmeasured", "note", float(len(pairs)), "pairs", text, "check a longer part")]
-    stated, best = max(near, key=_total), max(matches, key=_total)
-    unshifted = min(near, key=lambda each: abs(each.shift_s))
+        return [note("motion-unmeasured", float(len(pairs)), "pairs", text, "check a longer part")]
+    stated, best = max(near, key=total), max(matches, key=total)
+    unshifted = min(near, key=lambda one: abs(one.shift_s))
     if unshifted.total > stated.total - 0.02:
         stated = unshifted
     differs = best.reading != READINGS[0] or abs(best.shift_s) >= LEAST_TIME_S
@@ -159,31 +151,27 @@ def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[Rgbd
     return _otherwise(motions, readings, stated, best, tried)
 
 
-def _total(each: Match) -> float:
-    return each.total
-
-
 def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match) -> list[Finding]:
     findings = []
     fine = [match(motions, readings[best.reading], best.reading, best.shift_s + d) for d in np.arange(-5, 6) * 0.005]
-    shift = max(fine, key=_total).shift_s
+    shift = max(fine, key=total).shift_s
     so = f"so they explain {100 * best.clearest:.0f} % of the images' motion, as stored {100 * stated.clearest:.0f} %"
     if best.reading != READINGS[0]:
         name, text, cure = _CURES[best.reading]
-        findings.append(Finding(name, "fault", best.total, "", f"{text}: {so}", cure))
+        findings.append(fault(name, best.total, "", f"{text}: {so}", cure))
     if abs(shift) >= LEAST_TIME_S:
         when = "late" if shift > 0 else "early"
         text = f"the truth is {abs(shift):.3f} s {when}: {so.replace('they explain', 'it explains')}"
         change = "subtract {} s from" if shift > 0 else "add {} s to"
         cure = f"{change.format(f'{abs(shift):.3f}')} the stamps of the truth"
-        findings.append(Finding("truth-time-shift", "fault", shift, "s", text, cure))
+        findings.append(fault("truth-time-shift", shift, "s", text, cure))
     return findings
 
 
 def _otherwise(
     motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match, tried: int
 ) -> list[Finding]:
-    """A truth that tells the motion in no reading: in other axes, or not at all."""
+    """A truth that agrees with the motion in no convention: in other axes, or not at all."""
     closest = best.total
     for reading in READINGS[:3]:
         for shift in np.arange(-4, 5) * 0.025 if reading == READINGS[0] else (0.0,):
@@ -202,13 +190,13 @@ def _otherwise(
             f"the truth explains at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames "
             f"show, under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
         )
-        return [Finding("truth-other-sequence", "fault", closest, "", text, "take the truth of this recording")]
+        return [fault("truth-other-sequence", closest, "", text, "take the truth of this recording")]
     text = (
         f"the truth explains {100 * stated.total:.0f} % of the motion between the frames, too little to compare more: "
         "it may belong to another recording"
     )
     cure = "make sure that groundtruth.txt is this recording's, or check a part with a clearer motion"
-    return [Finding("truth-unclear", "note", stated.total, "", text, cure)]
+    return [note("truth-unclear", stated.total, "", text, cure)]
 
 
 def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) -> Finding | None:
@@ -224,12 +212,12 @@ def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) ->
 
 
 def _axes(X: Array, alike: float, stated: Match) -> Finding:
-    angle = float(np.degrees(np.linalg.norm(se3.log(_pose(X))[3:])))
+    angle = float(np.degrees(np.arccos(np.clip((np.trace(X) - 1) / 2, -1, 1))))
     text = (
         f"the truth's axes are turned by {angle:.0f} degrees against the camera's: so they explain "
         f"{100 * alike:.0f} % of the images' rotation, as stored {100 * stated.rotation:.0f} %"
     )
-    return Finding("truth-axes", "fault", angle, "degrees", text, _turn(X))
+    return fault("truth-axes", angle, "degrees", text, _turn(X))
 
 
 def _turn(R_body_cam: Array) -> str:
@@ -238,12 +226,6 @@ def _turn(R_body_cam: Array) -> str:
     near = not np.array_equal(swapped, np.eye(3)) and np.trace(swapped.T @ R_body_cam) > 1 + 2 * np.cos(np.radians(20))
     rows = [", ".join(f"{value:g}" for value in row) for row in (swapped if near else R_body_cam.round(3)) + 0.0]
     return f"multiply each rotation of groundtruth.txt from the right by [{'; '.join(rows)}]"
-
-
-def _pose(rotation: Array) -> Array:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    return pose
 
 
 def _measured(
@@ -276,9 +258,9 @@ def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
     text = f"the truth's translations are {factor:.4g} times the measured ones (median depth {motions.depth_m:.2f} m)"
     if unit and 0.15 < motions.depth_m < 20:
         cure = f"divide the positions of groundtruth.txt by {10**power}"
-        return Finding("truth-scale", "fault", factor, "", f"{text}: they are in {unit}", cure)
+        return fault("truth-scale", factor, "", f"{text}: they are in {unit}", cure)
     cure = f"set depth_factor = {camera.depth_factor / factor:.4g} in camera.toml (it is {camera.depth_factor:g})"
-    return Finding("depth-factor", "fault", factor, "", text, f"{cure}, unless the truth is not in metres")
+    return fault("depth-factor", factor, "", text, f"{cure}, unless the truth is not in metres")
 
 
 def _positions(motions: Motions, first: Array, relative: Array, stated: Match) -> Finding | None:
@@ -295,7 +277,7 @@ def _positions(motions: Motions, first: Array, relative: Array, stated: Match) -
                 f"the truth's positions are {how} in the {where}'s axes against its orientations: so they explain "
                 f"{100 * alike:.0f} % of the images' translation, as stored {100 * stated.translation:.0f} %"
             )
-            return Finding("truth-axes", "fault", angle, "degrees", text, "use one right-handed frame for both")
+            return fault("truth-axes", angle, "degrees", text, "use one right-handed frame for both")
     return None
 
 
@@ -303,14 +285,9 @@ def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> lis
     """The one of focal length, principal point, depth scale, axes and lever arm that explains the errors best."""
     before = fit_camera(pairs, relative, camera, ())
     fits = {name: fit_camera(pairs, relative, camera, names) for name, names in _GROUPS.items()}
-    name = min(fits, key=lambda each: fits[each].cost)
+    name = min(fits, key=lambda group: fits[group].cost)
     fit = fits[name]
-    size = fit.size(name) if name != "centre" else float(np.hypot(fit.value["cx"][0], fit.value["cy"][0]))
-    sigma = (
-        float(np.linalg.norm(fit.sigma[name]))
-        if name != "centre"
-        else float(np.hypot(fit.sigma["cx"][0], fit.sigma["cy"][0]))
-    )
+    size, sigma = (float(np.linalg.norm([values[part] for part in _GROUPS[name]])) for values in (fit.value, fit.sigma))
     left = fit.cost / before.cost
     rules = _EXPLAINED if name != "lever" else _EXPLAINED_BY_LEVER
     if name == "lever" and float(np.median([pair.depth_share for pair in pairs])) < _DEPTH_FOR_LEVER:
@@ -318,7 +295,7 @@ def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> lis
     if size < _LIMITS[name] or not any(size >= sigmas * sigma and left <= share for sigmas, share in rules):
         return []
     errors = f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px"
-    return [_described(name, fit, sigma, errors, camera)]
+    return [_described(name, fit, size, sigma, errors, camera)]
 
 
 _GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "turn": ("turn",), "lever": ("lever",)}
@@ -333,30 +310,143 @@ _DEPTH_FOR_LEVER = 0.5
 """Part of the image that has depth. With less, the corners may lie on moving people alone: 0.61 remained then."""
 
 
-def _described(name: str, fit: Fit, sigma: float, errors: str, camera: Camera) -> Finding:
+def _described(name: str, fit: Fit, size: float, sigma: float, errors: str, camera: Camera) -> Finding:
     if name == "focal":
         factor = float(np.exp(fit.value["focal"][0]))
         text = f"the focal length is {factor:.3f} times the stated one (+- {100 * sigma:.1f} %): {errors}"
         cure = f"fx = {camera.fx * factor:.1f}, fy = {camera.fy * factor:.1f} in camera.toml, or name the right camera"
-        return Finding("camera-focal-length", "fault", factor, "", text, cure)
+        return fault("camera-focal-length", factor, "", text, cure)
     if name == "centre":
         dx, dy = float(fit.value["cx"][0]), float(fit.value["cy"][0])
         text = f"the principal point is {dx:+.0f}, {dy:+.0f} px from the stated one (+- {sigma:.0f}): {errors}"
         cure = f"cx = {camera.cx + dx:.1f}, cy = {camera.cy + dy:.1f} in camera.toml, or name the right camera"
-        return Finding("camera-principal-point", "fault", float(np.hypot(dx, dy)), "px", text, cure)
+        return fault("camera-principal-point", size, "px", text, cure)
     if name == "scale":
         factor = float(np.exp(fit.value["scale"][0]))
-        how = f"by {factor:.3f} (+- {100 * sigma:.1f} %)"
-        text = f"the depth is to be multiplied {how} to agree with the truth: {errors}"
+        text = f"the depth, multiplied by {factor:.3f} (+- {100 * sigma:.1f} %), agrees with the truth: {errors}"
         cure = f"depth_factor = {camera.depth_factor / factor:.5g} in camera.toml (it is {camera.depth_factor:g})"
-        return Finding("depth-factor", "fault", factor, "", text, cure)
+        return fault("depth-factor", factor, "", text, cure)
     if name == "turn":
-        angle = float(np.degrees(fit.size("turn")))
+        angle = float(np.degrees(size))
         text = f"the truth's axes are turned by {angle:.1f} degrees against the camera's: {errors}"
         turn = se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
-        return Finding("truth-axes", "fault", angle, "degrees", text, _turn(turn))
-    lever = fit.value["lever"]
-    where = ", ".join(f"{value:+.3f}" for value in lever)
-    text = f"the camera is {fit.size('lever'):.3f} m (+- {sigma:.3f}) from the point that the truth tracks: {errors}"
-    cure = f"move each position by R ({where}), R being the pose's rotation"
-    return Finding("truth-lever-arm", "fault", fit.size("lever"), "m", text, cure)
+        return fault("truth-axes", angle, "degrees", text, _turn(turn))
+    text = f"the camera is {size:.3f} m (+- {sigma:.3f}) from the point that the truth tracks: {errors}"
+    lever = ", ".join(f"{value:+.3f}" for value in fit.value["lever"])
+    return fault("truth-lever-arm", size, "m", text, f"move each position by R ({lever}), R being the pose's rotation")
+
+
+# Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Camera and mounting that make the truth's motion carry the corners from image to image.
+
+    Attributes:
+        value: ``focal`` and ``scale`` (of the depth) as natural logarithms of the factor, ``cx`` and ``cy`` as pixels
+            to be added, ``turn`` the rotation vector ``[3]`` in rad and ``lever`` the position ``[3]`` in metres of the
+            camera in the frame of the body that the truth tracks.
+        sigma: Their standard deviations, each pair of frames being one observation.
+        residual_px: Median reprojection error.
+        cost: Mean robust cost of a corner.
+    """
+
+    value: dict[str, Array]
+    sigma: dict[str, Array]
+    residual_px: float
+    cost: float
+
+
+_PARAMETERS = {"focal": slice(0, 1), "cx": slice(1, 2), "cy": slice(2, 3), "scale": slice(3, 4),
+               "turn": slice(4, 7), "lever": slice(7, 10)}  # fmt: skip
+_PRIOR = np.array([1.0, 200.0, 200.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+_SCALES = np.array([0.1, 10, 10, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
+_STEPS = np.array([1e-4, 0.05, 0.05, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
+_CORNERS_A_PAIR = 25
+_OUTLIER_PX = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Corners:
+    """Corners of all pairs, the pair of each, and the truth's motions back to the second frames."""
+
+    camera: Camera
+    pair: NDArray[np.intp]
+    first: Array
+    depth: Array
+    second: Array
+    back: Array
+
+    def errors(self, x: Array) -> Array:
+        """Reprojection errors ``[N, 2]`` in pixels under the values ``[10]``."""
+        focal = np.exp(x[0]) * np.array([self.camera.fx, self.camera.fy])
+        centre = np.array([self.camera.cx, self.camera.cy]) + x[1:3]
+        rays = np.concatenate([(self.first - centre) / focal, np.ones((len(self.first), 1))], axis=1)
+        mount = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
+        mount[:3, 3] = x[7:10]
+        moves = se3.inverse(mount) @ self.back @ mount
+        points = np.exp(x[3]) * self.depth[:, None] * rays
+        moved = np.einsum("nij,nj->ni", moves[self.pair, :3, :3], points) + moves[self.pair, :3, 3]
+        return np.asarray(moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre - self.second)
+
+    def deviations(self, x: Array, index: NDArray[np.intp], pairs: int) -> Array:
+        """Standard deviations of the fitted values, each pair being one observation (a sandwich estimate)."""
+        left = self.errors(x)
+        weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))
+        slopes = np.stack([(self.errors(x + s) - self.errors(x - s)) / (2 * s.sum()) for s in np.diag(_STEPS)], axis=-1)
+        prior = np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
+        curvature = np.einsum("npi,n,npj->ij", slopes, weight, slopes) + prior
+        pulls = np.zeros((pairs, len(x)))
+        np.add.at(pulls, self.pair, np.einsum("npi,n,np->ni", slopes, weight, left))
+        chosen = np.ix_(index, index)
+        inverse = np.linalg.inv(curvature[chosen])
+        spread = inverse @ (pulls.T @ pulls + prior)[chosen] @ inverse
+        return np.asarray(np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(pairs / max(pairs - len(index), 1)))
+
+
+def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, free: PySequence[str]) -> Fit:
+    """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
+
+    Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.
+    A weak prior keeps values that the motion does not determine near the stated ones.
+
+    Args:
+        pairs: Pairs of frames with a motion.
+        relative: Motions of the truth between them ``[N, 4, 4]``, in the depth's units.
+        camera: The stated camera.
+        free: Names of what is fitted, of `Fit.value`; the rest stays as stated.
+    """
+    from scipy.optimize import least_squares
+
+    chosen = [np.flatnonzero(pair.inliers) for pair in pairs]
+    chosen = [index[:: max(1, len(index) // _CORNERS_A_PAIR)][:_CORNERS_A_PAIR] for index in chosen]
+    first, depth, second = (
+        np.concatenate([getattr(pair, name)[index] for pair, index in zip(pairs, chosen, strict=True)])
+        for name in ("pixels_first", "depth_first", "pixels_second")
+    )
+    number = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen])
+    corners = _Corners(camera, number, first, depth, second, se3.inverse(relative))
+    index = np.array([i for name in free for i in range(10)[_PARAMETERS[name]]], np.intp)
+
+    def filled(part: Array) -> Array:
+        x = np.zeros(10)
+        x[index] = part
+        return x
+
+    def robust(part: Array) -> Array:
+        raw = corners.errors(filled(part)) / _OUTLIER_PX
+        square = (raw**2).sum(axis=1, keepdims=True)
+        shrunk = raw * np.sqrt(2 * (np.sqrt(1 + square) - 1) / np.maximum(square, 1e-12))
+        return np.concatenate([shrunk.ravel(), filled(part) / _PRIOR])
+
+    part = np.zeros(len(index))
+    if len(index):
+        part = np.asarray(least_squares(robust, part, x_scale=_SCALES[index]).x, np.float64)
+    x, deviation = filled(part), filled(corners.deviations(filled(part), index, len(pairs)))
+    return Fit(
+        {name: x[where] for name, where in _PARAMETERS.items()},
+        {name: deviation[where] for name, where in _PARAMETERS.items()},
+        float(np.median(np.linalg.norm(corners.errors(x), axis=1))),
+        float((robust(part) ** 2).sum() / len(first)),
+    )

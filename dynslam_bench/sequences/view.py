@@ -1,14 +1,16 @@
-"""Part of a sequence, renumbered from 0."""
+"""Parts of a sequence: a view with renumbered frames, and the identity of the frames that it shows."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence as PySequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence, timestamps_ns
+from dynslam_bench.core.records import digest
 
 
 class SequenceView:
@@ -42,7 +44,7 @@ class SequenceView:
 
     @property
     def depth_timestamps(self) -> NDArray[np.float64]:
-        """Stamps of the selected frames' depth images; the frames' own where the sequence does not tell."""
+        """Stamps of the selected frames' depth images; the frames' own where the sequence does not state them."""
         stamps = getattr(self.base, "depth_timestamps", self.base.timestamps)
         return np.asarray(stamps[self.range.start : self.range.stop : self.range.step])
 
@@ -50,7 +52,7 @@ class SequenceView:
     def masks(self) -> MaskSource | None:
         """Masks of the selected frames, under their new indices."""
         source = self.base.masks
-        return None if source is None else _SelectedMasks(source, self.range)
+        return None if source is None else Masks(lambda index: source[self.range[index]])
 
     def __len__(self) -> int:
         return len(self.range)
@@ -61,9 +63,81 @@ class SequenceView:
 
 
 @dataclass(frozen=True)
-class _SelectedMasks:
-    source: MaskSource
-    selected: PySequence[int]
+class Masks:
+    """A `MaskSource` that is a function of the frame's index."""
+
+    masks_of: Callable[[int], FrameMasks]
 
     def __getitem__(self, index: int) -> FrameMasks:
-        return self.source[self.selected[index]]
+        return self.masks_of(index)
+
+
+# Identity of the frames: equal frames have one identity in every spelling.
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which frames of which content are seen.
+
+    Attributes:
+        id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed stays in it.
+        content: Digest of the whole content, however much of it is seen.
+        scene: The same without the draw of the sensors' noise.
+        camera: Intrinsics of the camera before any preprocessing.
+        start: First frame of the named part in the numbering of the whole sequence, before any offset.
+        stop: One past its last frame, never past the end.
+        stride: Every so many frames.
+        noise: Seed of the sensors' noise, None for the sequence's own.
+    """
+
+    id: str
+    content: str
+    scene: str
+    camera: dict[str, Any]
+    start: int
+    stop: int
+    stride: int
+    noise: int | None
+
+    @property
+    def block(self) -> str:
+        """Digest of scene, camera, frames and stride: equal for repeats by offset or noise, and for every spelling."""
+        return digest([self.scene, self.camera, self.start, self.stop, self.stride], 16)
+
+
+def part_of(sequence: Sequence, offset: int = 0) -> Part:
+    """What part a sequence is.
+
+    A sequence whose frames are cut from a longer one may offer ``whole_id``, ``scene_digest()`` and ``noise``, as the
+    rendered ones do; any other is its own whole.
+
+    Args:
+        sequence: The opened sequence, cut and preprocessed or not.
+        offset: How many leading frames of the named part were dropped to get it.
+    """
+    base, frames = _unwrapped(sequence)
+    noise: int | None = getattr(base, "noise", None)
+    scene_digest = getattr(base, "scene_digest", None)
+    scene = base.digest() if scene_digest is None else str(scene_digest())
+    return Part(
+        id=str(getattr(base, "whole_id", base.id)),
+        content=scene if noise is None else digest([scene, noise]),
+        scene=scene,
+        camera=asdict(base.camera),
+        start=frames.start - offset,
+        stop=frames.stop,
+        stride=frames.step,
+        noise=noise,
+    )
+
+
+def _unwrapped(sequence: Any) -> tuple[Any, range]:
+    """The sequence below all views and preprocessing, and which of its frames are seen."""
+    from dynslam_bench.sequences.preprocessing import Preprocessed
+
+    frames = range(len(sequence))
+    while isinstance(sequence, SequenceView | Preprocessed):
+        if isinstance(sequence, SequenceView):
+            frames = sequence.range[frames.start : frames.stop : frames.step]
+        sequence = sequence.base
+    return sequence, frames

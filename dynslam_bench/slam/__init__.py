@@ -1,1 +1,1 @@
-"""The back end that all trackers share: map, tracking, local mapping, relocalisation, and loops if asked to."""
+"""The back end that all trackers share: map, tracking, local mapping, relocalisation and loop closing."""

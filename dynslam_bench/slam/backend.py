@@ -1,8 +1,9 @@
-"""The back end that all trackers share: what turns the kept features of a frame into a pose and a map."""
+"""The back end that all trackers share: what turns the static features of a frame into a pose and a map."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
@@ -11,34 +12,69 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle, KeyframeView
-from dynslam_bench.contracts.map_outputs import MapOutputs
-from dynslam_bench.contracts.result import TrackingState
+from dynslam_bench.contracts.tracker import MapOutputs, TrackingState
+from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .localisation.camera_motion import CameraMotion
-from .localisation.first_pose import Before, FirstPose, first_pose, pose_at_home, tracked_at
-from .localisation.localised import Localised
-from .localisation.observation import Observations, observe
-from .localisation.reach import Reach
-from .localisation.rolling_shutter import Speeds, as_seen_at_once
-from .localisation.straightening import STILL_AGREE, Straightening
-from .localisation.surroundings import Surroundings
-from .localisation.tracking import MapFit, Tracked, fit_to_map
-from .loop_closing import LoopCloser
-from .mapping.history import History
-from .mapping.keyframes import KeyframeRule
-from .mapping.local_mapping import LocalMapper
-from .mapping.map_store import begin_map, check_descriptors, save
-from .mapping.saved_map import MapFeatures
-from .settings import BackendSettings
-from .views import MapViews
+from dynslam_bench.slam.atlas import TrajectoryHistory, open_atlas, save_atlas
+from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser, View
+from dynslam_bench.slam.keyframes import DEPTH_IMAGES, KeyframePolicy, MapViews
+from dynslam_bench.slam.local_mapping import LocalMapper
+from dynslam_bench.slam.loop_closing import LoopCloser
+from dynslam_bench.slam.map_files import MapFeatures
+from dynslam_bench.slam.motion_model import CameraMotion
+from dynslam_bench.slam.observation import Observations, observe
+from dynslam_bench.slam.relocalisation import InitialPose, MotionBound, PoseSearch, RelocalisationGate
+from dynslam_bench.slam.rolling_shutter import (
+    MIN_AGREEING,
+    CameraVelocity,
+    RollingShutter,
+    compensate_rolling_shutter,
+)
+from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
+from dynslam_bench.slam.tracking import LocalMap, MapFit, TrackedFrame, track_local_map
 
 Array = NDArray[np.float64]
 
 MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
+KNOWN_POSE = 1e6 * np.eye(6)
+"""Information of a pose that defines a map's frame of reference."""
+
+
+@dataclass(frozen=True, eq=False)
+class BackendResult:
+    """The pose of a frame, and what the frame did to the map.
+
+    Attributes:
+        T_world_cam: Camera-to-world pose ``[4, 4]``, after bundle adjustment if the frame became a keyframe; a
+            prediction while `state` is ``lost``; None before the first keyframe.
+        state: ``ok`` (tracked), ``lost`` or ``initialising``.
+        map_points: Points in the map afterwards.
+        keyframes: Keyframes in the map afterwards.
+        maps: Maps that they are of: the root map, and submaps that were not merged with it.
+        loops: Loops that were closed so far.
+        timings: Seconds of ``tracking``, ``mapping``, ``bundle_adjustment`` and ``loop_closing``, where they worked.
+        keyframe: Whether the frame became a keyframe.
+        matches: Features matched with points of the map or of the last frame.
+        inliers: How many of them fit the pose and observe a map point.
+        residual_px: Median reprojection error of the inliers in pixels of octave 0; 0 where there is no pose.
+        relocalised: Whether the initial pose came from keyframes' descriptors.
+    """
+
+    T_world_cam: Array | None
+    state: TrackingState
+    map_points: int
+    keyframes: int
+    maps: int
+    loops: int
+    timings: Mapping[str, float] = field(default_factory=dict)
+    keyframe: bool = False
+    matches: int = 0
+    inliers: int = 0
+    residual_px: float = 0.0
+    relocalised: bool = False
 
 
 class RgbdBackend:
@@ -46,13 +82,14 @@ class RgbdBackend:
 
     Args:
         settings: Of tracking, mapping, bundle adjustment, keyframes and relocalisation.
-        scale_factor: Ratio of consecutive pyramid levels of the features that will come.
-        levels: Number of pyramid levels of the features that will come.
-        extractor: Who finds them; a saved map serves the same features alone.
+        scale_factor: Ratio of consecutive pyramid levels of the features.
+        levels: Number of pyramid levels of the features.
+        extractor: Id of the feature extractor; a saved map serves the same features alone.
     """
 
     uses_depth = True
-    """Whether depth is read; where it is not, the pipeline shows it to nobody."""
+    """Whether depth is read; where it is not, the pipeline hides it."""
+    settings_type: type[BackendSettings] = BackendSettings
 
     def __init__(
         self,
@@ -62,16 +99,15 @@ class RgbdBackend:
         levels: int = 8,
         extractor: str = "orb",
     ) -> None:
-        self.settings = settings or BackendSettings()
-        self._made_of = MapFeatures(extractor=extractor, levels=max(levels, 1), scale_factor=scale_factor)
-        self._scales = self._made_of.scales
+        self.settings = settings or self.settings_type()
+        self._features = MapFeatures(extractor=extractor, levels=max(levels, 1), scale_factor=scale_factor)
         self._ready = False
 
     def configure(self, settings: BackendSettings) -> None:
         """Put other settings into force from the next frame on."""
         self.settings = settings
         if self._ready:
-            self.mapper.settings = self.loops.settings = self._surroundings.settings = settings
+            self.mapper.settings = self.loops.settings = settings
             self._keyframes.settings = settings.keyframes
 
     def reset(self, camera: Camera, seed: int) -> None:
@@ -84,33 +120,32 @@ class RgbdBackend:
         Raises:
             SettingsError: That map cannot be read, or is of another camera, other features or another sensor.
         """
+        s = self.settings
         self.camera = camera.undistorted()
         self.seed = int(seed)
-        start = self.settings.map
-        self.world, self._islands = begin_map(start.file, self.camera, self._made_of, depth=self.uses_depth)
-        self._grows = not start.localisation_only
-        self.mapper = LocalMapper(self.world, self.settings)
-        self.history = History(self.world.space)
+        self.atlas = open_atlas(s.map.file, self.camera, self._features, depth=self.uses_depth)
+        self.world = self.atlas.world
+        self.mapper = LocalMapper(self.world, s)
+        self.history = TrajectoryHistory()
+        self.motion = CameraMotion(s.motion)
+        self.shutter = RollingShutter(self.camera, self.motion.intervals)
+        self.loops = LoopCloser(self.atlas, self.mapper, s, self.seed, scale_is_known=self.uses_depth)
         self.state: TrackingState = "initialising"
+        self._grows = not s.map.localisation_only
+        self._gate = RelocalisationGate(self.atlas, s.relocalisation.max_speed, anywhere=bool(s.map.file))
+        self._keyframes = KeyframePolicy(s.keyframes, self.mapper.close_m)
+        self._local_map = LocalMap(self.world, connected_only=s.loop_closing.enabled)
+        self._views = MapViews(self.world, DEPTH_IMAGES if self.uses_depth else 0)
         self._tracked = False
-        self._island = 0
         self._unrecognised = 0
-        self._reach = Reach(self.camera, anywhere=bool(start.file))
-        self._last: Tracked | None = None
-        self._first: tuple[FrameBundle, Observations] | None = None
-        self.motion = CameraMotion(self.camera.readout_s)
-        self._straightening = Straightening(self.world, self.camera, self.motion)
         self._reference = -1
-        self._keyframes = KeyframeRule(self.settings.keyframes, self.mapper.close_m)
-        parts = self.world, self.mapper, self._islands, self.settings, self.seed
-        self.loops = LoopCloser(*parts, scale_is_known=self.uses_depth)
-        self._surroundings = Surroundings(self.world, self.settings)
-        self._views = MapViews(self.world, self.mapper)
+        self._last: TrackedFrame | None = None
+        self._first: tuple[FrameBundle, Observations] | None = None
         self._ready = True
 
     # ------------------------------------------------------------------ one frame
 
-    def track(self, frame: FrameBundle, keep: NDArray[np.bool_], weight: NDArray[np.float32]) -> Localised:
+    def track(self, frame: FrameBundle, keep: NDArray[np.bool_], weight: NDArray[np.float32]) -> BackendResult:
         """Find the frame's pose and, if it shows enough new, make it a keyframe.
 
         Args:
@@ -123,232 +158,265 @@ class RgbdBackend:
         """
         assert self._ready, "reset() comes before track()"
         begin = perf_counter()
-        self.mapper.resume()
-        seen = observe(frame, keep, weight, self.camera, self._scales, self.settings.tracking)
-        found = self._localise(frame, seen) if self.world.next_keyframe else self._initialise(frame, seen)
-        self.world.rest()
-        tracking = perf_counter() - begin - sum(found.timings.values())
+        self.resume()
+        observations = observe(frame, keep, weight, self.camera, self._features.scales)
+        result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
+        tracking = perf_counter() - begin - sum(result.timings.values())
         stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
-        return replace(found, timings={**stages, **found.timings})
+        return replace(result, timings={**stages, **result.timings})
 
-    def _initialise(self, frame: FrameBundle, seen: Observations) -> Localised:
-        """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
-        if np.count_nonzero(seen.z > 0) < MIN_INITIAL:
-            return self._localised(None)
-        begun = self._begin_map(frame, seen, np.eye(4))
-        self._first = (frame, seen) if self._rolling else None
-        return begun
-
-    def _begin_map(self, frame: FrameBundle, seen: Observations, T_cam_world: Array) -> Localised:
-        """A keyframe that shows nothing known; until its map is joined to the first one its frames count as lost."""
-        self._tracked = True
-        self._last = tracked = Tracked(seen, np.full(len(seen), -1, np.int64), T_cam_world, frame.timestamp)
-        spent = self._make_keyframe(frame, tracked)
-        self.state = self._state()
-        self.history.append(frame.timestamp, self._reference, np.eye(4), 1e6 * np.eye(6))
-        points = int(np.count_nonzero(tracked.point >= 0))
-        return replace(self._localised(T_cam_world, spent), matches=points, inliers=points)
-
-    def _begin_again(
-        self,
-        frame: FrameBundle,
-        seen: Observations,
-        first: tuple[FrameBundle, Observations],
-        speeds: Speeds,
-        count: int,
-    ) -> Localised:
-        """The second frame tells how the camera moved in the first, whose points a rolling shutter had put askew.
-
-        Where fewer points agree then than the `count` before, the first frame stays as it was.
-        """
-        for moving in (speeds, None):
-            self.reset(self.camera, self.seed)
-            self.motion.last_speeds = moving
-            straight = first[1] if moving is None else as_seen_at_once(first[1], self.camera, moving)
-            self._begin_map(first[0], straight, np.eye(4))
-            found = self._localise(frame, seen)
-            if found.state == "ok" and found.inliers >= STILL_AGREE * count:
-                break
-        return found
-
-    def _state(self) -> TrackingState:
-        """Poses count in the world of the first map alone."""
-        self._island = int(self.world.kf_island[self._reference])
-        return "ok" if self._tracked and self._island == 0 else "lost"
-
-    def _localise(self, frame: FrameBundle, seen: Observations) -> Localised:
-        """First pose, local map, pose; then the keyframe decision with all that a keyframe brings."""
-        last = self._nowhere(frame, seen) if self._last is None else self._last
-        raw = seen
+    def _track(self, frame: FrameBundle, raw: Observations) -> BackendResult:
+        """Predict, match the last frame or relocalise, track the local map, insert a keyframe."""
+        last, stamp = self._last_frame(frame, raw), frame.timestamp
+        observations = self.shutter.predicted(raw, last, stamp) if self._rolling else raw
+        prediction = self.motion.predicted(last, stamp)
+        search = self._search(frame, raw, observations, last, prediction)
+        root = search.in_root_map()
+        initial = search.from_last_frame() or search.relocalised()
+        if initial is None and root is not None:  # the camera is lost in the submap, and found in the root map
+            initial, root, self._tracked = root, None, False
+            self._gate.start(last)
+            self._forget_motion()
+        if initial is None:
+            return self._lose(frame, raw, last, prediction)
+        _, points = self._local_map.around(initial.keyframe)
+        tracking = self.settings.tracking
+        fit = track_local_map(self.world, observations, initial.matches, initial.T_cam_world, points, tracking)
+        velocity = None
         if self._rolling:
-            seen = self._straightening.foreseen(raw, last, frame.timestamp, self.settings.motion)
-        prediction = self.motion.predicted(last, frame.timestamp, self.settings.motion)
-        around = self._surroundings.keyframes(self._reference) if self._tracked else self._anywhere()
-        known = last, raw, frame.timestamp, self._island, self.settings.relocalisation
-        told = partial(self._reach.at_most, *known, prediction) if self._tracked else partial(self._reach.since, *known)
-        where = last, prediction, self._reference, around, not self._tracked, cache(told)
-        before = Before(*where, self.mapper.close_m, self.seed, frame.index)
-        home = pose_at_home(self.world, self._islands, seen, before, self.settings)
-        first = first_pose(self.world, self._islands, seen, before, self.settings)
-        if first is None and home is not None:
-            first, home, self._tracked = home, None, False
-            self._reach.left(last)
-            self.motion.forget()
-        if first is None:
-            return self._lost(frame, raw, last, prediction)
-        points = self._surroundings.points(first.keyframe, first.matches.point)
-        fit = fit_to_map(self.world, seen, first.matches, first.T_cam_world, points, self.settings.tracking)
-        speeds = None
-        if self._rolling:
-            at, motion, second = frame.timestamp, self.settings.motion, self._first is not None
-            seen, fit, speeds = self._straightening.refitted(raw, seen, fit, last, at, motion, anyhow=second)
+            force = self._first is not None
+            observations, fit, velocity = self.shutter.refitted(raw, observations, fit, last, stamp, force=force)
         if self._grows:
             self.world.visible[fit.in_view] += 1
-        asked = self.settings.tracking if self._tracked else self.settings.relocalisation
-        if fit.count < asked.min_inliers or not np.isfinite(fit.estimate.T_cam_world).all():
-            found = self._lost(frame, raw, last, prediction)
+        required = tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
+        if fit.count < required or not np.isfinite(fit.estimate.T_cam_world).all():
+            result = self._lose(frame, raw, last, prediction)
         else:
-            taken = self._accept(frame, seen, fit, last)
-            self.motion.last_speeds = speeds
-            beginning, self._first = self._first, None
-            if beginning is not None and speeds is not None:
-                return self._begin_again(frame, raw, beginning, speeds, fit.count)
-            spent = self._keyframe_if_wanted(frame, taken, fit, home)
-            found = replace(self._localised(taken.T_cam_world, spent), residual_px=fit.estimate.residual_px)
-            if home is not None and self._island and self.loops.at_home:
-                found = self._at_home(taken, home, found)
-        return replace(found, matches=len(fit.matches), inliers=fit.count, relocalised=first.relocalised)
+            tracked = self._accept(frame, observations, fit, last)
+            self.shutter.velocity = velocity
+            first, self._first = self._first, None
+            if first is not None and velocity is not None:
+                return self._restart(frame, raw, first, velocity, fit.count)
+            result = self._update_map(frame, tracked, fit, root)
+        return replace(result, matches=len(fit.matches), inliers=fit.count, relocalised=initial.relocalised)
 
-    @property
-    def _rolling(self) -> bool:
-        """Whether the frame that comes can be straightened."""
-        return bool(self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked)
-
-    def _nowhere(self, frame: FrameBundle, seen: Observations) -> Tracked:
-        """What stands for the last tracked frame before the camera is found in a loaded map: it shows nothing."""
-        check_descriptors(self.world, seen, frame.index)
-        none, unsure = np.zeros(len(frame), bool), np.zeros(len(frame), np.float32)
-        nothing = observe(frame, none, unsure, self.camera, self._scales, self.settings.tracking)
-        return Tracked(nothing, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
-
-    def _lost(self, frame: FrameBundle, seen: Observations, last: Tracked, prediction: Array) -> Localised:
-        """Nothing is recognised; after some such frames, with loop closing, a map of its own begins."""
-        self.state, self._first = "lost", None
-        shown = self._usable(seen)
+    def _search(
+        self, frame: FrameBundle, raw: Observations, observations: Observations, last: TrackedFrame, prediction: Array
+    ) -> PoseSearch:
+        """The search for the frame's initial pose: what the camera can see, and where it can be."""
+        bound: partial[MotionBound]
         if self._tracked:
-            self._reach.lost(last, seen, self.settings.relocalisation, shows=shown >= MIN_INITIAL)
-        self._tracked = False
-        self.motion.forget()
-        self._unrecognised = self._unrecognised + 1 if shown >= MIN_INITIAL else 0
-        enough = self._unrecognised >= self.settings.relocalisation.new_map_after
-        begins = enough and self._grows and self.settings.loop_closing.enabled
-        begun = self._begin_island(frame, seen, last) if begins else None
-        return begun or self._localised(None if self._last is None else prediction)
+            keyframes, _ = self._local_map.around(self._reference)
+            bound = partial(self._gate.while_tracked, last, raw, frame.timestamp, prediction)
+        else:  # how other submaps lie to the active one is unknown
+            keyframes = self.world.keyframes
+            keyframes = keyframes[np.isin(self.world.kf_map[keyframes], (0, self.atlas.active))]
+            bound = partial(self._gate.while_lost, last, raw, frame.timestamp)
+        return PoseSearch(
+            self.atlas, observations, last, prediction, self._reference, keyframes, not self._tracked, cache(bound),
+            self.settings, self.seed, frame.index,
+        )  # fmt: skip
 
-    def _at_home(self, tracked: Tracked, home: FirstPose, found: Localised) -> Localised:
-        """A camera on an island is in the first map, too: there its pose counts, and it may go on there."""
-        self.history.see_from(self.world, home.keyframe, home.T_cam_world)
-        if self.loops.leaves:
-            self._last, self._reference = tracked_at(self.world, tracked, home), home.keyframe
-            self.motion.forget()
-            self.state = self._state()
-        return replace(found, T_world_cam=se3.inverse(home.T_cam_world), state="ok")
+    def _last_frame(self, frame: FrameBundle, observations: Observations) -> TrackedFrame:
+        """The last tracked frame; an empty one before the camera is found in a loaded map."""
+        if self._last is not None:
+            return self._last
+        if len(observations) and 8 * observations.words.shape[1] != self.world.descriptor_bytes:
+            raise TrackerError(
+                f"the map's descriptors have {self.world.descriptor_bytes} bytes, frame {frame.index}'s "
+                f"{8 * observations.words.shape[1]}",
+                "make the map with the same features",
+            )
+        none = observe(
+            frame, np.zeros(len(frame), bool), np.zeros(len(frame), np.float32), self.camera, self._features.scales
+        )
+        return TrackedFrame(none, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
-    def _anywhere(self) -> NDArray[np.int64]:
-        """Slots of the keyframes where a lost camera may be: how other islands lie to its own is unknown."""
-        slots = self.world.keyframes
-        return slots[np.isin(self.world.kf_island[slots], (0, self._island))]
-
-    def _usable(self, seen: Observations) -> int:
-        """How many features a map could begin with."""
-        return int(np.count_nonzero(seen.z > 0))
-
-    def _begin_island(self, frame: FrameBundle, seen: Observations, last: Tracked) -> Localised | None:
-        """Begin a map of its own where the camera was lost, turned as the images say; None if not yet."""
-        self._note_island(last, frame.timestamp)
-        return self._begin_map(frame, seen, self._reach.turned(last))
-
-    def _note_island(self, last: Tracked, timestamp: float) -> None:
-        """An island begins with the frame of this stamp."""
-        reach = self._reach.metres(last, timestamp, self.settings.relocalisation)
-        self._unrecognised = 0
-        start = se3.inverse(last.T_cam_world)[:3, 3]
-        self._island = self._islands.begin(self._island, start, reach, self._reach.slack)
-
-    def _accept(self, frame: FrameBundle, seen: Observations, fit: MapFit, last: Tracked) -> Tracked:
-        """The frame is tracked: what it sees counts as found, and its pose is weighed against the motion model."""
+    def _accept(self, frame: FrameBundle, observations: Observations, fit: MapFit, last: TrackedFrame) -> TrackedFrame:
+        """The frame is tracked: its pose is weighed against the motion model, its inliers count as found."""
         points = fit.matches.point[fit.inliers]
         if self._grows:
             self.world.found[points] += 1
-        point = np.full(len(seen), -1, np.int64)
+        point = np.full(len(observations), -1, np.int64)
         point[fit.matches.feature[fit.inliers]] = points
-        measured = fit.estimate.T_cam_world, fit.estimate.information
-        pose = self.motion.filtered(last, frame.timestamp, *measured, self.settings.motion)
+        pose = self.motion.filtered(last, frame.timestamp, fit.estimate.T_cam_world, fit.estimate.information)
         self._tracked, self._unrecognised = True, 0
-        self._last = tracked = Tracked(seen, point, pose, frame.timestamp)
+        self._last = tracked = TrackedFrame(observations, point, pose, frame.timestamp)
         near, _ = self.world.covisible_of(points)
         if len(near):
             self._reference = int(near[0])
-        self.state = self._state()
+        self._update_state()
         return tracked
+
+    def _lose(
+        self, frame: FrameBundle, observations: Observations, last: TrackedFrame, prediction: Array
+    ) -> BackendResult:
+        """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
+        self.state, self._first = "lost", None
+        textured = self._usable_features(observations) >= MIN_INITIAL
+        if self._tracked:
+            self._gate.lose(last, observations, textured=textured)
+        self._tracked = False
+        self._forget_motion()
+        self._unrecognised = self._unrecognised + 1 if textured else 0
+        enough = self._unrecognised >= self.settings.relocalisation.new_map_after
+        begun = None
+        if enough and self._grows and self.settings.loop_closing.enabled:
+            begun = self._begin_submap(frame, observations, last)
+        return begun or self._result(None if self._last is None else prediction)
+
+    def _forget_motion(self) -> None:
+        self.motion.forget()
+        self.shutter.velocity = None
+
+    @property
+    def _rolling(self) -> bool:
+        """Whether the rolling shutter of the next frame can be compensated."""
+        return bool(self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked)
+
+    def _update_state(self) -> None:
+        """Poses count in the world of the root map alone."""
+        self.atlas.active = int(self.world.kf_map[self._reference])
+        self.state = "ok" if self._tracked and self.atlas.active == 0 else "lost"
+
+    def _result(self, T_cam_world: Array | None, timings: Mapping[str, float] | None = None) -> BackendResult:
+        """A frame's result with the state and the map as they are now; with `timings` if it became a keyframe."""
+        return BackendResult(
+            T_world_cam=None if T_cam_world is None else se3.inverse(T_cam_world),
+            state=self.state,
+            map_points=self.world.point_count,
+            keyframes=self.world.keyframe_count,
+            maps=self.world.map_count,
+            loops=len(self.loops.closed),
+            timings=timings or {},
+            keyframe=bool(timings),
+        )
+
+    # ------------------------------------------------------------------ beginning a map
+
+    def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
+        """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
+        if np.count_nonzero(observations.z > 0) < MIN_INITIAL:
+            return self._result(None)
+        result = self._begin_map(frame, observations, np.eye(4))
+        self._first = (frame, observations) if self._rolling else None
+        return result
+
+    def _usable_features(self, observations: Observations) -> int:
+        """How many features a map could begin with."""
+        return int(np.count_nonzero(observations.z > 0)) if self.uses_depth else len(observations)
+
+    def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> BackendResult:
+        """The frame becomes the first keyframe of the active map."""
+        self._tracked = True
+        self._last = tracked = TrackedFrame(
+            observations, np.full(len(observations), -1, np.int64), T_cam_world, frame.timestamp
+        )
+        timings = self._insert_keyframe(frame, tracked)
+        self._update_state()
+        self.history.append(frame.timestamp, self._reference, np.eye(4), KNOWN_POSE)
+        points = int(np.count_nonzero(tracked.point >= 0))
+        return replace(self._result(T_cam_world, timings), matches=points, inliers=points)
+
+    def _restart(
+        self,
+        frame: FrameBundle,
+        raw: Observations,
+        first: tuple[FrameBundle, Observations],
+        velocity: CameraVelocity,
+        inliers: int,
+    ) -> BackendResult:
+        """Begin the map again: the second frame tells the camera's motion in the first, whose points were distorted.
+
+        Where fewer points agree then than the `inliers` before, the first frame is left uncompensated.
+        """
+        for assumed in (velocity, None):
+            self.reset(self.camera, self.seed)
+            self.shutter.velocity = assumed
+            observations = first[1] if assumed is None else compensate_rolling_shutter(first[1], self.camera, assumed)
+            self._begin_map(first[0], observations, np.eye(4))
+            result = self._track(frame, raw)
+            if result.state == "ok" and result.inliers >= MIN_AGREEING * inliers:
+                break
+        return result
+
+    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> BackendResult | None:
+        """Begin a submap where the camera was lost, rotated as the images tell; None if not yet."""
+        self._note_submap(last, frame.timestamp)
+        return self._begin_map(frame, observations, self._gate.rotated(last))
+
+    def _note_submap(self, last: TrackedFrame, timestamp: float) -> None:
+        """A submap begins with the frame of this stamp."""
+        self._unrecognised = 0
+        start = se3.inverse(last.T_cam_world)[:3, 3]
+        self.atlas.begin_submap(start, self._gate.distance_m(last, timestamp), self._gate.slack)
 
     # ------------------------------------------------------------------ keyframes
 
-    def _keyframe_if_wanted(
-        self, frame: FrameBundle, tracked: Tracked, fit: MapFit, home: FirstPose | None
-    ) -> dict[str, float]:
-        """Make the tracked frame a keyframe if the rule or a join wants it, note its pose; what that took, by stage."""
-        spent: dict[str, float] = {}
+    def _update_map(
+        self, frame: FrameBundle, tracked: TrackedFrame, fit: MapFit, root: InitialPose | None
+    ) -> BackendResult:
+        """Make the tracked frame a keyframe if the policy or a merge asks for it, and add its pose to the history."""
+        timings: dict[str, float] = {}
         pose = fit.estimate.T_cam_world
-        wanted = home is not None or self._keyframes.wants(self.world, tracked, frame.index, self._reference)
-        if self._grows and wanted:
-            spent = self._make_keyframe(frame, tracked, home)
-            if self.settings.bundle_adjustment.enabled or self.settings.loop_closing.enabled:
-                pose = tracked.T_cam_world
-                self.motion.relocated(pose)
+        needed = root is not None or self._keyframes.needed(self.world, tracked, frame.index, self._reference)
+        if self._grows and needed:
+            timings = self._insert_keyframe(frame, tracked, root)
+            pose = tracked.T_cam_world
+            self.motion.relocated(pose)
         relative = pose @ se3.inverse(self.world.kf_pose[self._reference])
         self.history.append(frame.timestamp, self._reference, relative, fit.estimate.information)
-        self.state = self._state()
-        return spent
+        self._update_state()
+        result = replace(self._result(tracked.T_cam_world, timings), residual_px=fit.estimate.residual_px)
+        if root is None or not self.atlas.active or not self.loops.in_root_map:
+            return result
+        # the camera is in the root map, too: there its pose counts, and it may continue there
+        self.history.reanchor_newest(self.world, root.keyframe, root.T_cam_world)
+        if self.loops.leaves_submap:
+            point = np.full(len(tracked.observations), -1, np.int64)
+            point[root.matches.feature] = np.where(self.world.alive[root.matches.point], root.matches.point, -1)
+            self._last, self._reference = replace(tracked, point=point, T_cam_world=root.T_cam_world), root.keyframe
+            self._forget_motion()
+            self._update_state()
+        return replace(result, T_world_cam=se3.inverse(root.T_cam_world), state="ok")
 
-    def _make_keyframe(self, frame: FrameBundle, tracked: Tracked, home: FirstPose | None = None) -> dict[str, float]:
-        pose, at = tracked.T_cam_world, (frame.index, frame.timestamp, self._island)
-        slot, spent = self.mapper.insert(tracked.seen, tracked.point, pose, *at)
+    def _insert_keyframe(
+        self, frame: FrameBundle, tracked: TrackedFrame, root: InitialPose | None = None
+    ) -> dict[str, float]:
+        """Make a tracked frame a keyframe, with bundle adjustment and loop closing; returns seconds by stage."""
+        world, mapper = self.world, self.mapper
+        slot, timings = mapper.insert(
+            tracked.observations, tracked.point, tracked.T_cam_world, frame.index, frame.timestamp, self.atlas.active
+        )
         self._reference = slot
-        for dropped, heir, relative in self.mapper.dropped:
-            self.history.inherit(dropped, heir, relative)
+        for culled, replacement, relative in mapper.culled:
+            self.history.replace_keyframe(culled, replacement, relative)
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
-            before = self.world.kf_pose[slot].copy()
-            self.loops.close(slot, tracked.seen, home)
+            before = world.kf_pose[slot].copy()
+            self.loops.close(slot, tracked.observations, root)
             self.history.rescale(self.loops.rescaled)
-            if slot in self.loops.rescaled:  # what a loop turns with depth is within the motion's noise
-                self.motion.carried(before, self.world.kf_pose[slot], self.loops.rescaled[slot])
-            spent["loop_closing"] = perf_counter() - begin
+            if slot in self.loops.rescaled:  # the rotation by a loop with depth is within the motion's noise
+                self.motion.transformed(before, world.kf_pose[slot], self.loops.rescaled[slot])
+            timings["loop_closing"] = perf_counter() - begin
         self._keyframes.made(frame.index)
-        gone = [dropped for dropped, _, _ in self.mapper.dropped]
-        self._views.renew(slot, frame.depth, gone, self.settings.keyframes.depth_images)
-        tracked.point = self.world.kf_point[slot, : len(tracked.seen)].astype(np.int64)
-        tracked.T_cam_world = self.world.kf_pose[slot].copy()
-        self.world.release()
-        return spent
+        self._views.add_keyframe(slot, frame.depth)
+        tracked.point = world.kf_point[slot, : len(tracked.observations)].astype(np.int64)
+        tracked.T_cam_world = world.kf_pose[slot].copy()
+        world.release()
+        return timings
 
-    def _localised(self, T_cam_world: Array | None, spent: dict[str, float] | None = None) -> Localised:
-        """A frame's outcome with the state and the map as they are now; `spent` on a keyframe, if it became one."""
-        return Localised.of(self.world, self.state, T_cam_world, len(self.loops.closed), spent or {})
-
-    # ------------------------------------------------------------------ what others may see
+    # ------------------------------------------------------------------ what filters and files read
 
     def predict(self, timestamp: float) -> Array | None:
         """The motion model's camera-to-world pose at a time, after a long gap the last tracked one; None while lost.
 
         Args:
-            timestamp: The stamp of the frame to come, seconds.
+            timestamp: The stamp of the next frame, seconds.
         """
         if self._last is None or not self._tracked:
             return None
-        regular = self.motion.regular(self._last, timestamp)
-        return se3.inverse(self.motion.predicted(self._last, regular, self.settings.motion))
+        return se3.inverse(self.motion.predicted(self._last, self.motion.regular(self._last, timestamp)))
 
     def motion_covariance(self, timestamp: float) -> Array | None:
         """Covariance ``[6, 6]`` of the camera's motion since the last frame, about the predicted one.
@@ -357,20 +425,19 @@ class RgbdBackend:
         nothing is known yet, and after a gap that nothing is assumed about.
 
         Args:
-            timestamp: The stamp of the frame to come, seconds.
+            timestamp: The stamp of the next frame, seconds.
         """
         if self._last is None:
             return None
-        regular = self.motion.regular(self._last, timestamp)
-        return self.motion.covariance(self._last, regular, self.settings.motion)
+        return self.motion.covariance(self._last, self.motion.regular(self._last, timestamp))
 
     def keyframe_views(self, limit: int) -> tuple[KeyframeView, ...]:
         """The newest keyframes of the map that the camera is in, newest first, at most `limit`."""
-        return self._views.keyframes(limit, self._island)
+        return self._views.keyframes(limit, self.atlas.active)
 
     def map_points(self) -> tuple[NDArray[np.int64], Array]:
         """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all points of the map that the camera is in."""
-        return self._views.points(self._island)
+        return self._views.points(self.atlas.active)
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""
@@ -387,14 +454,89 @@ class RgbdBackend:
             TrackerError: There is no map yet, or it is too large for a file.
             DynslamError: The file cannot be written.
         """
-        save(path, self.world, self._islands, self._made_of, depth=self.uses_depth, made_by=made_by)
+        save_atlas(path, self.atlas, self._features, depth=self.uses_depth, made_by=made_by)
+
+    def resume(self) -> None:
+        """The run goes on after a `finalize`: the map is again what it was before."""
+        if self.mapper.refined:
+            self.mapper.resume()
+            self._views.clear()
 
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
 
-        With `bundle_adjustment.full` all of the map is refined first, unless the run only localises in it; should
-        the run go on, that is taken back.
+        With `bundle_adjustment.full` the whole map is refined first, unless the run only localises in it; `resume`
+        undoes that.
         """
         if self._grows and self.settings.bundle_adjustment.full:
             self.mapper.adjust_all()
+            self._views.clear()
         return self.history.trajectory(self.world, self.settings.motion)
+
+
+class MonocularBackend(RgbdBackend):
+    """Tracks frames against a map whose points are triangulated; lengths are in units of its initial median depth.
+
+    No feature has a depth. The scale of bundle adjustment is free but for the keyframes that stay.
+    """
+
+    uses_depth = False
+    settings_type = MonocularBackendSettings
+    settings: MonocularBackendSettings
+
+    def reset(self, camera: Camera, seed: int) -> None:
+        """Forget everything: a new sequence begins."""
+        super().reset(camera, seed)
+        self._initialiser = TwoViewInitialiser()
+
+    def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
+        """Frames are ``initialising`` until one determines the motion together with an earlier one."""
+        begin = perf_counter()
+        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
+        if initial is None:
+            return self._result(None)
+        return self._begin_from_two(initial, np.eye(4), perf_counter() - begin)
+
+    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> BackendResult | None:
+        """Begin a submap as the root map began; its unit of length is the median depth of its own views."""
+        begin = perf_counter()
+        if self._unrecognised == self.settings.relocalisation.new_map_after:
+            self._initialiser = TwoViewInitialiser()
+        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
+        if initial is None:
+            return None
+        seconds = perf_counter() - begin
+        self._note_submap(last, initial.first.frame.timestamp)
+        T_first_world = last.T_cam_world.copy()
+        T_first_world[:3] = initial.motion.T_second_first[:3, :3].T @ self._gate.rotated(last)[:3]
+        return self._begin_from_two(initial, T_first_world, seconds)
+
+    def _begin_from_two(self, initial: InitialMap, T_first_world: Array, seconds: float) -> BackendResult:
+        """The two views become keyframes; the second, which is the current frame, is tracked."""
+        first, second = initial.insert_into(self.world, T_first_world, self.atlas.active)
+        frame, observations, pose = initial.second.frame, initial.second.observations, self.world.kf_pose[second].copy()
+        self._initialiser = TwoViewInitialiser()
+        self._tracked = True
+        point = self.world.kf_point[second, : len(observations)].astype(np.int64)
+        self._last = TrackedFrame(observations, point, pose, frame.timestamp)
+        self._reference = second
+        self._keyframes.made(frame.index)
+        self._views.add_keyframe(first, initial.first.frame.depth)
+        self._views.add_keyframe(second, frame.depth)
+        self._update_state()
+        self.history.append(frame.timestamp, second, np.eye(4), KNOWN_POSE)
+        count = len(initial.motion.points)
+        return replace(self._result(pose, {"mapping": seconds}), matches=count, inliers=count)
+
+
+def build_backend(settings: BackendSettings, scale_factor: float, levels: int, extractor: str) -> RgbdBackend:
+    """The back end that settings ask for: with depth or, of `MonocularBackendSettings`, without.
+
+    Args:
+        settings: Of the back end.
+        scale_factor: Ratio of consecutive pyramid levels of the features.
+        levels: Number of pyramid levels of the features.
+        extractor: Id of the feature extractor.
+    """
+    kind = MonocularBackend if isinstance(settings, MonocularBackendSettings) else RgbdBackend
+    return kind(settings, scale_factor=scale_factor, levels=levels, extractor=extractor)

@@ -1,133 +1,214 @@
 """Loop closing, the last row of the paper's Figure 2: recognise a place, verify it, correct the map, fuse it.
 
-1. *Detect*: keyframes that share few points with the newest one, and are old, are ranked by how much they look like
-   it (`places`: nothing is trained or downloaded). Those that do so no less than its neighbours do, the best few of
-   them, are matched feature by feature.
+1. *Detect*: old keyframes that are weakly connected with the newest one are ranked by place recognition. The best few
+   of those that score no less than its neighbours are matched feature by feature.
 2. *Verify*: a pose by RANSAC, then by all points around the candidate, and without depth the scale. It must explain
-   most of what should be in view, agree with the keyframes before, and ask for no more correction than the way since
-   the candidate may have drifted. The last condition is ours: rooms that look the same pass all others.
-3. *Correct*: a pose graph over all keyframes: neighbours, those that share many points, all loops. Without depth the
-   scale drifts as well: each keyframe's scale is found first, then the poses. A map of its own, begun after the camera
-   was lost where nothing was recognised, is moved to where it belongs instead, as it is.
-4. *Fuse*: points of both visits that are one thing in the world are merged, and the surroundings are adjusted.
+   most of what should be in view, agree with the keyframes before, and ask for no more correction than the path since
+   the candidate may have drifted. The last condition is this project's: buildings that repeat pass all others.
+3. *Correct*: a pose graph over all keyframes: neighbours, those that share many points, all loop edges. Without depth
+   the scale drifts as well: each keyframe's scale is solved first, then the poses. A submap is merged instead: it is
+   moved as a whole.
+4. *Fuse*: duplicate points of both visits are merged, and the local map is adjusted.
 
-Lengths are metres; without depth they are in units of the first map's median depth.
+Lengths are metres; without depth they are in units of the root map's median depth.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
-
-from .bundle.pose_graph import Edge, inherited, optimise_poses, rescaled, spread_scale, within
-from .corrections import Correction, Loop
-from .localisation.first_pose import FirstPose
-from .localisation.lookalikes import Sight, ambiguous
-from .localisation.observation import Observations
-from .localisation.recognition import Recognised, around, imprecision, points_around, recognise
-from .localisation.relocalisation import match_keyframe, ransac_pose
-from .localisation.surroundings import not_held
-from .localisation.tracking import Matches
-from .mapping.islands import Islands
-from .mapping.local_mapping import LocalMapper
-from .mapping.map import Map
-from .mapping.map_kernels import distinct
-from .places import likeness
-from .settings import BackendSettings
+from dynslam_bench.slam.atlas import Atlas
+from dynslam_bench.slam.local_mapping import LocalMapper
+from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.place_recognition import (
+    PlaceHypothesis,
+    PlaceMatch,
+    around,
+    is_aliased,
+    match_keyframe,
+    pose_uncertainty,
+    ransac_matches,
+    recognition_scores,
+    verify_place,
+)
+from dynslam_bench.slam.pose_graph import (
+    Edge,
+    edges_within,
+    optimise_poses,
+    rescaled_edges,
+    spread_scale,
+    transferred_edges,
+)
+from dynslam_bench.slam.relocalisation import InitialPose
+from dynslam_bench.slam.settings import BackendSettings
+from dynslam_bench.slam.tracking import Matches, weakly_connected
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
-STRONG = 100
-"""Keyframes that share so many points are tied in the pose graph (ORB-SLAM2's number)."""
+CANDIDATES = 3
+"""Best-ranked keyframes that are matched feature by feature."""
+MIN_MATCHES = 20
+"""Descriptor matches that a candidate needs; half of them must be RANSAC inliers."""
+MIN_SHARE = 0.3
+"""Share of the candidate's own points in view that must be seen."""
+MERGE_INLIERS, MERGE_SHARE = 100, 0.5
+"""The same, and the number of inliers, where two maps are merged, which no drift bounds."""
+MERGE_UNCERTAINTY = 0.4
+"""Largest `place_recognition.pose_uncertainty` of a pose by which maps are merged."""
+STRONG_COVISIBILITY = 100
+"""Keyframes that share so many points have an edge in the pose graph (ORB-SLAM2's number)."""
 SLACK_M, SLACK_DEG = 0.1, 3.0
-"""Correction that is believed however short the way."""
-TURN_M = 3.0
-"""Metres of way that a turn by one radian counts as: it renews the view as much as walking past a wall 3 m away."""
-TURN_DEPTHS = 1.0
-"""The same without depth: the wall is as far away as what the first map showed."""
-STRETCH = 100.0
-"""Way along which drift adds up; of a longer one each such stretch drifts by itself, so that the root of it counts."""
+"""Correction that is accepted however short the path is."""
+DRIFT_DEG = 0.5
+"""Largest rotation that is accepted, degrees a metre (or unit of length) of path."""
+ROTATION_M, ROTATION_DEPTHS = 3.0, 1.0
+"""Path length that a rotation by one radian counts as, with depth and without: it renews the view as much as passing a
+wall so far away."""
+DRIFT_SECTION = 100.0
+"""Path along which drift adds up; sections of a longer one drift independently, so that its root counts."""
 NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
 """A smaller correction is left to fusion and bundle adjustment; of a scale, its logarithm."""
-MOST_SCALE = 3.0
-"""Factor by which scale may have drifted, at most, where it is free."""
-FIRM = 100.0
-"""Weight of a loop's tie, where neighbours' ties weigh 1: what it leaves open between two visits bends both."""
+MAX_SCALE = 3.0
+"""Factor by which scale may have drifted at most."""
+MIN_SCALE_POINTS = 20
+"""Features with a point of both visits that determine the scale at least."""
+LOOP_WEIGHT = 100.0
+"""Information weight of a loop edge, where other edges have 1: an error left between two visits bends both."""
 PATIENCE = 5
-"""Frames after which a camera leaves an island for the first map, if that could not be joined by then."""
-FIRMLY = 0.4
-"""So imprecise, at most, is a pose by which maps are joined (`localisation.recognition`)."""
-SCALE_POINTS = 20
-"""So many features with a point of both visits are needed to tell the scale."""
+"""Frames after which a camera leaves a submap for the root map if the two were not merged by then."""
+AGREE_M, AGREE_DEG, AGREE_SCALE = 0.1, 2.0, 0.1
+"""Largest difference of the corrections of consecutive keyframes; of a scale, its logarithm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The similarity that a keyframe asks for when it recognises a place.
+
+    Attributes:
+        T_cam_before: Its pose ``[4, 4]`` as the map has it, world to camera.
+        T_cam_now: Its pose by the place that it recognises.
+        scale: What lengths around it are to be multiplied by.
+    """
+
+    T_cam_before: Array
+    T_cam_now: Array
+    scale: float
+
+    @property
+    def T_now_before(self) -> Array:
+        """From the keyframe's world, once its lengths are multiplied, to that of the place, ``[4, 4]``."""
+        before = self.T_cam_before.copy()
+        before[:3, 3] *= self.scale
+        return se3.inverse(self.T_cam_now) @ before
+
+    @property
+    def inverse(self) -> Correction:
+        """The correction of the place if the keyframe stays instead."""
+        return Correction(self.T_cam_now, self.T_cam_before, 1 / self.scale)
+
+    def moved(self, at: Array) -> Array:
+        """Where a place ``[3]`` near the keyframe is after the correction, ``[3]``."""
+        local = self.scale * se3.transform(self.T_cam_before, at[None])
+        return np.asarray(se3.transform(se3.inverse(self.T_cam_now), local)[0])
+
+    def agrees(self, other: Correction, at: Array) -> bool:
+        """Whether another correction moves a place nearly as this one does."""
+        distance = np.linalg.norm(self.moved(at) - other.moved(at))
+        rotation = se3.rotation_angle(self.T_now_before @ se3.inverse(other.T_now_before))
+        scale = abs(np.log(self.scale / other.scale))
+        return bool(distance < AGREE_M and np.degrees(rotation) < AGREE_DEG and scale < AGREE_SCALE)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A place that was recognised.
+
+    Attributes:
+        keyframe: Slot, at that time, of the keyframe that was recognised.
+        frame: Index of that keyframe's frame.
+        T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
+        inliers: Points that fit it.
+        share: Which share of the keyframe's own points in view is among them.
+        merges: Whether the place lies in another submap.
+        moved_m: Distance of the correction.
+        rotated_deg: Rotation of the correction, degrees.
+        scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
+        fits: Whether the submap can have begun where the merge puts its start; not so after much drift.
+    """
+
+    keyframe: int
+    frame: int
+    T_cam_world: Array
+    inliers: int
+    share: float
+    merges: bool
+    moved_m: float
+    rotated_deg: float
+    scale: float
+    fits: bool = True
 
 
 class LoopCloser:
     """Looks for loops at every new keyframe, and closes them.
 
     Args:
-        world: The map.
+        atlas: The maps.
         mapper: Fuses and adjusts.
-        islands: Where parts of the map may lie that are connected with the first one by nothing.
         settings: Of the back end.
         seed: Founds RANSAC's draws.
         scale_is_known: Whether lengths are metres everywhere, as with depth.
+
+    Attributes:
+        closed: All loops that were closed.
+        rescaled: Scales of the keyframes, by slot, that the last `close` rescaled (or with depth moved to another map).
+        in_root_map: Whether the last `close` found a submap's camera in the root map.
+        leaves_submap: Whether the camera is to continue in the root map.
     """
 
     def __init__(
-        self,
-        world: Map,
-        mapper: LocalMapper,
-        islands: Islands,
-        settings: BackendSettings,
-        seed: int,
-        *,
-        scale_is_known: bool = True,
+        self, atlas: Atlas, mapper: LocalMapper, settings: BackendSettings, seed: int, *, scale_is_known: bool = True
     ) -> None:
-        self.world = world
+        self.atlas = atlas
+        self.world = atlas.world
         self.mapper = mapper
-        self.islands = islands
         self.settings = settings
         self.closed: list[Loop] = []
-        """All loops that were closed."""
         self.rescaled: dict[int, float] = {}
-        """By what the last call of `close` rescaled the surroundings of keyframes, by their slots; with depth by 1, and
-        of those alone that it moved to another map."""
-        self.at_home = self.leaves = False
-        """Whether an island's camera was in the first map by the last call of `close`, and is to go on there."""
+        self.in_root_map = self.leaves_submap = False
         self._seed = seed
         self._scale_is_known = scale_is_known
-        self._way: dict[int, float] = {}
-        self._walked = 0.0
-        self._short_cuts: list[tuple[float, float]] = []
+        self._path: dict[int, float] = {}
+        self._path_length = 0.0
+        self._shortcuts: list[tuple[float, float]] = []
         self._last_pose: Array | None = None
         self._row: list[Correction] = []
-        self._met: int | None = None
-        self._ties: list[Edge] = []
+        self._met_at: int | None = None
+        self._loop_edges: list[Edge] = []
 
-    def close(self, slot: int, seen: Observations, home: FirstPose | None = None) -> bool:
-        """Look for a loop at a new keyframe; correct and fuse the map if enough keyframes in a row agree on one.
+    def close(self, slot: int, observations: Observations, root: InitialPose | None = None) -> bool:
+        """Look for a loop at a new keyframe; correct and fuse the map if enough consecutive keyframes agree on one.
 
         Args:
             slot: The keyframe.
-            seen: Its features.
-            home: Its pose in the first map, if the camera is on an island and was found there.
+            observations: Its features.
+            root: Its pose in the root map, if the camera is in a submap and was found there.
 
         Returns:
             Whether a loop was closed; every pose and point may have changed then.
         """
-        self.rescaled, self.at_home, self.leaves = {}, False, False
-        self._note_way(slot)
-        for dropped, heir, relative in self.mapper.dropped if self._ties else ():
-            gone, stands = (int(self.world.kf_id[each]) for each in (dropped, heir))
-            self._ties = inherited(self._ties, gone, stands, relative)
-        loop = self._verified(slot, seen) if home is None else self._at_home(slot, seen, home)
-        self._met = self._met if self.at_home else None
+        self.rescaled, self.in_root_map, self.leaves_submap = {}, False, False
+        self._extend_path(slot)
+        for culled, replacement, relative in self.mapper.culled if self._loop_edges else ():
+            ids = int(self.world.kf_id[culled]), int(self.world.kf_id[replacement])
+            self._loop_edges = transferred_edges(self._loop_edges, *ids, relative)
+        loop = self._verified(slot, observations) if root is None else self._loop_to_root(slot, observations, root)
+        self._met_at = self._met_at if self.in_root_map else None
         if loop is None:
             self._row.clear()
             return False
@@ -137,190 +218,185 @@ class LoopCloser:
         self._row.append(correction)
         if len(self._row) < self.settings.loop_closing.confirmations:
             return False
-        loop = replace(loop, scale=float(np.median([each.scale for each in self._row])))
+        loop = replace(loop, scale=float(np.median([correction.scale for correction in self._row])))
         self._row.clear()
         if not loop.fits:
-            self.leaves = self.at_home = home is not None
+            self.leaves_submap = self.in_root_map = root is not None
             return False
-        if loop.joins and home is None and self._ambiguous(slot, seen, loop):
+        if loop.merges and root is None and self._aliased(slot, observations, loop):
             return False
-        if loop.joins:
-            self._join(slot, loop)
+        if loop.merges:
+            self._merge(slot, loop)
         else:
             self._correct(slot, loop)
         self._fuse(slot, loop.keyframe)
-        self._short_cuts.append((self._way_at(loop.keyframe), self._walked))
+        self._shortcuts.append((self._path_at(loop.keyframe), self._path_length))
         self.closed.append(loop)
-        self._last_pose = self.world.kf_pose[slot].copy()  # a correction is no way
+        self._last_pose = self.world.kf_pose[slot].copy()  # a correction adds no path
         return True
 
     # ------------------------------------------------------------------ detect and verify
 
-    def _note_way(self, slot: int) -> None:
+    def _extend_path(self, slot: int) -> None:
         pose, number = self.world.kf_pose[slot].copy(), int(self.world.kf_id[slot])
-        for begun in range(next(reversed(self._way), number - 1) + 1, number):  # the first two views of an island
-            self._way[begun] = self._walked
+        for begun in range(next(reversed(self._path), number - 1) + 1, number):  # the first two views of a submap
+            self._path[begun] = self._path_length
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)
-            turn = TURN_M if self._scale_is_known else TURN_DEPTHS
-            self._walked += float(np.linalg.norm(step[:3, 3]) + turn * se3.rotation_angle(step))
+            rotation = ROTATION_M if self._scale_is_known else ROTATION_DEPTHS
+            self._path_length += float(np.linalg.norm(step[:3, 3]) + rotation * se3.rotation_angle(step))
         self._last_pose = pose
-        self._way[number] = self._walked
+        self._path[number] = self._path_length
 
-    def _verified(self, slot: int, seen: Observations) -> Loop | None:
-        s = self.settings.loop_closing
-        elsewhere = not_held(self.world, slot, s.away)
-        there, here = self.world.kf_island[elsewhere], self.world.kf_island[slot]
-        elsewhere = elsewhere[(there == here) | (there == 0) | (here == 0)]
-        if not len(elsewhere):
+    def _verified(self, slot: int, observations: Observations) -> Loop | None:
+        """The first of the best-ranked candidates that is verified."""
+        world = self.world
+        old = weakly_connected(world, slot)
+        there, here = world.kf_map[old], world.kf_map[slot]
+        old = old[(there == here) | (there == 0) | (here == 0)]
+        if not len(old):
             return None
-        rng = stream(self._seed, "loop", int(self.world.kf_id[slot]))
-        for candidate in self._as_alike_as_neighbours(slot, elsewhere, seen):
-            matches = match_keyframe(self.world, candidate, seen, self.settings.relocalisation.max_distance)
-            if len(matches) < s.min_matches:
+        near = np.setdiff1d(around(world, slot)[1:], old)
+        score = recognition_scores(world, np.concatenate([near, old]), observations)
+        least, score = score[: len(near)].min(initial=np.inf), score[len(near) :]
+        rng = stream(self._seed, "loop", int(world.kf_id[slot]))
+        for row in np.argsort(-score, kind="stable")[:CANDIDATES]:
+            if score[row] < least:
                 continue
-            loop = self._by_points_around(slot, candidate, seen, matches, rng)
+            matches = match_keyframe(world, int(old[row]), observations)
+            if len(matches) < MIN_MATCHES:
+                continue
+            loop = self._verified_candidate(slot, int(old[row]), observations, matches, rng)
             if loop is not None:
                 return loop
         return None
 
-    def _as_alike_as_neighbours(self, slot: int, elsewhere: Slots, seen: Observations) -> list[int]:
-        near = np.setdiff1d(around(self.world, slot)[1:], elsewhere)  # what is to be recognised is no measure of it
-        score = likeness(self.world, np.concatenate([near, elsewhere]), seen)
-        least = score[: len(near)].min(initial=np.inf)
-        there = score[len(near) :]
-        best = np.argsort(-there, kind="stable")[: self.settings.loop_closing.candidates]
-        return [int(elsewhere[row]) for row in best if there[row] >= least]
-
-    def _by_points_around(
-        self, slot: int, candidate: int, seen: Observations, matches: Matches, rng: np.random.Generator
+    def _verified_candidate(
+        self, slot: int, candidate: int, observations: Observations, matches: Matches, rng: np.random.Generator
     ) -> Loop | None:
-        """The pose by all points around a candidate, if it explains enough and is not too far to be drift."""
-        world, s = self.world, self.settings.loop_closing
-        f = matches.feature
-        iterations = self.settings.relocalisation.iterations
-        found = ransac_pose(matches.position, seen.xy[f], seen.info[f], world.camera, iterations, rng)
-        if found is None or np.count_nonzero(found[1]) < s.min_matches // 2:
+        """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
+        s = self.settings.loop_closing
+        ransac = ransac_matches(matches, observations, self.world.camera, rng, MIN_MATCHES // 2)
+        if ransac is None:
             return None
-        pose, inliers = found
-        place = recognise(world, candidate, seen, matches.select(inliers), pose, self.settings.tracking)
-        if len(place.matches) < s.min_inliers or place.share < s.min_share:
+        pose, inliers = ransac
+        place = verify_place(self.world, candidate, observations, inliers, pose, self.settings.tracking)
+        if len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
             return None
         loop = self._loop(slot, candidate, place)
-        if loop is None or (loop.joins and imprecision(world, seen, place, rng) > FIRMLY):
+        if loop is None or (loop.merges and pose_uncertainty(self.world, observations, place, rng) > MERGE_UNCERTAINTY):
             return None
-        return loop if self._believable(slot, loop) else None
+        return loop if self._within_drift(slot, loop) else None
 
-    def _at_home(self, slot: int, seen: Observations, home: FirstPose) -> Loop | None:
-        """The place in the first map where an island's camera was found, if it tells well enough how the two lie."""
+    def _loop_to_root(self, slot: int, observations: Observations, root: InitialPose) -> Loop | None:
+        """The loop to the place in the root map where a submap's camera is, if it determines the merge well enough."""
         s, world, frame = self.settings.loop_closing, self.world, int(self.world.kf_frame[slot])
-        loop = self._loop(slot, home.keyframe, Recognised(home.T_cam_world, home.matches, home.share))
-        if loop is None or not world.kf_alive[home.keyframe]:
+        loop = self._loop(slot, root.keyframe, PlaceMatch(root.T_cam_world, root.matches, root.share))
+        if loop is None or not world.kf_alive[root.keyframe]:
             return None
-        if (loop.fits or self._scale_is_known) and self._ambiguous(slot, seen, loop):
+        if (loop.fits or self._scale_is_known) and self._aliased(slot, observations, loop):
             return None
-        well = loop.inliers >= s.min_inliers and loop.share >= s.join_share and home.imprecision <= FIRMLY
-        self.at_home = loop.fits
-        self._met = frame if self._met is None else self._met
-        self.leaves = self.at_home and not well and frame - self._met >= PATIENCE
+        precise = root.uncertainty <= MERGE_UNCERTAINTY
+        well = loop.inliers >= s.min_inliers and loop.share >= MERGE_SHARE and precise
+        self.in_root_map = loop.fits
+        self._met_at = frame if self._met_at is None else self._met_at
+        self.leaves_submap = self.in_root_map and not well and frame - self._met_at >= PATIENCE
         return loop if well else None
 
-    def _loop(self, slot: int, candidate: int, place: Recognised) -> Loop | None:
-        """What a place asks for; None where too little tells the scale."""
+    def _loop(self, slot: int, candidate: int, place: PlaceMatch) -> Loop | None:
+        """The correction to a place; None where too few points determine the scale."""
         world = self.world
         scale = 1.0 if self._scale_is_known else self._scale(slot, place)
         if scale is None:
             return None
         T_cam_world = place.T_cam_world
         moved = float(np.linalg.norm(se3.inverse(T_cam_world)[:3, 3] - world.kf_centre[slot]))
-        turned = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
-        back, joins = int(world.kf_frame[candidate]), bool(world.kf_island[candidate] != world.kf_island[slot])
-        loop = Loop(candidate, back, T_cam_world, len(place.matches), place.share, joins, moved, turned, scale)
-        return replace(loop, fits=self._fits(slot, loop)) if joins else loop
+        rotated = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
+        frame, merges = int(world.kf_frame[candidate]), bool(world.kf_map[candidate] != world.kf_map[slot])
+        loop = Loop(candidate, frame, T_cam_world, len(place.matches), place.share, merges, moved, rotated, scale)
+        return replace(loop, fits=self._fits(slot, loop)) if merges else loop
 
-    def _scale(self, slot: int, place: Recognised) -> float | None:
-        """How many times as deep points lie by the first visit as by this one; None where too few tell."""
-        world, theirs = self.world, place.matches
-        own = world.kf_point[slot, theirs.feature].astype(np.int64)
-        both = (own >= 0) & (own != theirs.point)
-        if np.count_nonzero(both) < SCALE_POINTS:
+    def _scale(self, slot: int, place: PlaceMatch) -> float | None:
+        """Median ratio of the depths of common points by the first visit and by this one; None where too few."""
+        world, first = self.world, place.matches
+        own = world.kf_point[slot, first.feature].astype(np.int64)
+        both = (own >= 0) & (own != first.point)
+        if np.count_nonzero(both) < MIN_SCALE_POINTS:
             return None
-        then = se3.transform(place.T_cam_world, world.position[theirs.point[both]])[:, 2]
+        then = se3.transform(place.T_cam_world, world.position[first.point[both]])[:, 2]
         now = se3.transform(world.kf_pose[slot], world.position[own[both]])[:, 2]
         ahead = (then > 0) & (now > 0)
-        return float(np.exp(np.median(np.log(then[ahead] / now[ahead])))) if ahead.sum() >= SCALE_POINTS else None
+        return float(np.exp(np.median(np.log(then[ahead] / now[ahead])))) if ahead.sum() >= MIN_SCALE_POINTS else None
 
-    def _believable(self, slot: int, loop: Loop) -> bool:
-        """Whether drift explains the correction; where islands meet, whether the camera can have got from one there."""
-        s = self.settings.loop_closing
-        if loop.joins and (loop.inliers < s.join_inliers or loop.share < s.join_share):
+    def _within_drift(self, slot: int, loop: Loop) -> bool:
+        """Whether drift explains the correction; between submaps, whether the camera can have moved from one there."""
+        if loop.merges:
+            if loop.inliers < MERGE_INLIERS or loop.share < MERGE_SHARE:
+                return False
+            here, there = (int(self.world.kf_map[keyframe]) for keyframe in (slot, loop.keyframe))
+            return loop.fits and bool(np.radians(loop.rotated_deg) <= self.atlas.slack(here, there))
+        if not 1 / MAX_SCALE < loop.scale < MAX_SCALE:
             return False
-        if loop.joins:
-            here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
-            return loop.fits and bool(np.radians(loop.turned_deg) <= self.islands.slack(here, there))
-        way = self._way_to(loop.keyframe)
-        if not 1 / MOST_SCALE < loop.scale < MOST_SCALE:
-            return False
-        return loop.moved_m <= SLACK_M + s.drift_share * way and loop.turned_deg <= SLACK_DEG + s.drift_deg * way
+        path = self._path_since(loop.keyframe)
+        moved_limit = SLACK_M + self.settings.loop_closing.drift_share * path
+        return loop.moved_m <= moved_limit and loop.rotated_deg <= SLACK_DEG + DRIFT_DEG * path
 
     def _fits(self, slot: int, loop: Loop) -> bool:
-        """Whether the younger of two islands can have begun where the older one would have it."""
-        younger, _, move = self._moves(slot, loop)
+        """Whether the younger of two submaps can have begun where the merge puts its start."""
+        younger, _, correction = self._merge_of(slot, loop)
         share = 0.0 if self._scale_is_known else self.settings.loop_closing.drift_share
-        return self.islands.may_lie(younger, move.moved, share * self._way_around(slot, loop))
+        left = self._path_at(int(self.world.submap(younger)[0]))
+        ends = (slot, loop.keyframe) if self.world.kf_map[slot] == younger else (loop.keyframe, slot)
+        on_younger, on_older = (abs(self._path_at(keyframe) - left) for keyframe in ends)
+        path = correction.scale * on_younger + on_older  # from the meeting place back to where the older was left
+        return self.atlas.admits_start(younger, correction.moved, share * path)
 
-    def _ambiguous(self, slot: int, seen: Observations, loop: Loop) -> bool:
-        """Whether the keyframe looks like two places: nothing but what is seen tells how islands lie together."""
+    def _aliased(self, slot: int, observations: Observations, loop: Loop) -> bool:
+        """Whether the keyframe fits two places: nothing but what is seen tells how two maps lie to each other."""
         world = self.world
-        here, there = (int(world.kf_island[each]) for each in (slot, loop.keyframe))
+        here, there = (int(world.kf_map[keyframe]) for keyframe in (slot, loop.keyframe))
         own = world.kf_point[slot, world.kf_point[slot] >= 0]
         depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[own])[:, 2]))
-        known = {here: Sight(world.kf_pose[slot], loop.share, depth)}
-        known[there] = Sight(loop.T_cam_world, loop.share, depth * loop.scale)
-        elsewhere = not_held(world, slot, self.settings.loop_closing.away)
-        return ambiguous(world, seen, known, elsewhere, self.settings, self._seed)
+        hypotheses = {here: PlaceHypothesis(world.kf_pose[slot], loop.share, depth)}
+        hypotheses[there] = PlaceHypothesis(loop.T_cam_world, loop.share, depth * loop.scale)
+        old = weakly_connected(world, slot)
+        return is_aliased(world, observations, hypotheses, old, self.settings.tracking, self._seed)
 
-    def _way_to(self, slot: int) -> float:
-        """The way whose drift adds up since a keyframe: walked and turned, or over a closed loop."""
-        then = self._way_at(slot)
-        way = min([self._walked - then, *(abs(then - old) + self._walked - new for old, new in self._short_cuts)])
-        return min(way, float(np.sqrt(STRETCH * way)))
+    def _path_since(self, slot: int) -> float:
+        """The path whose drift adds up since a keyframe: the length since then, or over a closed loop."""
+        then = self._path_at(slot)
+        shortcuts = (abs(then - old) + self._path_length - new for old, new in self._shortcuts)
+        path = min([self._path_length - then, *shortcuts])
+        return min(path, float(np.sqrt(DRIFT_SECTION * path)))
 
-    def _way_around(self, slot: int, loop: Loop) -> float:
-        """The way from where one island meets another back to where it left it, in the older one's unit of length."""
-        younger, _, move = self._moves(slot, loop)
-        left = self._way_at(int(self.world.island(younger)[0]))
-        ends = (slot, loop.keyframe) if self.world.kf_island[slot] == younger else (loop.keyframe, slot)
-        on_younger, on_older = (abs(self._way_at(each) - left) for each in ends)
-        return move.scale * on_younger + on_older
-
-    def _way_at(self, slot: int) -> float:
-        """The way up to a keyframe; none up to those of a loaded map."""
-        return self._way.get(int(self.world.kf_id[slot]), 0.0)
+    def _path_at(self, slot: int) -> float:
+        """Path length up to a keyframe; 0 for those of a loaded map."""
+        return self._path.get(int(self.world.kf_id[slot]), 0.0)
 
     # ------------------------------------------------------------------ correct and fuse
 
     def _correct(self, slot: int, loop: Loop) -> None:
         """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
         world = self.world
-        tie = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=FIRM)
-        older = within(world.kf_id[world.keyframes], self._ties)
-        self._ties = [*older, tie]
-        small = loop.moved_m < NEGLIGIBLE_M and loop.turned_deg < NEGLIGIBLE_DEG
+        loop_edge = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=LOOP_WEIGHT)
+        older = edges_within(world.kf_id[world.keyframes], self._loop_edges)
+        self._loop_edges = [*older, loop_edge]
+        small = loop.moved_m < NEGLIGIBLE_M and loop.rotated_deg < NEGLIGIBLE_DEG
         if small and abs(np.log(loop.scale)) < NEGLIGIBLE_SCALE:
             return
-        slots = world.island(int(world.kf_island[slot]))
+        submap = int(world.kf_map[slot])
+        slots = world.submap(submap)
         before, ids = world.kf_pose.copy(), world.kf_id[slots]
-        edges, scales = self._edges(slots), np.ones(world.kf_alive.size)
+        edges, scales = self._covisibility_edges(slots), np.ones(world.kf_alive.size)
         if not self._scale_is_known:
-            scales[slots] = spread_scale(ids, [*edges, *within(ids, older)], tie, loop.scale)
-            edges = rescaled(edges, ids, scales[slots])
+            scales[slots] = spread_scale(ids, [*edges, *edges_within(ids, older)], loop_edge, loop.scale)
+            edges = rescaled_edges(edges, ids, scales[slots])
             self._note_scales(slots, scales[slots])
-        after = optimise_poses(ids, before[slots], [*edges, *within(ids, self._ties)])
+        after = optimise_poses(ids, before[slots], [*edges, *edges_within(ids, self._loop_edges)])
         for at, pose in zip(slots.tolist(), after, strict=True):
             world.set_pose(at, pose)
-        self.islands.carried(int(world.kf_island[slot]), before[slots], after, scales[slots])
-        points = distinct(world.kf_point[slots], world.alive.size)
+        self.atlas.move_nearby(submap, before[slots], after, scales[slots])
+        points = world.points_of(slots)
         reference = world.obs_kf[world.obs_at[points]]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
         local *= scales[reference, None]
@@ -328,24 +404,24 @@ class LoopCloser:
         world.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
         world.refresh(points)
 
-    def _moves(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
-        """The younger of two islands that meet, the older one, and how the younger is to be moved."""
-        here, there = (int(self.world.kf_island[each]) for each in (slot, loop.keyframe))
-        move = Correction(self.world.kf_pose[slot].copy(), loop.T_cam_world, loop.scale)
-        return (here, there, move) if here > there else (there, here, move.inverse)
+    def _merge_of(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
+        """The younger of the two submaps, the older one, and the correction of the younger."""
+        here, there = (int(self.world.kf_map[keyframe]) for keyframe in (slot, loop.keyframe))
+        correction = Correction(self.world.kf_pose[slot].copy(), loop.T_cam_world, loop.scale)
+        return (here, there, correction) if here > there else (there, here, correction.inverse)
 
-    def _join(self, slot: int, loop: Loop) -> None:
-        """Move the younger of two islands as a whole to where the older one has the place."""
+    def _merge(self, slot: int, loop: Loop) -> None:
+        """Move the younger of two submaps as a whole to where the older one has the place."""
         world = self.world
-        younger, older, move = self._moves(slot, loop)
-        slots = world.island(younger)
-        world.move_island(younger, move.T_now_before, older, move.scale)
-        self._note_scales(slots, np.full(len(slots), move.scale))
-        self._ties.append(replace(self._edge(loop.keyframe, slot, world.kf_pose[slot]), weight=FIRM))
+        younger, older, correction = self._merge_of(slot, loop)
+        slots = world.submap(younger)
+        world.move_submap(younger, correction.T_now_before, older, correction.scale)
+        self._note_scales(slots, np.full(len(slots), correction.scale))
+        self._loop_edges.append(replace(self._edge(loop.keyframe, slot, world.kf_pose[slot]), weight=LOOP_WEIGHT))
 
     def _note_scales(self, slots: Slots, scales: Array) -> None:
         """Lengths around keyframes were multiplied."""
-        self._ties = rescaled(self._ties, self.world.kf_id[slots], scales)
+        self._loop_edges = rescaled_edges(self._loop_edges, self.world.kf_id[slots], scales)
         self.rescaled = dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array) -> Edge:
@@ -353,23 +429,22 @@ class LoopCloser:
         relative = pose_of_other @ se3.inverse(world.kf_pose[one])
         return Edge(int(world.kf_id[one]), int(world.kf_id[other]), relative)
 
-    def _edges(self, slots: Slots) -> list[Edge]:
-        """Ties between keyframes as the map is now: each with the older ones that share many points, and the most.
+    def _covisibility_edges(self, slots: Slots) -> list[Edge]:
+        """Edges of each keyframe to the older ones that share many points, and to the one that shares most.
 
-        Neighbours in time that share nothing are not tied: the camera was lost between them.
+        Neighbours in time that share nothing have none: the camera was lost between them.
         """
         pairs = set()
         for slot in slots.tolist():
             near, shared = self.world.covisible(slot)
             older = self.world.kf_id[near] < self.world.kf_id[slot]
             near, shared = near[older], shared[older]
-            pairs |= {(int(other), slot) for other in [*near[:1], *near[shared >= STRONG]]}
+            pairs |= {(int(other), slot) for other in [*near[:1], *near[shared >= STRONG_COVISIBILITY]]}
         return [self._edge(a, b, self.world.kf_pose[b]) for a, b in sorted(pairs)]
 
     def _fuse(self, slot: int, candidate: int) -> None:
-        theirs = points_around(self.world, candidate)
+        points = self.world.points_of(around(self.world, candidate))
         for keyframe in around(self.world, slot).tolist():
-            self.mapper.fuse_into(keyframe, theirs[self.world.alive[theirs]])
-        self.world.refresh(theirs[self.world.alive[theirs]])
-        if self.settings.bundle_adjustment.enabled:
-            self.mapper.adjust(slot)
+            self.mapper.fuse_into(keyframe, points[self.world.alive[points]])
+        self.world.refresh(points[self.world.alive[points]])
+        self.mapper.adjust(slot)

@@ -1,7 +1,209 @@
-"""Named benchmark suites, as TOML files."""
+"""Benchmark suites, as TOML files: which trackers run on which sequences, with which repeats."""
 
 from __future__ import annotations
 
-from .suite import Suite, Variant, load_suite, suite_names
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, ValidationError
+
+from dynslam_bench.core.errors import RunError, did_you_mean
+from dynslam_bench.core.reading import read_text
+from dynslam_bench.core.records import Record
+from dynslam_bench.core.settings import field_names
+from dynslam_bench.core.toml import parse_toml
+from dynslam_bench.runs.spec import Limits, RunSpec
+from dynslam_bench.trackers.registry import TRACKERS
 
 __all__ = ["Suite", "Variant", "load_suite", "suite_names"]
+
+Offset = Annotated[int, Field(ge=0)]
+
+
+class Variant(Record):
+    """One way to run everything in a suite.
+
+    Attributes:
+        name: Shown in tables; empty for the plain variant.
+        degrade: Strengths of `DegradeFrames`.
+        drop_share: Share of the frames dropped at random.
+        realtime: Whether frames are dropped while the tracker is busy.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = ""
+    degrade: dict[str, float] = Field(default_factory=dict)
+    drop_share: float = Field(default=0.0, ge=0, lt=1)
+    realtime: bool = False
+
+
+class Row(Record):
+    """A tracker once more, with settings of its own: a reference beside the systems.
+
+    Attributes:
+        tracker: One of the suite's trackers.
+        settings: What is different from its other row.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tracker: str
+    settings: dict[str, Any] = Field(min_length=1)
+
+
+class Suite(Record):
+    """A benchmark suite: every tracker on every sequence, with every seed, in every variant.
+
+    Attributes:
+        name: Its name.
+        title: One line for reports.
+        description: What it is for.
+        trackers: Ids, ``id:value``, ``module:Attr`` or ``file.py:Attr``.
+        optional: Trackers that take part only where the packages they need are installed.
+        sequences: Ids or folders.
+        seeds: Seeds.
+        offsets: Start offsets: so many leading frames are left out; repeats, like seeds (see `RunSpec.offset`).
+        frames: Part of every sequence, ``[start, stop]``; without it all.
+        stride: Take every so many frames.
+        threads: Threads of a run.
+        cache: Whether features and masks that trackers share are computed once (see `RunSpec.cache`).
+        settings: Overrides for every tracker that has the setting.
+        tracker_settings: Overrides by tracker.
+        rows: Further rows: trackers of the suite once more, with other settings.
+        variants: Ways to run everything.
+        limits: What a run may take.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    title: str = ""
+    description: str = ""
+    trackers: tuple[str, ...] = Field(min_length=1)
+    optional: tuple[str, ...] = ()
+    sequences: tuple[str, ...] = Field(min_length=1)
+    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
+    offsets: tuple[Offset, ...] = Field(default=(0,), min_length=1)
+    frames: tuple[int, int | None] | None = None
+    stride: int = Field(default=1, ge=1)
+    threads: int = Field(default=1, ge=1)
+    cache: bool = False
+    settings: dict[str, Any] = Field(default_factory=dict)
+    tracker_settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    rows: tuple[Row, ...] = ()
+    variants: tuple[Variant, ...] = Field(default=(Variant(),), min_length=1)
+    limits: Limits = Limits()
+
+    def specs(
+        self,
+        *,
+        data_root: str | Path | None = None,
+        device: str = "auto",
+        threads: int | None = None,
+        trackers: tuple[str, ...] = (),
+        seeds: tuple[int, ...] = (),
+        offsets: tuple[int, ...] = (),
+        frames: tuple[int, int | None] | None = None,
+    ) -> list[RunSpec]:
+        """The runs of the suite, sequence by sequence so that rendered frames are shared while they are fresh.
+
+        Args:
+            data_root: Folder of the recorded sequences.
+            device: Device of all runs.
+            threads: Threads of a run in place of the suite's.
+            trackers: Only these trackers of the suite, or others in place of them.
+            seeds: In place of the suite's seeds.
+            offsets: In place of the suite's start offsets.
+            frames: In place of the suite's frames.
+
+        Raises:
+            PluginError: A tracker is not known (with a did-you-mean).
+            RunError: A tracker is given settings but is no part of the suite.
+        """
+        shared: dict[str, Any] = {"frames": frames or self.frames, "stride": self.stride, "device": device}
+        shared |= {"threads": threads or self.threads, "cache": self.cache, "limits": self.limits}
+        shared |= {"data_root": None if data_root is None else str(data_root)}
+        entries = self._entries(trackers)
+        return [
+            RunSpec(
+                tracker=tracker,
+                sequence=sequence,
+                seed=seed,
+                offset=offset,
+                settings=settings,
+                degrade=variant.degrade,
+                drop_share=variant.drop_share,
+                realtime=variant.realtime,
+                **shared,
+            )
+            for sequence in self.sequences
+            for variant in self.variants
+            for tracker, settings in entries
+            for seed in seeds or self.seeds
+            for offset in offsets or self.offsets
+        ]
+
+    def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
+        """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
+        chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
+        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in chosen}
+        named = {*self.tracker_settings, *(row.tracker for row in self.rows)}
+        strangers = sorted(named - {*self.trackers, *self.optional})
+        if strangers:
+            raise RunError(
+                f"suite '{self.name}' has settings for '{strangers[0]}', which is none of its trackers",
+                did_you_mean(strangers[0], {*self.trackers, *self.optional}),
+            )
+        rows: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
+        rows += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
+        common = {
+            tracker: {name: value for name, value in self.settings.items() if name in field_sets[tracker]}
+            | self.tracker_settings.get(tracker, {})
+            for tracker in chosen
+        }
+        return [(tracker, common[tracker] | own) for tracker, own in rows]
+
+
+def suite_names() -> list[str]:
+    """Names of the suites that come with the package."""
+    here = files(__package__)
+    return sorted(entry.name.removesuffix(".toml") for entry in here.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_suite(name: str | Path) -> Suite:
+    """A suite by its name, or from a TOML file.
+
+    Raises:
+        RunError: There is no such suite, the file cannot be read or is no TOML, or it does not describe a suite
+            (with the first fault).
+        PluginError: One of its trackers is not known.
+    """
+    text, where = _read(str(name))
+    document = parse_toml(text, where, kind=RunError)
+    document.setdefault("name", Path(where).stem)
+    try:
+        suite = Suite.model_validate(document)
+    except ValidationError as error:
+        raise _explain(error, where) from error
+    for tracker in (*suite.trackers, *suite.optional):
+        TRACKERS.get(tracker)
+    return suite
+
+
+def _read(name: str) -> tuple[str, str]:
+    if name in suite_names():
+        return files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8"), f"{name}.toml"
+    path = Path(name).expanduser()
+    if path.suffix != ".toml":
+        raise RunError(f"unknown suite '{name}'", did_you_mean(name, suite_names()) + " Or name a .toml file")
+    return read_text(path, kind=RunError), str(path)
+
+
+def _explain(error: ValidationError, where: str) -> RunError:
+    first = error.errors()[0]
+    key = ".".join(map(str, first["loc"]))
+    if first["type"] == "extra_forbidden":
+        return RunError(f"{where}: unknown key '{key}'", did_you_mean(key, Suite.model_fields))
+    return RunError(f"{where}: {key}: {first['msg'][0].lower()}{first['msg'][1:]}")

@@ -1,6 +1,6 @@
 """Conformance checks for the authors of plug-ins.
 
-Each ``check_*`` raises a `ConformanceError` that names what was found and its likely cause; each ``*_report`` runs the
+Each ``check_*`` raises a `ConformanceError` that names the fault and its likely cause; each ``*_report`` runs the
 same checks and returns the outcome of every one. `pytest_plugin` makes tests of them.
 """
 
@@ -9,21 +9,26 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .features import check_features, features_report
-    from .filter import check_filter, filter_report, filter_scene
-    from .flow import check_flow, flow_report
-    from .isolated import isolated_tracker_report
-    from .report import Check, ConformanceError, ConformanceReport
-    from .scenes import CornerSequence, TurningSequence, hard_frames
-    from .segmenter import check_segmenter, segmenter_report
-    from .sequence import check_sequence, sequence_report
-    from .tracker import check_tracker, tracker_report
+    from dynslam_bench.testing.filter import check_filter, filter_report, filter_scene
+    from dynslam_bench.testing.images import (
+        check_features,
+        check_flow,
+        check_segmenter,
+        features_report,
+        flow_report,
+        segmenter_report,
+    )
+    from dynslam_bench.testing.isolated import isolated_tracker_report
+    from dynslam_bench.testing.report import Check, ConformanceError, ConformanceReport
+    from dynslam_bench.testing.scenes import CornerSequence, TurningSequence, hard_frames
+    from dynslam_bench.testing.sequence import check_sequence, sequence_report
+    from dynslam_bench.testing.tracker import check_tracker, tracker_report
 
 _HOMES = {
-    "check_features": "features",
+    "check_features": "images",
     "check_filter": "filter",
-    "check_flow": "flow",
-    "check_segmenter": "segmenter",
+    "check_flow": "images",
+    "check_segmenter": "images",
     "check_sequence": "sequence",
     "check_tracker": "tracker",
     "Check": "report",
@@ -31,13 +36,13 @@ _HOMES = {
     "ConformanceReport": "report",
     "CornerSequence": "scenes",
     "TurningSequence": "scenes",
-    "features_report": "features",
+    "features_report": "images",
     "filter_report": "filter",
     "filter_scene": "filter",
-    "flow_report": "flow",
+    "flow_report": "images",
     "hard_frames": "scenes",
     "isolated_tracker_report": "isolated",
-    "segmenter_report": "segmenter",
+    "segmenter_report": "images",
     "sequence_report": "sequence",
     "tracker_report": "tracker",
 }

@@ -24,34 +24,35 @@ from dynslam_bench.contracts import (
     Provenance,
 )
 from dynslam_bench.geometry import se3
-
-from .report import ConformanceReport, require
-from .scenes import CornerSequence
+from dynslam_bench.testing.report import ConformanceReport, require, require_arrays, require_unchanged
+from dynslam_bench.testing.scenes import CornerSequence
 
 NEEDS: frozenset[str] = frozenset(get_args(Need))
+Steps = list[tuple[FrameBundle, FilterState]]
+Change = Callable[[FrameBundle, FilterState], tuple[FrameBundle, FilterState]]
 
 
 @dataclass(frozen=True, eq=False)
 class FilterScene:
-    """Consecutive frames of the built-in scene with everything that a filter may be told.
+    """Consecutive frames of the built-in scene with all inputs that a filter may use.
 
     Attributes:
         steps: Frame and state, in order; the first has no past.
         moving: For each step, which keypoints lie on the moving panel, bool ``[N]``.
     """
 
-    steps: list[tuple[FrameBundle, FilterState]]
+    steps: Steps
     moving: list[NDArray[np.bool_]]
 
 
 def check_filter(construct: Callable[[], DynamicFilter]) -> None:
-    """Check that a filter keeps its contract, with everything it may be told and with much of it missing.
+    """Check that a filter keeps its contract, with all its inputs and with many of them missing.
 
     Args:
         construct: Builds a filter.
 
     Raises:
-        ConformanceError: Names every failed check, what was found and the likely cause.
+        ConformanceError: Names every failed check, the fault and the likely cause.
     """
     filter_report(construct).raise_for_failures()
 
@@ -59,10 +60,10 @@ def check_filter(construct: Callable[[], DynamicFilter]) -> None:
 def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     """Run all checks of `check_filter` and report each."""
     scene = filter_scene()
-    report = ConformanceReport(f"filter {getattr(construct, '__name__', type(construct).__name__)!r}")
+    report = ConformanceReport.of("filter", construct)
     if not report.run("declaration", lambda: _declaration(construct())):
         return report
-    if not report.run("results", lambda: _apply_all(construct(), scene.steps)):
+    if not report.run("results", lambda: _run(construct(), scene.steps)):
         return report
     report.run("declared stats", lambda: _declared_stats(construct(), scene.steps))
     report.run("same keys on every frame", lambda: _keys(construct(), scene.steps))
@@ -71,7 +72,7 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     report.run("two resets", lambda: _two_resets(construct(), scene.steps))
     for name, change in _DEGENERATE.items():
         steps = [change(frame, state) for frame, state in scene.steps]
-        report.run(name, lambda steps=steps: _apply_all(construct(), steps))  # type: ignore[misc]
+        report.run(name, lambda steps=steps: _run(construct(), steps))  # type: ignore[misc]
     return report
 
 
@@ -138,89 +139,72 @@ def check_result(result: FilterResult, frame: FrameBundle) -> None:
     Raises:
         ConformanceError: Something in it breaks the contract.
     """
-    at, count = f"frame {frame.index}", len(frame)
-    require(isinstance(result, FilterResult), f"{at}: apply() gave a {type(result).__name__}, not a FilterResult")
-    keep, weight = result.keep, result.weight
-    found = f"{at}: keep is {keep.dtype} {keep.shape}, expected bool {(count,)}"
+    where, count = f"frame {frame.index}: ", (len(frame),)
+    require(isinstance(result, FilterResult), f"{where}apply() gave a {type(result).__name__}, not a FilterResult")
     cause = "the verdict is on all keypoints, not only on those that earlier filters kept"
-    require(keep.dtype == np.bool_ and keep.shape == (count,), found, cause)
-    found = f"{at}: weight is {weight.dtype} {weight.shape}, expected float32 {(count,)}"
-    require(weight.dtype == np.float32 and weight.shape == (count,), found)
-    require(((weight >= 0) & (weight <= 1)).all(), f"{at}: a weight lies outside [0, 1] or is no number")
+    require_arrays(result, {"keep": (np.bool_, count), "weight": (np.float32, count)}, where, cause)
+    in_range = (result.weight >= 0) & (result.weight <= 1)
+    require(in_range.all(), f"{where}a weight lies outside [0, 1] or is no number")
     bad = {key: value for key, value in result.stats.items() if not np.isfinite(value)}
-    require(not bad, f"{at}: stats hold values that are not finite: {bad}")
-    mask = result.mask
-    if mask is not None:
-        found = f"{at}: the mask is {mask.dtype} {mask.shape}, expected bool {frame.depth.shape}"
-        require(mask.dtype == np.bool_ and mask.shape == frame.depth.shape, found)
+    require(not bad, f"{where}stats hold values that are not finite: {bad}")
+    if result.mask is not None:
+        require_arrays(result, {"mask": (np.bool_, frame.depth.shape)}, where)
 
 
 def _declaration(candidate: DynamicFilter) -> None:
     require(isinstance(candidate.name, str) and candidate.name, f"the name is {candidate.name!r}")
     unknown = set(candidate.needs) - NEEDS
     require(not unknown, f"unknown needs {sorted(unknown)}", f"known are {', '.join(sorted(NEEDS))}")
-    known = get_args(Provenance)
-    require(candidate.provenance in known, f"provenance is {candidate.provenance!r}", f"one of {', '.join(known)}")
+    tags = get_args(Provenance)
+    require(candidate.provenance in tags, f"provenance is {candidate.provenance!r}", f"one of {', '.join(tags)}")
 
 
-def _run(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> list[FilterResult]:
+def _run(candidate: DynamicFilter, steps: Steps) -> list[FilterResult]:
     candidate.reset(steps[0][1].camera)
     results = []
     for frame, state in steps:
-        result = candidate.apply(frame, state)
-        check_result(result, frame)
-        results.append(result)
+        results.append(candidate.apply(frame, state))
+        check_result(results[-1], frame)
     return results
 
 
-def _apply_all(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:
-    _run(candidate, steps)
-
-
-def _declared_stats(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:
+def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:
     declared = set(getattr(candidate, "stats_names", DynamicFilter.stats_names))
-    for result, (frame, _) in zip(_run(candidate, steps), steps, strict=True):
-        for found, wrong in (("not declared", set(result.stats) - declared), ("missing", declared - set(result.stats))):
-            require(not wrong, f"frame {frame.index}: stats {found}: {sorted(wrong)}", "list them all in stats_names")
+    for index, result in enumerate(_run(candidate, steps)):
+        given = set(result.stats)
+        for fault, names in (("not declared", given - declared), ("missing", declared - given)):
+            require(not names, f"frame {index}: stats {fault}: {sorted(names)}", "list them all in stats_names")
 
 
-def _keys(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:
+def _keys(candidate: DynamicFilter, steps: Steps) -> None:
     results = _run(candidate, steps)
-    for result, (frame, _) in zip(results, steps, strict=True):
+    for index, result in enumerate(results):
         changed = set(result.stats) ^ set(results[0].stats)
-        require(not changed, f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}")
+        require(not changed, f"frame {index}: stats have other keys than on frame 0: {sorted(changed)}")
 
 
-def _left_alone(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:
+def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
     candidate.reset(steps[0][1].camera)
     for frame, state in steps:
-        after: list[NDArray[Any]] = [frame.rgb, frame.depth, frame.xy, frame.z, state.keep]
-        before = [array.copy() for array in after]
-        candidate.apply(frame, state)
-        same = all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-        require(same, f"frame {frame.index} or its state was changed", "work on a copy, return the verdict")
+        inputs: list[NDArray[Any]] = [frame.rgb, frame.depth, frame.xy, frame.z, state.keep]
+        require_unchanged(lambda: candidate.apply(frame, state), *inputs, what=f"frame {frame.index} or its state")  # noqa: B023
 
 
-def _determinism(construct: Callable[[], DynamicFilter], steps: list[tuple[FrameBundle, FilterState]]) -> None:
-    _same(
-        _run(construct(), steps),
-        _run(construct(), steps),
-        "two runs differ",
-        "all randomness has to come from state.seed",
-    )
+def _determinism(construct: Callable[[], DynamicFilter], steps: Steps) -> None:
+    first, second = _run(construct(), steps), _run(construct(), steps)
+    _same(first, second, "two runs differ", "all randomness has to come from state.seed")
 
 
-def _two_resets(candidate: DynamicFilter, steps: list[tuple[FrameBundle, FilterState]]) -> None:
-    first = _run(candidate, steps)
-    _same(
-        first, _run(candidate, steps), "the verdict changes after a second reset()", "reset() leaves something behind"
-    )
+def _two_resets(candidate: DynamicFilter, steps: Steps) -> None:
+    first, second = _run(candidate, steps), _run(candidate, steps)
+    cause = "reset() keeps something of the sequence before"
+    _same(first, second, "the verdict changes after a second reset()", cause)
 
 
-def _same(first: list[FilterResult], second: list[FilterResult], found: str, cause: str) -> None:
+def _same(first: list[FilterResult], second: list[FilterResult], fault: str, cause: str) -> None:
     for index, (a, b) in enumerate(zip(first, second, strict=True)):
         same = np.array_equal(a.keep, b.keep) and np.array_equal(a.weight, b.weight)
-        require(same, f"{found} at frame {index}", cause)
+        require(same, f"{fault} at frame {index}", cause)
 
 
 def _keypoints(xy: NDArray[np.float64], rng: np.random.Generator) -> Keypoints:
@@ -234,30 +218,11 @@ def _keypoints(xy: NDArray[np.float64], rng: np.random.Generator) -> Keypoints:
     )
 
 
-Change = Callable[[FrameBundle, FilterState], tuple[FrameBundle, FilterState]]
-
-
-def _without_past(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
-    return frame, FilterState(state.camera, state.keep, seed=state.seed)
-
-
 def _without_flow(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
     if state.flow is None:
         return frame, state
     lost = np.full_like(state.flow.xy, np.nan)
     return frame, replace(state, flow=FlowResult(lost, np.zeros(len(lost), bool), state.flow.cost, {}))
-
-
-def _without_depth(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
-    return replace(frame, depth=np.zeros_like(frame.depth), z=np.zeros_like(frame.z)), state
-
-
-def _without_masks(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
-    return replace(frame, instances=None), state
-
-
-def _with_empty_masks(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
-    return replace(frame, instances=Instances.empty(*frame.depth.shape)), state
 
 
 def _all_masked(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
@@ -267,38 +232,36 @@ def _all_masked(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, Fi
     return replace(frame, instances=whole), state
 
 
-def _select(frame: FrameBundle, index: NDArray[np.intp]) -> FrameBundle:
-    return replace(frame, keypoints=frame.keypoints.select(index), xy=frame.xy[index], z=frame.z[index])
-
-
 def _few(count: int) -> Change:
+    """Only the first keypoints of every frame."""
+
+    def select(frame: FrameBundle) -> FrameBundle:
+        keypoints = frame.keypoints.select(np.arange(count))
+        return replace(frame, keypoints=keypoints, xy=frame.xy[:count], z=frame.z[:count])
+
     def change(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
-        index = np.arange(count)
-        flow = state.flow
-        if flow is not None:
-            flow = FlowResult(flow.xy[index], flow.valid[index], flow.cost[index], flow.stats)
-        previous = None if state.previous is None else _select(state.previous, index)
-        kept = None if previous is None else np.ones(count, dtype=bool)
-        return _select(frame, index), replace(
-            state, keep=np.ones(count, dtype=bool), flow=flow, previous=previous, previous_keep=kept
-        )
+        keep = np.ones(count, dtype=bool)
+        if state.flow is None or state.previous is None:
+            return select(frame), replace(state, keep=keep)
+        flow = FlowResult(state.flow.xy[:count], state.flow.valid[:count], state.flow.cost[:count], state.flow.stats)
+        previous = select(state.previous)
+        return select(frame), replace(state, keep=keep, flow=flow, previous=previous, previous_keep=keep.copy())
 
     return change
 
 
-def _nothing_kept(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
-    return frame, replace(state, keep=np.zeros_like(state.keep))
-
-
 _DEGENERATE: dict[str, Change] = {
-    "nothing known of the past": _without_past,
+    "nothing known of the past": lambda frame, state: (frame, FilterState(state.camera, state.keep, seed=state.seed)),
     "no valid flow": _without_flow,
-    "no depth": _without_depth,
-    "no segmenter": _without_masks,
-    "no objects": _with_empty_masks,
+    "no depth": lambda frame, state: (
+        replace(frame, depth=np.zeros_like(frame.depth), z=np.zeros_like(frame.z)),
+        state,
+    ),
+    "no segmenter": lambda frame, state: (replace(frame, instances=None), state),
+    "no objects": lambda frame, state: (replace(frame, instances=Instances.empty(*frame.depth.shape)), state),
     "the whole image masked": _all_masked,
     "no keypoints": _few(0),
     "one keypoint": _few(1),
     "seven keypoints": _few(7),
-    "nothing kept by earlier filters": _nothing_kept,
+    "nothing kept by earlier filters": lambda frame, state: (frame, replace(state, keep=np.zeros_like(state.keep))),
 }

@@ -10,9 +10,7 @@ from importlib import metadata
 from dynslam_bench.core.folders import find_data_root, is_writable, stage_cache_folder, weights_folder
 from dynslam_bench.core.version import install_hint, version
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint, embedded_weights
-from dynslam_bench.sequences.listing import summaries
-
-from .doctor import diagnose
+from dynslam_bench.sequences.catalogue import summaries
 
 DISTRIBUTION = "dynslam-bench"
 FOR_DEVELOPERS = ("test", "lint")
@@ -21,13 +19,13 @@ FOR_DEVELOPERS = ("test", "lint")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """One thing that was examined.
 
     Attributes:
-        part: ``program``, ``package``, ``extra``, ``weights``, ``sequences``, ``folder`` or ``plug-in``.
+        part: ``program``, ``package``, ``extra``, ``weights``, ``sequences``, ``folder``, ``plug-in`` or ``device``.
         name: Which.
-        state: What was found.
-        missing: Whether something is not there; what works without it is not wrong.
+        state: Its version, place or fault.
+        missing: Whether it is not there; what works without it is no fault.
         hint: How to get what is missing.
     """
 
@@ -38,21 +36,35 @@ class Finding:
     hint: str = ""
 
 
+@dataclass(frozen=True)
+class UnavailablePlugin:
+    """A plug-in that cannot be used.
+
+    Attributes:
+        kind: ``trackers``, ``segmenters``, ``features``, ``flow`` or ``sequences``.
+        name: Its id, or where it should have come from.
+        reason: What went wrong, or what to install.
+    """
+
+    kind: str
+    name: str
+    reason: str
+
+
 def examine() -> list[Finding]:
     """Everything that decides what can be run on this machine; nothing is downloaded or loaded for it."""
     system = f"{platform.system()} {platform.machine()}"
-    found = [Finding("program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}")]
-    found += _packages()
-    found += _weights()
-    here = [each for each in summaries() if each.here and not each.id.startswith("synthetic/")]
-    hint = "" if here else "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
-    found.append(Finding("sequences", "recorded", f"{len(here)} in {find_data_root()}", not here, hint))
+    findings = [Finding("program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}")]
+    findings += [*_packages(), *_weights()]
+    recorded = sum(summary.here and not summary.id.startswith("synthetic/") for summary in summaries())
+    hint = "" if recorded else "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
+    findings.append(Finding("sequences", "recorded", f"{recorded} in {find_data_root()}", not recorded, hint))
     for name, folder in (("stage cache", stage_cache_folder()), ("weights", weights_folder())):
         good = is_writable(folder)
-        state = f"{folder}, writable" if good else f"{folder}, not writable"
-        found.append(Finding("folder", name, state, not good, "" if good else "another one: see core/folders.py"))
-    found += [Finding("plug-in", f"{each.kind}: {each.name}", "missing", True, each.reason) for each in diagnose()]
-    return found
+        state = f"{folder}, {'' if good else 'not '}writable"
+        findings.append(Finding("folder", name, state, not good, "" if good else "another one: see core/folders.py"))
+    plugins = unavailable_plugins()
+    return findings + [Finding("plug-in", f"{p.kind}: {p.name}", "missing", True, p.reason) for p in plugins]
 
 
 def _packages() -> list[Finding]:
@@ -67,39 +79,31 @@ def _packages() -> list[Finding]:
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", requirement)
         if extra is not None or ";" not in requirement:
             extras.setdefault(extra.group(1) if extra else "", []).append(name)
-    found = [_package("package", name, [name], "pip install --force-reinstall .") for name in extras[""]]
-    found += [
+    packages = [_package("package", name, [name], "pip install --force-reinstall .") for name in extras.pop("")]
+    return packages + [
         _package("extra", extra, names, install_hint(extra))
         for extra, names in sorted(extras.items())
-        if extra and extra not in FOR_DEVELOPERS
+        if extra not in FOR_DEVELOPERS
     ]
-    return found
 
 
 def _package(part: str, title: str, names: list[str], hint: str) -> Finding:
-    versions = {}
+    parts = []
     for name in names:
         try:
-            versions[name] = metadata.version(name)
+            parts.append(metadata.version(name) if name == title else f"{name} {metadata.version(name)}")
         except metadata.PackageNotFoundError:
             return Finding(part, title, f"{name} is not installed", True, hint)
-    state = ", ".join(version if name == title else f"{name} {version}" for name, version in versions.items())
-    return Finding(part, title, state)
+    return Finding(part, title, ", ".join(parts))
 
 
 def _weights() -> list[Finding]:
-    embedded, coco = embedded_weights(), cached_checkpoint(COCO)
+    coco = cached_checkpoint(COCO)
     where = f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
-    return [
-        Finding(
-            "weights",
-            "embedded",
-            "in the package, for rendered people" if embedded else "missing",
-            not embedded,
-            "" if embedded else "reinstall",
-        ),
-        Finding("weights", "coco", str(coco) if coco else "not here", not coco, "" if coco else where),
-    ]
+    fetched = Finding("weights", "coco", str(coco)) if coco else Finding("weights", "coco", "not here", True, where)
+    if embedded_weights():
+        return [Finding("weights", "embedded", "in the package, for rendered people"), fetched]
+    return [Finding("weights", "embedded", "missing", True, "reinstall"), fetched]
 
 
 def torch_device() -> Finding:
@@ -109,3 +113,22 @@ def torch_device() -> Finding:
     cuda = torch.cuda.is_available()
     name = torch.cuda.get_device_name(0) if cuda else f"{torch.get_num_threads()} processor threads"
     return Finding("device", "auto", f"{'cuda:0' if cuda else 'cpu'}, {name}, torch {torch.__version__}")
+
+
+def unavailable_plugins() -> list[UnavailablePlugin]:
+    """All plug-ins of all kinds that failed to load, and trackers that lack a package."""
+    from dynslam_bench.features.registry import FEATURES
+    from dynslam_bench.flow.registry import FLOWS
+    from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
+    from dynslam_bench.sequences.catalogue import DATASETS
+    from dynslam_bench.trackers.registry import TRACKERS
+
+    failed = [
+        UnavailablePlugin(registry.kind, failure.source, failure.reason)
+        for registry in (TRACKERS, SEGMENTERS, FEATURES, FLOWS, DATASETS)
+        for failure in registry.failures()
+    ]
+    specs = [tracker.spec for tracker in TRACKERS.all()]
+    return failed + [
+        UnavailablePlugin("trackers", spec.id, f"needs {hint}") for spec in specs for hint in spec.missing()
+    ]

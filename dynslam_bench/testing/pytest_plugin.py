@@ -1,19 +1,20 @@
 """The conformance checks as tests of pytest: ``pytest --dynslam-tracker my_slam.py:SPEC``.
 
-Every check of a subject becomes a test item named after it. The checks run while pytest collects (what they are called
-is known only then), those of a tracker in a process of their own. Installing the distribution makes pytest find this
-module (entry point ``pytest11``); it imports nothing of weight before it is asked for something.
+Every check of a subject becomes a test item of its name. The checks run while pytest collects, because their names are
+known only then; those of a tracker run in a child process. The entry point ``pytest11`` makes pytest load this module,
+so it imports nothing heavy before one of its options is used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 if TYPE_CHECKING:
-    from .report import Check, ConformanceReport
+    from dynslam_bench.testing.report import Check, ConformanceReport
 
 OPTIONS = {
     "tracker": "a tracker: id, module:Attr or file.py:Attr of a TrackerSpec; runs in a process of its own",
@@ -91,77 +92,47 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
         DynslamError: There is no such subject.
     """
     from dynslam_bench import testing
+    from dynslam_bench.core.plugins import load_object
 
     if kind == "tracker":
         return testing.isolated_tracker_report(subject)
     if kind == "sequence":
-        return _sequence(subject)
+        return testing.sequence_report(_open(subject))
     if kind == "filter":
-        from dynslam_bench.core.plugins import load_object
-
         return testing.filter_report(load_object(subject))
-    return _REPORTS[kind](subject)
+    if kind == "segmenter":
+        from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, build_segmenter
+        from dynslam_bench.segmentation.settings import SegmentationSettings
+
+        SEGMENTERS.get(subject)  # an unknown name is an error, not a failed check
+        scene, masks = testing.CornerSequence(2), SegmentationSettings(source=f"plugin:{subject}")
+        build: Any = partial(build_segmenter, masks, sequence_id=scene.id, masks=scene.masks)
+        return testing.segmenter_report(build, sequence=scene)
+    if kind == "flow":
+        from dynslam_bench.flow.registry import FLOWS, build_flow
+        from dynslam_bench.flow.settings import FlowSettings
+
+        FLOWS.get(subject)
+        return testing.flow_report(partial(build_flow, FlowSettings(plugin=subject)))
+    from dynslam_bench.features.registry import FEATURES, build_extractor
+    from dynslam_bench.features.settings import FeatureSettings
+
+    spec = FEATURES.get(subject)
+    extractor = partial(build_extractor, FeatureSettings(extractor=subject))
+    return testing.features_report(extractor, descriptor_bytes=spec.descriptor_bytes)
 
 
-def _sequence(subject: str) -> ConformanceReport:
+def _open(subject: str) -> Any:
+    """A sequence by its name, or the first one of a `DatasetSpec`."""
     from dynslam_bench.core.errors import PluginError
     from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.core.plugins import load_object
-    from dynslam_bench.sequences.published.datasets import DATASETS
-
-    from . import sequence_report
+    from dynslam_bench.sequences.catalogue import DATASETS
 
     head, _, attribute = subject.rpartition(":")
     if not attribute.isidentifier() or not (head.endswith(".py") or head.replace(".", "").isidentifier()):
-        return sequence_report(subject)
+        return subject
     spec = DATASETS.get(subject)
     if not spec.sequences:
         raise PluginError(f"the data set '{spec.id}' lists no sequence", "name one in DatasetSpec.sequences")
-    factory = load_object(spec.entry_point)
-    return sequence_report(factory(spec.sequences[0], data_root=find_data_root()))
-
-
-def _segmenter(subject: str) -> ConformanceReport:
-    from dynslam_bench.segmentation.build_segmenter import build_segmenter
-    from dynslam_bench.segmentation.registry import SEGMENTERS
-    from dynslam_bench.segmentation.settings import SegmentationSettings
-
-    from . import CornerSequence, segmenter_report
-
-    SEGMENTERS.get(subject)  # unknown ones are no failed check
-    scene, settings = CornerSequence(2), SegmentationSettings(source=f"plugin:{subject}")
-
-    def construct() -> Any:
-        return build_segmenter(settings, sequence_id=scene.id, masks=scene.masks)
-
-    return segmenter_report(construct, sequence=scene)
-
-
-def _flow(subject: str) -> ConformanceReport:
-    from dynslam_bench.flow.build_flow import build_flow
-    from dynslam_bench.flow.registry import FLOWS
-    from dynslam_bench.flow.settings import FlowSettings
-
-    from . import flow_report
-
-    FLOWS.get(subject)  # unknown ones are no failed check
-    settings = FlowSettings(plugin=subject)
-    return flow_report(lambda: build_flow(settings))
-
-
-def _features(subject: str) -> ConformanceReport:
-    from dynslam_bench.features.build_extractor import build_extractor
-    from dynslam_bench.features.registry import FEATURES
-    from dynslam_bench.features.settings import FeatureSettings
-
-    from . import features_report
-
-    spec, settings = FEATURES.get(subject), FeatureSettings(extractor=subject)
-    return features_report(lambda: build_extractor(settings), descriptor_bytes=spec.descriptor_bytes)
-
-
-_REPORTS: dict[str, Callable[[str], ConformanceReport]] = {
-    "segmenter": _segmenter,
-    "flow": _flow,
-    "features": _features,
-}
+    return load_object(spec.entry_point)(spec.sequences[0], data_root=find_data_root())

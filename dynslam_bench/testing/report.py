@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 
 class ConformanceError(AssertionError):
-    """A plug-in breaks its contract; the message names the check, what was found and the likely cause."""
+    """A plug-in breaks its contract; the message names the check, the measured value and the likely cause."""
 
 
 class NotApplicable(Exception):
@@ -23,7 +26,7 @@ class Check:
     Attributes:
         name: What was checked.
         status: How it ended.
-        message: What was found and the likely cause, or why it does not apply; empty if passed.
+        message: The fault and its likely cause, or why the check does not apply; empty if passed.
     """
 
     name: str
@@ -31,28 +34,21 @@ class Check:
     message: str = ""
 
 
-class Observer(Protocol):
-    """Follows the checks of a report while they run; see `isolated`."""
+class Observer:
+    """Follows the checks of a report while they run; this one does nothing. See `isolated`."""
 
-    def verdict(self, name: str) -> Check | None:
-        """The outcome of a check that is known already and need not be found out; else it begins now."""
+    def outcome(self, name: str) -> Check | None:
+        """Called before a check; returns its outcome if it is known, None to run it."""
+        return None
 
     def alive(self) -> None:
-        """A check got on a little."""
+        """Called while a check makes progress."""
 
     def ended(self, check: Check) -> None:
-        """A check came to its end."""
+        """Called with the outcome of a check."""
 
 
-OBSERVER: ContextVar[Observer | None] = ContextVar("OBSERVER", default=None)
-"""Who is told of the checks; nobody by default."""
-
-
-def still_alive() -> None:
-    """Tell whoever follows that a check has got on; for checks that take long."""
-    observer = OBSERVER.get()
-    if observer is not None:
-        observer.alive()
+OBSERVER: ContextVar[Observer] = ContextVar("OBSERVER", default=Observer())  # noqa: B039 - it has no state
 
 
 @dataclass
@@ -67,6 +63,11 @@ class ConformanceReport:
     subject: str
     checks: list[Check] = field(default_factory=list)
 
+    @classmethod
+    def of(cls, kind: str, construct: object) -> ConformanceReport:
+        """An empty report on what a function constructs."""
+        return cls(f"{kind} {getattr(construct, '__name__', type(construct).__name__)!r}")
+
     @property
     def ok(self) -> bool:
         """Whether no check failed."""
@@ -77,14 +78,13 @@ class ConformanceReport:
         """The checks that failed."""
         return [check for check in self.checks if check.status == "failed"]
 
-    def run(self, name: str, check: Callable[[], None]) -> bool:
-        """Run one check; whatever it raises is its outcome. True unless it failed."""
+    def run(self, name: str, check: Callable[[], object]) -> bool:
+        """Run one check; an exception of any kind is its outcome. True unless the check failed."""
         observer = OBSERVER.get()
-        outcome = None if observer is None else observer.verdict(name)
+        outcome = observer.outcome(name)
         if outcome is None:
             outcome = _outcome(name, check)
-            if observer is not None:
-                observer.ended(outcome)
+            observer.ended(outcome)
         self.checks.append(outcome)
         return outcome.status != "failed"
 
@@ -99,7 +99,7 @@ class ConformanceReport:
             raise ConformanceError(f"{self.subject} fails {len(self.failed)} of {len(self.checks)} checks:{lines}")
 
 
-def _outcome(name: str, check: Callable[[], None]) -> Check:
+def _outcome(name: str, check: Callable[[], object]) -> Check:
     try:
         check()
     except NotApplicable as reason:
@@ -113,16 +113,55 @@ def _outcome(name: str, check: Callable[[], None]) -> Check:
     return Check(name, "passed")
 
 
-def require(condition: object, found: str, cause: str = "") -> None:
+def require(condition: object, fault: str, cause: str = "") -> None:
     """Raise unless the condition holds.
 
     Args:
         condition: What must hold.
-        found: What was found in its place.
+        fault: What is there in its place.
         cause: The likely cause.
 
     Raises:
         ConformanceError: It does not hold.
     """
     if not condition:
-        raise ConformanceError(f"{found} (likely cause: {cause})" if cause else found)
+        raise ConformanceError(f"{fault} (likely cause: {cause})" if cause else fault)
+
+
+def require_methods(candidate: object, *names: str) -> None:
+    """Raise unless an object has all methods.
+
+    Raises:
+        ConformanceError: Names the missing ones.
+    """
+    missing = [f"{name}()" for name in names if not callable(getattr(candidate, name, None))]
+    require(not missing, f"a {type(candidate).__name__} lacks {', '.join(missing)}")
+
+
+def require_arrays(
+    holder: object, expected: Mapping[str, tuple[DTypeLike, tuple[int, ...]]], where: str = "", cause: str = ""
+) -> None:
+    """Raise unless the named attributes are arrays of the expected types and shapes.
+
+    Raises:
+        ConformanceError: Names the first other one.
+    """
+    for name, (kind, shape) in expected.items():
+        value = getattr(holder, name)
+        require(
+            value.dtype == kind and value.shape == shape,
+            f"{where}{name} is {value.dtype} {value.shape}, expected {np.dtype(kind)} {shape}",
+            cause,
+        )
+
+
+def require_unchanged(call: Callable[[], object], *arrays: NDArray[Any], what: str) -> None:
+    """Raise if a call changes one of the arrays.
+
+    Raises:
+        ConformanceError: Says that `what` was changed.
+    """
+    copies = [array.copy() for array in arrays]
+    call()
+    same = all(np.array_equal(array, copy) for array, copy in zip(arrays, copies, strict=True))
+    require(same, f"{what} was changed", "an operation in place: draw on a copy")

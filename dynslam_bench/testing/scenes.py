@@ -1,7 +1,8 @@
-"""Small exact scenes for conformance checks: before a corner with a moving panel, and in a room where nothing moves."""
+"""Small exact scenes for conformance checks: a corner with a moving panel, and a static room."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -107,7 +108,7 @@ def grey(frame: Frame) -> NDArray[np.uint8]:
 
 
 def hard_frames(like: Frame) -> dict[str, Frame]:
-    """Frames that a tracker must survive, by name.
+    """Frames on which a tracker must not fail, by name.
 
     Args:
         like: A frame whose index, stamp and size they take.
@@ -115,11 +116,11 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
     black, zero = np.zeros_like(like.rgb), np.zeros_like(like.depth)
     speckle = np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)
     return {
-        "all-black": Frame(like.index, like.timestamp, black, zero),
-        "saturated": Frame(like.index, like.timestamp, np.full_like(like.rgb, 255), like.depth),
-        "zero depth": Frame(like.index, like.timestamp, like.rgb, zero),
-        "textureless": Frame(like.index, like.timestamp, np.full_like(like.rgb, 128), np.full_like(like.depth, 2.0)),
-        "noise": Frame(like.index, like.timestamp, speckle, like.depth),
+        "all-black": replace(like, rgb=black, depth=zero),
+        "saturated": replace(like, rgb=np.full_like(like.rgb, 255)),
+        "zero depth": replace(like, depth=zero),
+        "textureless": replace(like, rgb=np.full_like(like.rgb, 128), depth=np.full_like(like.depth, 2.0)),
+        "noise": replace(like, rgb=speckle),
     }
 
 
@@ -149,18 +150,18 @@ def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.flo
 
 
 def _room(camera: Camera, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Depth ``[H, W]`` of a box-shaped room that is seen from inside, and the two coordinates of what is seen there."""
+    """Depth ``[H, W]`` of a box-shaped room, from inside, and two texture coordinates of every pixel."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     rays = rays @ T_world_cam[:3, :3].T
     side = np.where(rays > 0, (1.0, 0.8, 3.5), (-1.0, -0.8, -1.0))  # x to the right, y down, z ahead
-    each = (side - T_world_cam[:3, 3]) / np.where(rays == 0, 1e-12, rays)
-    depth = each.min(axis=-1)
-    seen = T_world_cam[:3, 3] + depth[..., None] * rays
-    facing = each.argmin(axis=-1)
+    depths = (side - T_world_cam[:3, 3]) / np.where(rays == 0, 1e-12, rays)
+    depth = depths.min(axis=-1)
+    points = T_world_cam[:3, 3] + depth[..., None] * rays
+    facing = depths.argmin(axis=-1)
     other = 0.9 * np.where(np.take_along_axis(side, facing[..., None], axis=-1)[..., 0] > 0, facing, facing + 3)
-    x, y = np.where(facing == 0, seen[..., 2], seen[..., 0]), np.where(facing == 1, seen[..., 2], seen[..., 1])
-    return depth, x + other, y + other  # no two sides look alike
+    x, y = np.where(facing == 0, points[..., 2], points[..., 0]), np.where(facing == 1, points[..., 2], points[..., 1])
+    return depth, x + other, y + other  # the sides differ
 
 
 @lru_cache(maxsize=1)

@@ -1,4 +1,4 @@
-"""Conformance of sequences: readers and data sets of one's own."""
+"""Conformance of sequences."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
-
-from .report import ConformanceReport, NotApplicable, require
+from dynslam_bench.testing.report import ConformanceReport, NotApplicable, require, require_arrays
 
 
 def check_sequence(sequence: Sequence | str | Path, *, frames: int = 3) -> None:
@@ -23,7 +22,7 @@ def check_sequence(sequence: Sequence | str | Path, *, frames: int = 3) -> None:
         frames: How many frames to read, spread over the sequence.
 
     Raises:
-        ConformanceError: Names every failed check, what was found and the likely cause.
+        ConformanceError: Names every failed check, the fault and the likely cause.
     """
     sequence_report(sequence, frames=frames).raise_for_failures()
 
@@ -86,34 +85,20 @@ def _timestamps(sequence: Sequence) -> None:
 
 
 def _frames(sequence: Sequence, chosen: list[int]) -> None:
-    height, width = sequence.camera.height, sequence.camera.width
+    size = sequence.camera.height, sequence.camera.width
     for index in chosen:
-        frame = sequence[index]
+        frame, where = sequence[index], f"frame {index}: "
         require(isinstance(frame, Frame), f"frame {index} is a {type(frame).__name__}, not a Frame")
         require(frame.index == index, f"frame {index} says that its index is {frame.index}")
         stamp = float(sequence.timestamps[index])
-        require(
-            frame.timestamp == stamp, f"frame {index} is stamped {frame.timestamp!r}, but timestamps[{index}] {stamp}"
-        )
-        require(
-            frame.rgb.dtype == np.uint8 and frame.rgb.shape == (height, width, 3),
-            f"rgb of frame {index} is {frame.rgb.dtype} {frame.rgb.shape}, expected uint8 {(height, width, 3)}",
-            "the camera's size is not the image's, or the image is grey",
-        )
-        depth = frame.depth
-        require(
-            depth.dtype == np.float32 and depth.shape == (height, width),
-            f"depth of frame {index} is {depth.dtype} {depth.shape}, not float32 {(height, width)}",
-        )
-        require(
-            np.isfinite(depth).all() and (depth >= 0).all(),
-            f"depth of frame {index} has values below 0 or not finite",
-            "missing depth is 0",
-        )
-        valid = depth[depth > 0]
-        if len(valid):
-            median = float(np.median(valid))
-            require(0.05 < median < 200, f"the median depth of frame {index} is {median:g} m", "wrong depth_factor")
+        require(frame.timestamp == stamp, f"{where}stamped {frame.timestamp!r}, but timestamps[{index}] is {stamp}")
+        cause = "the camera's size is not the image's, or the image is grey"
+        require_arrays(frame, {"rgb": (np.uint8, (*size, 3)), "depth": (np.float32, size)}, where, cause)
+        valid = np.isfinite(frame.depth) & (frame.depth >= 0)
+        require(valid.all(), f"{where}depth has values below 0 or not finite", "missing depth is 0")
+        if frame.depth.any():
+            median = float(np.median(frame.depth[frame.depth > 0]))
+            require(0.05 < median < 200, f"{where}the median depth is {median:g} m", "wrong depth_factor")
 
 
 def _end(sequence: Sequence) -> None:

@@ -38,7 +38,7 @@ class @CLASS@Settings(Settings):
 
 
 class @CLASS@:
-    """Frame-to-frame visual odometry: corners of the last frame with depth, found again, solved as PnP."""
+    """Frame-to-frame visual odometry: corners of the last frame with depth, tracked by Lucas-Kanade, solved as PnP."""
 
     def __init__(self, settings):
         self.settings = self.built_with = settings
@@ -67,11 +67,11 @@ class @CLASS@:
             last_gray, last_depth = self.last
             corners = cv2.goodFeaturesToTrack(last_gray, self.settings.features, 0.01, 7)
             if corners is not None:
-                moved, found, _ = cv2.calcOpticalFlowPyrLK(last_gray, gray, corners, None)
+                moved, tracked, _ = cv2.calcOpticalFlowPyrLK(last_gray, gray, corners, None)
                 corners, moved = corners.reshape(-1, 2), moved.reshape(-1, 2)
                 column, row = np.rint(corners).astype(int).T
                 z = last_depth[row.clip(0, gray.shape[0] - 1), column.clip(0, gray.shape[1] - 1)]
-                use = (found.ravel() == 1) & (z > 0)
+                use = (tracked.ravel() == 1) & (z > 0)
                 matches = int(use.sum())
                 if matches >= 12:
                     points = self.camera.unproject(self.camera.undistort_points(corners[use]), z[use])
@@ -128,13 +128,14 @@ def write_tracker_template(name: str, folder: Path | str = ".") -> Path:
     if path.exists():
         raise PluginError(f"{path} exists already", "choose another name or folder")
     text = _TEMPLATE
-    for key, value in {
+    names = {
         "@TITLE@": " ".join(word if word.isupper() else word.capitalize() for word in words),
         "@FILE@": path.name,
         "@MODULE@": module,
         "@ID@": identifier,
         "@CLASS@": "".join(word[0].upper() + word[1:] for word in words),
-    }.items():
+    }
+    for key, value in names.items():
         text = text.replace(key, value)
     write_atomic(path, text)
     return path

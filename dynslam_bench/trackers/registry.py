@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
+from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +16,45 @@ from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, PluginError, TrackerError
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.settings import Settings, apply_overrides
+from dynslam_bench.trackers.adapters.specs import adapter_specs
+
+SYSTEMS = (
+    "blitz_slam", "cfp_slam", "chen_slam", "dai_slam", "detect_slam", "dgs_slam", "di_slam", "ds_slam", "dynaslam",
+    "dynatm_slam", "emfoa_oft", "huai_slam", "mask_rcnn", "mor_slam", "ngd_slam", "opf_slam", "orb_slam2", "seg_slam",
+    "sgc_slam", "sof_slam", "yolo_slam",
+)  # fmt: skip
+"""The modules of `trackers.systems` that announce trackers, as ``SPEC`` or ``SPECS``."""
+KINDS = {
+    "own": "this project's", "faithful-code": "published", "faithful-paper": "published", "inspired": "published",
+    "assumed": "published", "external": "external", "control": "control",
+}  # fmt: skip
+"""Kind of a tracker by its provenance."""
 
 
-def _builtin() -> Iterable[TrackerSpec]:
-    from . import specs
+def all_specs() -> list[TrackerSpec]:
+    """The specs of all built-in trackers; imports neither torch nor OpenCV."""
+    specs = adapter_specs()
+    for name in SYSTEMS:
+        module = import_module(f"dynslam_bench.trackers.systems.{name}")
+        specs += getattr(module, "SPECS", None) or [module.SPEC]
+    return specs
 
-    return specs.all_specs()
+
+def tracker_groups() -> dict[str, list[list[TrackerSpec]]]:
+    """All trackers by kind, for lists: ``this project's``, ``published``, ``external``, ``control`` and ``plug-in``.
+
+    Returns:
+        Kind to its trackers by id; each is a list of the tracker and its variants (``ID?...``).
+    """
+    groups: dict[str, list[list[TrackerSpec]]] = {kind: [] for kind in (*dict.fromkeys(KINDS.values()), "plug-in")}
+    registered = TRACKERS.all()
+    for tracker in registered:
+        name = tracker.spec.id
+        if "?" not in name:
+            kind = KINDS[tracker.spec.provenance] if tracker.source == "built in" else "plug-in"
+            variants = [other.spec for other in registered if other.spec.id.startswith(f"{name}?")]
+            groups[kind].append([tracker.spec, *variants])
+    return groups
 
 
 class TrackerRegistry(Registry[TrackerSpec]):
@@ -34,11 +70,11 @@ class TrackerRegistry(Registry[TrackerSpec]):
         Raises:
             PluginError: Unknown id (with a did-you-mean), an empty value, or the named object is no spec.
         """
-        known = {found.spec.id: found.spec for found in self.all()}
+        specs = {plugin.spec.id: plugin.spec for plugin in self.all()}
         prefix, separator, value = name.partition(":")
-        if name in known or not separator or prefix not in known or not known[prefix].parameter:
+        if name in specs or not separator or prefix not in specs or not specs[prefix].parameter:
             return super().get(name)
-        return _bind(known[prefix], value)
+        return _bind(specs[prefix], value)
 
 
 def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
@@ -59,11 +95,11 @@ def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
     )
 
 
-TRACKERS: Registry[TrackerSpec] = TrackerRegistry("trackers", TrackerSpec, _builtin)
+TRACKERS: Registry[TrackerSpec] = TrackerRegistry("trackers", TrackerSpec, all_specs)
 
 
 def resolve_settings(spec: TrackerSpec, overrides: Mapping[str, Any] | None = None) -> Settings:
-    """The tracker's default settings with what its name has bound, then the overrides (dotted name to value) applied.
+    """The tracker's default settings, with the values that its id binds, then the overrides (dotted name to value).
 
     Raises:
         SettingsError: Unknown name, unfit value, or values that do not go together.
@@ -113,3 +149,13 @@ def _takes_context(factory: Any) -> bool:
         return "context" in inspect.signature(factory).parameters
     except (TypeError, ValueError):
         return False
+
+
+def epipolar_skipped(tracker: str) -> dict[str, float]:
+    """Share of the tracked frames on which no fundamental matrix was used, by sequence, with the default settings.
+
+    Empty where nothing was measured. Written by ``tests/benchmarks/epipolar_share.py --write``; a run's own share is
+    `RunRecord.epipolar_skipped`.
+    """
+    text = (files("dynslam_bench.trackers") / "epipolar_skipped.json").read_text(encoding="utf-8")
+    return {sequence: float(share) for sequence, share in json.loads(text).get(tracker, {}).items()}

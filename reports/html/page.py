@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
-from jinja2 import Environment, FunctionLoader, select_autoescape
+import numpy as np
+from jinja2 import Environment, FunctionLoader
 from markupsafe import Markup, escape
+from numpy.typing import ArrayLike
 
-from ..figures.style import Figure
-from ..tables.table import Table
-from .side_files import to_script
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.reports.figures import Figure
+from dynslam_bench.reports.tables.table import Table
 
 _STYLES = ("report.css", "figures.css")
 _CHARTS = ("scales.js", "marks.js", "chart.js", "hover.js", "store.js", "page.js")
@@ -31,6 +36,7 @@ class Block:
         title: Heading above it.
         table: For ``table``.
         figure: Id of the figure, for ``figure``.
+        chart: Its specification.
         caption: Below the figure.
         text: For ``code``.
         entries: For ``list``.
@@ -45,6 +51,7 @@ class Block:
     title: str = ""
     table: Table | None = None
     figure: str = ""
+    chart: Figure = field(default_factory=dict)
     caption: str = ""
     text: str = ""
     entries: list[str] = field(default_factory=list)
@@ -74,6 +81,16 @@ class Section:
     blocks: list[Block] = field(default_factory=list)
 
 
+def folded(table: Table | None) -> list[Block]:
+    """A block that shows a table behind its own title, closed at first; none for no table."""
+    return [] if table is None else [Block("table", table.title, table, folded=True)]
+
+
+def figure_blocks(name: str, chart: Figure | None, caption: str = "") -> list[Block]:
+    """A block that shows a figure; none for no figure."""
+    return [] if chart is None else [Block("figure", figure=name, chart=chart, caption=caption)]
+
+
 def render(
     sections: Sequence[Section],
     figures: Mapping[str, Figure],
@@ -94,21 +111,10 @@ def render(
         footer: Last line.
     """
     explores = any(block.kind == "explore" for section in sections for block in section.blocks)
-    return (
-        _environment()
-        .from_string(_resource("report.html.j2"))
-        .render(
-            title=title,
-            protocol=protocol,
-            facts=facts,
-            sections=sections,
-            footer=footer,
-            css=_joined(_STYLES),
-            figures=Markup(to_script(dict(figures))),
-            javascript=_joined(_CHARTS + (_EXPLORE if explores else ())),
-            explores=explores,
-        )
-    )
+    return _render(
+        "report.html.j2", _EXPLORE if explores else (), title=title, protocol=protocol, facts=facts, sections=sections,
+        footer=footer, figures=Markup(to_script(dict(figures))), explores=explores,
+    )  # fmt: skip
 
 
 def render_run_page(title: str) -> str:
@@ -117,19 +123,14 @@ def render_run_page(title: str) -> str:
     Args:
         title: Title of the report that it belongs to.
     """
-    template = _environment().from_string(_resource("run.html.j2"))
-    return template.render(title=title, css=_joined(_STYLES), javascript=_joined(_CHARTS + _RUN))
+    return _render("run.html.j2", _RUN, title=title)
 
 
-def _environment() -> Environment:
-    environment = Environment(autoescape=select_autoescape(default=True), trim_blocks=True, lstrip_blocks=True)
+def _render(template: str, scripts: tuple[str, ...], **values: Any) -> str:
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(resource))
     environment.filters["breakable"] = _breakable
-    environment.loader = FunctionLoader(_resource)
-    return environment
-
-
-def _joined(names: Sequence[str]) -> Markup:
-    return Markup("\n".join(_resource(name) for name in names))
+    css, javascript = (Markup("\n".join(map(resource, names))) for names in (_STYLES, _CHARTS + scripts))
+    return environment.get_template(template).render(css=css, javascript=javascript, **values)
 
 
 def _breakable(name: str) -> Markup:
@@ -138,5 +139,55 @@ def _breakable(name: str) -> Markup:
 
 
 @cache
-def _resource(name: str) -> str:
+def resource(name: str) -> str:
+    """The text of a template, style or script."""
     return (files("dynslam_bench.reports.html") / "templates" / name).read_text(encoding="utf-8")
+
+
+FOLDER = "data"
+_MISSING = 65535
+
+
+def to_script(value: Any) -> str:
+    """A value as JSON that may stand inside a script element."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def write_side(output: Path, name: str, value: Any) -> None:
+    """Write ``data/<name>.js``, a script that hands a value to the page: a page opened from a folder loads no JSON.
+
+    Args:
+        output: Folder of the page.
+        name: What the page asks for.
+        value: Anything that JSON can hold; no NaN.
+
+    Raises:
+        DynslamError: It cannot be written.
+    """
+    path = output / FOLDER / f"{name}.js"
+    content = f"keep({json.dumps(name)},{to_script(value)});\n".encode()
+    if not path.is_file() or path.read_bytes() != content:  # to replace a file takes longer than to read it
+        write_atomic(path, content)
+
+
+def packed_rows(rows: ArrayLike) -> list[list[float | str]]:
+    """Series of numbers in 16 bits each between their smallest and their largest; what is no number stays missing.
+
+    Args:
+        rows: Numbers ``[K, N]``.
+
+    Returns:
+        Of each series its smallest value, the step, and the counts of steps in base64; a page shows them to a 65 000th
+        of their range.
+    """
+    array = np.atleast_2d(np.asarray(rows, dtype=np.float64))
+    finite = np.isfinite(array)
+    low = np.min(array, axis=1, where=finite, initial=np.inf)
+    high = np.max(array, axis=1, where=finite, initial=-np.inf)
+    low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
+    step = np.where(high > low, (high - low) / (_MISSING - 1), 1.0)
+    counts = np.where(finite, (array - low[:, None]) / step[:, None], _MISSING).round().astype("<u2")
+    return [
+        [float(f"{first:.9g}"), float(f"{width:.9g}"), base64.b64encode(row.tobytes()).decode()]
+        for first, width, row in zip(low, step, counts, strict=True)
+    ]

@@ -2,150 +2,138 @@
 
 from __future__ import annotations
 
-from dynslam_bench.evaluation.protocol import Protocol
+from concurrent.futures import Executor
 
-from ..figures import leaderboard as figures
-from ..figures.style import colours, safe
-from ..model.board import Board
-from ..model.common import common_errors, representatives
-from ..model.crew import Crew
-from ..model.missing import missing_commands, missing_note
-from ..model.published import is_excerpt, least_length_s, reported_for
-from ..model.records import records_for
-from ..model.rows import Loaded, trial_words, without_scale_words
-from ..model.statistics import FEWEST, power_note
-from ..tables import fairness as fairness_tables
-from ..tables import leaderboard as tables
-from ..tables import runs as run_tables
-from ..tables import sequences as sequence_tables
-from ..tables.formats import significant_text
-from ..tables.metric import metric_table
-from .draft import Draft
-from .explore import Explored
-from .page import Block, Section
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.reports import figures
+from dynslam_bench.reports.figures import colours, safe
+from dynslam_bench.reports.html.page import Block, Section, figure_blocks, folded
+from dynslam_bench.reports.model.board import Board, common_errors, representatives
+from dynslam_bench.reports.model.load import Loaded, trial_words, without_scale_words
+from dynslam_bench.reports.model.missing import missing_commands, missing_note
+from dynslam_bench.reports.model.published import is_excerpt, least_length_s, records_for, reported_for
+from dynslam_bench.reports.model.row import command_line
+from dynslam_bench.reports.model.statistics import FEWEST, power_note
+from dynslam_bench.reports.tables import errors as error_tables
+from dynslam_bench.reports.tables import leaderboard as tables
+from dynslam_bench.reports.tables.errors import (
+    LOST_MARK,
+    LOST_NOTE,
+    STATISTICS,
+    absolute_table,
+    relative_table,
+    time_table,
+)
+from dynslam_bench.reports.tables.table import significant_text
 
 _MOST_NOTES = 60
 _MOST_COMMANDS = 200
 
 
-def add_leaderboard(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded) -> None:
+def leaderboard_section(board: Board, protocol: Protocol, loaded: Loaded) -> Section:
     """The ranking, what is missing for more of it, and the commands that fill the gaps."""
     section = Section("leaderboard", "Leaderboard", "Leaderboard", notes=_leaderboard_notes(board, protocol, loaded))
-    section.blocks.append(draft.table(tables.leaderboard(board, protocol)))
-    ratio = figures.ratio_figure(board)
-    if ratio is not None:
-        caption = (
-            f"Points: geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} sequences on. Open "
-            "points are not ranked."
-        )
-        section.blocks.append(draft.figure("ratio", ratio, caption))
+    section.blocks.append(Block("table", table=tables.leaderboard(board, protocol)))
+    caption = (
+        f"Points: geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} sequences on. Open "
+        "points are not ranked."
+    )
+    section.blocks += figure_blocks("ratio", figures.ratio_figure(board), caption)
     commands = missing_commands(board)
     if commands:
         section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(commands)))
-    draft.add(section)
+    return section
 
 
 def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list[str]:
     cells = [cell for key in board.ranked for name, cell in board.cells[key].items() if name in board.common]
-    notes = [power_note(board.standings, len(board.common), min((len(c.scores) for c in cells if c.scores), default=0))]
-    missing = missing_note(board)
-    if missing:
-        notes.insert(0, missing)
-    if board.final_only:
-        named = ", ".join(board.labels[key] for key in board.final_only)
-        notes.append(f"Only in the table of final trajectories, as nothing else is known of them: {named}.")
-    if board.unscored:
-        notes.append(f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}.")
-    left = [
-        (loaded.superseded, "older runs of the same tracker, settings, frames and repeat"),
-        (loaded.stopped, "runs that were stopped on request"),
-        (len(loaded.unreadable), "folders without a valid record"),
-    ]
-    if any(count for count, _ in left):
-        notes.append("Left out: " + ", ".join(f"{count} {words}" for count, words in left if count) + ".")
-    if loaded.conflicts:
-        told = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
-        notes.insert(0, f"Runs with one id must be equal, but these have different results: {told}.")
+    fewest_repeats = min((len(cell.scores) for cell in cells if cell.scores), default=0)
+    conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
+    final_only = ", ".join(board.labels[key] for key in board.final_only)
     older = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
-    if older:
-        why = "as a newer program has made runs of the same tracker and settings, or as the runs' ids are unverified"
-        notes.append(f"Not ranked, {why}: {', '.join(older)}.")
-    if loaded.without_scale:
-        notes.append(f"Left out: {without_scale_words(loaded.without_scale, protocol)}.")
-    if loaded.trials:
-        notes.append(f"Left out: {trial_words(loaded.trials)}.")
-    return notes
+    left_out = {
+        "older runs of the same tracker, settings, frames and repeat": loaded.superseded,
+        "runs that were stopped on request": loaded.stopped,
+        "folders without a valid record": len(loaded.unreadable),
+    }
+    counts = ", ".join(f"{count} {words}" for words, count in left_out.items() if count)
+    notes = [
+        f"Runs with one id must be equal, but these have different results: {conflicts}." if conflicts else "",
+        missing_note(board),
+        power_note(board.standings, len(board.common), fewest_repeats),
+        f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
+        if final_only
+        else "",
+        f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}." if board.unscored else "",
+        f"Left out: {counts}." if counts else "",
+        "Not ranked, as a newer program has made runs of the same tracker and settings, or as the runs' ids are "
+        f"unverified: {', '.join(older)}."
+        if older
+        else "",
+        f"Left out: {without_scale_words(loaded.without_scale, protocol)}." if loaded.without_scale else "",
+        f"Left out: {trial_words(loaded.trials)}." if loaded.trials else "",
+    ]
+    return [note for note in notes if note]
 
 
-def add_explore(draft: Draft, explored: Explored) -> None:
-    """The table that leads to every run."""
-    section = Section("explore", "Explore", "Explore", blocks=[Block("explore")])
-    section.notes += explored.notes
-    draft.add(section)
-
-
-def add_speed(draft: Draft, board: Board) -> None:
+def speed_section(board: Board) -> Section:
     """Accuracy against speed."""
-    figure = figures.speed_figure(board)
-    if figure is None:
-        return
     caption = (
         "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
         "include segmentation and exclude decoding; they hold for the machine named below."
     )
     if any(row.cached for row in board.rows):
         caption += f" {tables.CACHED_NOTE}"
-    section = Section("speed", "Accuracy against speed", "Speed")
-    section.blocks.append(draft.figure("speed", figure, caption))
-    draft.add(section)
+    blocks = figure_blocks("speed", figures.speed_figure(board), caption)
+    return Section("speed", "Accuracy against speed", "Speed", blocks=blocks)
 
 
-def add_errors(draft: Draft, board: Board, protocol: Protocol, loaded: Loaded, crew: Crew | None = None) -> None:
+def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
-    if not board.sequences:
-        return
     section = Section("errors", "Errors by sequence", "Errors")
-    excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence, row.duration_s)}
-    recorded = [row for row in board.rows if not row.sequence.startswith("synthetic/")]
-    parts = sorted(excerpts | {board.sequence(row) for row in recorded if row.frames})
+    if not board.sequences:
+        return section
+    excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
+    recorded = [row for row in board.rows if not row.sequence.id.startswith("synthetic/")]
+    parts = sorted(excerpts | {board.sequence(row) for row in recorded if row.frame_words})
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     whole = [name for name in board.sequences if name not in parts]
     published = reported_for(whole, protocol) + records_for(whole, protocol)
     beside = {cell.sequence for cell in published}
     unsure = sorted(
-        {row.sequence for row in board.rows if board.sequence(row) in beside and not least_length_s(row.sequence)}
+        {r.sequence.id for r in board.rows if board.sequence(r) in beside and not least_length_s(r.sequence.id)}
     )
     if unsure:
         section.notes.append(
             f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
             "are of the whole recordings is not checked."
         )
-    table_of_errors = sequence_tables.per_sequence(board, protocol, published)
-    section.blocks.append(draft.table(table_of_errors, "Absolute trajectory error"))
-    common, frames = common_errors(board, protocol, loaded, crew)
-    section.blocks += draft.titled(fairness_tables.common_frames_table(board, common, frames))
+    table_of_errors = error_tables.per_sequence(board, protocol, published)
+    section.blocks.append(Block("table", "Absolute trajectory error", table_of_errors))
+    common, frames = common_errors(board, protocol, pool)
+    section.blocks += folded(tables.common_frames_table(board, common, frames))
     if protocol.trajectory == "online":
-        section.blocks += draft.titled(sequence_tables.final_errors(board, protocol))
+        section.blocks += folded(error_tables.final_errors(board, protocol))
     if any(row.coverage < 1 and not row.failed for row in board.rows):
-        section.blocks += draft.titled(sequence_tables.tracked_errors(board, protocol))
-    section.blocks += draft.titled(fairness_tables.failure_rule_table(board))
-    for table in sequence_tables.relative_errors(board, protocol):
-        section.blocks += draft.titled(table)
-    section.blocks += draft.titled(sequence_tables.rotation_errors(board, protocol))
-    draft.add(section)
+        section.blocks += folded(error_tables.tracked_errors(board, protocol))
+    section.blocks += folded(tables.failure_rule_table(board))
+    for table in error_tables.relative_errors(board, protocol):
+        section.blocks += folded(table)
+    section.blocks += folded(error_tables.rotation_errors(board, protocol))
+    return section
 
 
-def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Protocol) -> None:
+def trajectories_section(board: Board, protocol: Protocol) -> Section:
     """Paths and errors over time of one run a tracker, by sequence; drawn of the runs' side files when it opens."""
     section = Section("trajectories", "Trajectories and error over time", "Trajectories")
     palette = colours(board)
     shown = (board.ranked_order() or board.trackers)[:6] + ([board.reference] if board.reference else [])
     for sequence in board.sequences:
-        chosen = representatives(board, sequence, loaded)
+        chosen = representatives(board, sequence)
         tracks = [
-            {"run": run.row.run_id, "name": safe(board.labels[key]), "colour": palette[key], "shown": key in shown}
-            for key, run in chosen.items()
+            {"run": row.run_id, "name": safe(board.labels[key]), "colour": palette[key], "shown": key in shown}
+            for key, row in chosen.items()
         ]
         if tracks:
             small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
@@ -158,24 +146,18 @@ def add_trajectories(draft: Draft, board: Board, loaded: Loaded, protocol: Proto
             "gap exceeds twice the median interval. Click a name to show or hide it."
         )
         section.blocks.insert(0, Block("caption", text=caption))
-    draft.add(section)
+    return section
 
 
-def add_repeatability(draft: Draft, board: Board) -> None:
+def repeatability_section(board: Board) -> Section:
     """How far the runs of a cell lie apart."""
-    table = run_tables.repeatability(board)
-    if table is None:
-        return
     section = Section("repeatability", "Repeatability", "Repeatability")
-    figure = figures.repeat_figure(board)
-    if figure is not None:
-        caption = (
-            "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
-            + thinned_note(board)
-        )
-        section.blocks.append(draft.figure("repeat", figure, caption))
-    section.blocks.append(draft.table(table))
-    draft.add(section)
+    table = tables.repeatability(board)
+    if table is not None:
+        caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
+        section.blocks += figure_blocks("repeat", figures.repeat_figure(board), caption + thinned_note(board))
+        section.blocks.append(Block("table", table=table))
+    return section
 
 
 def thinned_note(board: Board) -> str:
@@ -186,13 +168,11 @@ def thinned_note(board: Board) -> str:
     return f" Of trackers with more than {most} runs as many are drawn, from the best to the worst."
 
 
-def add_masks(draft: Draft, board: Board) -> None:
+def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
     section = Section("masks", "Mask quality and pose error", "Masks")
-    figure = figures.mask_figure(board)
-    if figure is not None:
-        section.blocks.append(draft.figure("masks", figure, "One point a run." + thinned_note(board)))
-    table = metric_table(
+    section.blocks += figure_blocks("masks", figures.mask_figure(board), "One point a run." + thinned_note(board))
+    table = error_tables.metric_table(
         board,
         lambda row: row.mask_iou,
         "mask_iou",
@@ -203,22 +183,24 @@ def add_masks(draft: Draft, board: Board) -> None:
         larger_is_better=True,
     )
     if table is not None:
-        section.blocks.append(draft.table(table))
-    draft.add(section)
+        section.blocks.append(Block("table", table=table))
+    return section
 
 
-def add_failures(draft: Draft, board: Board) -> None:
+def failures_section(board: Board) -> Section:
     """Every run that failed, or that none did."""
-    table = run_tables.failures(board)
-    nothing = Block(kind="list", entries=[f"None of {len(board.rows)} runs failed."])
-    draft.add(Section("failures", "Failures", "Failures", [], [nothing if table is None else draft.table(table)]))
+    table = tables.failures(board)
+    block = Block("table", table=table)
+    if table is None:
+        block = Block("list", entries=[f"None of {len(board.rows)} runs failed."])
+    return Section("failures", "Failures", "Failures", blocks=[block])
 
 
-def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> None:
+def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
     section = Section("provenance", "Machines, versions, commands", "Reproduce")
-    section.blocks.append(draft.table(run_tables.machines(board)))
-    commands = list(dict.fromkeys(row.command for row in board.rows if row.command))
+    section.blocks.append(Block("table", table=tables.machines(board)))
+    commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     section.blocks.append(
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
@@ -232,9 +214,25 @@ def add_provenance(draft: Draft, board: Board, loaded: Loaded, again: str) -> No
     if notes:
         entries = first_of(notes, _MOST_NOTES, "... and {} more on the pages of the runs")
         section.blocks.append(Block(kind="list", title="Diagnostics", entries=entries, folded=True))
-    draft.add(section)
+    return section
 
 
 def first_of(entries: list[str], most: int, others: str) -> list[str]:
     """The first entries; how many others there are stands behind them."""
     return entries if len(entries) <= most else [*entries[:most], others.format(len(entries) - most)]
+
+
+def paper_section(board: Board, protocol: Protocol) -> Section:
+    """Tables 1 to 3 and Figures 9 to 12, as the paper lays them out."""
+    section = Section("paper", "As in the paper: four statistics of the errors, and time", "As in the paper")
+    for table in (absolute_table(board, protocol), relative_table(board, protocol), time_table(board)):
+        section.blocks += folded(table)
+    for statistic, number in figures.FIGURES.items():
+        figure = figures.bar_figure(board, statistic)
+        lost = figure is not None and any(LOST_MARK in trace["text"] for trace in figure["data"])
+        caption = (
+            f"As the paper's Figure {number}: {STATISTICS[statistic]} of the absolute pose error, median over the "
+            "runs that succeeded; pale bars are not ranked." + f" {LOST_NOTE}" * lost
+        )
+        section.blocks += figure_blocks(f"paper-{statistic}", figure, caption)
+    return section

@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
+from pathlib import Path
 from statistics import geometric_mean, median
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from dynslam_bench.core.errors import ReportError
-
-from .cell import Cell, make_cell
-from .columns import name_columns, shortened
-from .frame import rows_frame
-from .labels import make_labels
-from .row import RunRow
-from .rows import check_one_protocol, check_reference
-from .statistics import FLOOR_M, Standing, standings
+from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
+from dynslam_bench.core.toml import assignments
+from dynslam_bench.evaluation.ape import ate_rmse_m
+from dynslam_bench.evaluation.prepare import common_frames
+from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores, run_jobs
+from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.reports.model.row import RunRow, grouped
+from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
+from dynslam_bench.runs.store import RunStore
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NEVER_MOVE = "static camera (from ground truth)"
+
+STATIC_CAMERA = "static camera (from ground truth)"
 DEFAULT_REFERENCE = "orb-slam2"
 On = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
-_GROUPS = (("static", "static"), ("low-dynamic", "low dynamic"), ("high-dynamic", "high dynamic"))
-
+_GROUPS = {"static": "static", "low-dynamic": "low dynamic", "high-dynamic": "high dynamic"}
+"""Tag of a sequence to the name of its group, in their order."""
 _NAMES = (("walking", "high dynamic"), ("sitting", "low dynamic"))
 _OTHER = "other"
 
@@ -49,7 +54,7 @@ class Board:
         groups: Sequence to the name of its group.
         unscored: Names of the sequences without ground truth.
         cells: Variant key to sequence to its runs.
-        never_move: Sequence to the error of a static camera.
+        static_camera: Sequence to the error of a static camera.
         reference: Variant key of the reference; None if ratios are to a static camera.
         reference_name: How to call the reference in captions.
         asked_reference: The tracker id that was asked for as the reference; empty for none.
@@ -74,9 +79,9 @@ class Board:
     groups: dict[str, str] = field(default_factory=dict)
     unscored: list[str] = field(default_factory=list)
     cells: dict[str, dict[str, Cell]] = field(default_factory=dict)
-    never_move: dict[str, float] = field(default_factory=dict)
+    static_camera: dict[str, float] = field(default_factory=dict)
     reference: str | None = None
-    reference_name: str = NEVER_MOVE
+    reference_name: str = STATIC_CAMERA
     asked_reference: str = ""
     standings: list[Standing] = field(default_factory=list)
     ranked: list[str] = field(default_factory=list)
@@ -86,10 +91,7 @@ class Board:
 
     @cached_property
     def _by_key(self) -> dict[str, list[RunRow]]:
-        found: dict[str, list[RunRow]] = {}
-        for row in self.rows:
-            found.setdefault(row.variant_key, []).append(row)
-        return found
+        return grouped(self.rows, lambda row: row.variant_key)
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
@@ -103,19 +105,24 @@ class Board:
         """Any row of a tracker, for what all its rows share."""
         return self._by_key[key][0]
 
-    def no_better_than_still(self, key: str, sequence: str) -> bool:
+    def is_rankable(self, key: str) -> bool:
+        """Whether a tracker could be ranked: a system, as its spec says, by the newest program."""
+        row = self.first(key)
+        return row.ranked and row.is_current and row.tracker.provenance != "control"
+
+    def no_better_than_static(self, key: str, sequence: str) -> bool:
         """Whether a tracker's runs that ended well have, by their median, a static camera's error or more.
 
         Controls make no claim: never.
         """
-        cell, still = self.cells[key].get(sequence), self.never_move.get(sequence)
-        if cell is None or still is None or not cell.succeeded or self.first(key).provenance == "control":
+        cell, static_m = self.cells[key].get(sequence), self.static_camera.get(sequence)
+        if cell is None or static_m is None or not cell.succeeded or self.first(key).tracker.provenance == "control":
             return False
-        return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * still
+        return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * static_m
 
     def static_ratio(self, key: str) -> float:
         """Geometric mean over the common sequences of a tracker's median error over that of a static camera."""
-        pairs = [(self.cells[key][name].median or 0.0, self.never_move[name]) for name in self.common]
+        pairs = [(self.cells[key][name].median or 0.0, self.static_camera[name]) for name in self.common]
         return geometric_mean([max(error, FLOOR_M) / max(static, FLOOR_M) for error, static in pairs])
 
     def ranked_order(self) -> list[str]:
@@ -128,24 +135,22 @@ class Board:
 
     def competes(self, key: str, name: str) -> bool:
         """Whether a tracker's number on a sequence may rank: no network that it uses was trained there."""
-        return self.rank_seen or not self.cells[key][name].seen
+        return self.rank_seen or not self.cells[key][name].in_training
 
     def lacking(self, key: str) -> list[str]:
         """The sequences on which a tracker was not run."""
         return [name for name in self.sequences if name not in self.cells[key]]
 
-    def reference_scores(self) -> dict[str, list[float]]:
-        """The reference's errors on the common sequences."""
-        if self.reference is None:
-            return {name: [self.never_move[name]] for name in self.common}
-        return {name: list(self.cells[self.reference][name].scores) for name in self.common}
-
     def reference_median(self, sequence: str) -> float | None:
         """The reference's median error on a sequence; None where it was not run."""
         if self.reference is None:
-            return self.never_move[sequence]
+            return self.static_camera[sequence]
         cell = self.cells[self.reference].get(sequence)
         return None if cell is None else cell.median
+
+    def unranked_rows(self, keys: Sequence[str]) -> set[int]:
+        """Positions among some trackers of those that are not ranked."""
+        return {at for at, key in enumerate(keys) if key not in self.ranked}
 
     def separators(self) -> set[int]:
         """Rows of a table of all trackers above which a line is drawn: the unranked, and those that never succeeded."""
@@ -168,42 +173,51 @@ def make_board(
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
 
     Raises:
-        ReportError: There are no rows, they mix protocols, or nothing is known of the reference.
+        ReportError: There are no rows, they mix protocols, or no run is of the reference.
     """
     if not rows:
         raise ReportError("there are no runs to report")
     check_one_protocol(rows)
-    check_reference(reference, [row.tracker for row in rows])
+    trackers = sorted({row.tracker.id for row in rows})
+    if reference is not None and reference not in trackers:
+        raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, trackers))
     board = Board(list(rows), on, rank_seen, name_columns(rows), asked_reference=reference or "")
     board.labels = make_labels(rows)
     _order_sequences(board)
     for key in board.labels:
-        found: dict[str, list[RunRow]] = {}
-        for row in board.runs(key):
-            found.setdefault(board.sequence(row), []).append(row)
-        board.cells[key] = {name: make_cell(runs) for name, runs in found.items()}
-    shown = [key for key in board.labels if not _only_final(board, key)]
-    board.final_only = [key for key in board.labels if key not in shown]
-    scored = [key for key in shown if any(_scored(board, key))]
+        cells = grouped(board.runs(key), board.sequence)
+        board.cells[key] = {name: make_cell(runs) for name, runs in cells.items()}
+    board.final_only = [key for key in board.labels if all(row.only_final for row in board.runs(key))]
+    shown = [key for key in board.labels if key not in board.final_only]
+    scored = [key for key in shown if _scored(board, key)]
     _choose_ranked(board, scored)
-    wanted = reference or DEFAULT_REFERENCE
-    candidates = [k for k in scored if board.first(k).tracker == wanted and "map" not in board.first(k).variant]
-    candidates = [k for k in candidates if board.first(k).is_current and not board.first(k).imported]
-    candidates = [k for k in candidates if not _real_time(board, k)]
-    candidates = [k for k in candidates if set(board.common) <= set(_scored(board, k))]
-    if candidates and board.common:
-        board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
-        board.reference_name = board.labels[board.reference]
+    _choose_reference(board, scored, reference or DEFAULT_REFERENCE)
     if board.common:
         board.standings = rank(board, scored, board.ranked)
     placed = [standing.key for standing in board.standings]
     placed += sorted((key for key in shown if key not in placed), key=board.labels.__getitem__)
-    board.trackers = [k for k in placed if k not in board.hopeless] + [k for k in placed if k in board.hopeless]
+    board.trackers = sorted(placed, key=lambda key: key in board.hopeless)
     return board
 
 
+def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
+    """The plainest variant of a tracker that was run on all common sequences, if there is one."""
+    candidates = []
+    for key in scored:
+        row = board.first(key)
+        plain = row.is_current and not row.imported and not row.realtime and "map" not in row.variant
+        if row.tracker.id == tracker and plain and set(board.common) <= set(_scored(board, key)):
+            candidates.append(key)
+    if candidates and board.common:
+        board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
+        board.reference_name = board.labels[board.reference]
+
+
 def rank(
-    board: Board, scored: Sequence[str], ranked: Sequence[str], score: Callable[[RunRow], float | None] | None = None
+    board: Board,
+    scored: Sequence[str],
+    ranked: Sequence[str],
+    score: Callable[[RunRow], float | None] = attrgetter("score_m"),
 ) -> list[Standing]:
     """Standings over the common sequences under one rule for failures.
 
@@ -211,47 +225,37 @@ def rank(
         board: Gives cells and reference.
         scored: Trackers to place.
         ranked: Those of them that are ranked.
-        score: Error of a run in metres, or None to leave it out; None for the board's own rule.
+        score: Error of a run in metres, or None to leave it out.
     """
-    rule = score or (lambda row: row.score_m)
-    cells = {
-        key: {
-            name: [value for row in cell.kept if (value := rule(row)) is not None]
-            for name, cell in board.cells[key].items()
-            if name in board.common
-        }
-        for key in scored
-    }
-    reference = board.reference_scores() if score is None or board.reference is None else dict(cells[board.reference])
-    shared = {name: values for name, values in reference.items() if values}
-    placed = [key for key in scored if any(cells[key].get(name) for name in shared)]
-    full = [key for key in ranked if key in placed and all(cells[key].get(name) for name in shared)]
+    cells: dict[str, dict[str, list[float]]] = {}
+    for key in {*scored} if board.reference is None else {*scored, board.reference}:
+        rows = {name: board.cells[key][name].kept for name in board.common if name in board.cells[key]}
+        cells[key] = {name: [error for error in map(score, kept) if error is not None] for name, kept in rows.items()}
+    static = {name: [board.static_camera[name]] for name in board.common}
+    reference = static if board.reference is None else cells[board.reference]
+    shared = {name: errors for name, errors in reference.items() if errors}
     if not shared:
         return []
+    placed = [key for key in scored if any(cells[key].get(name) for name in shared)]
+    full = [key for key in ranked if key in placed and all(cells[key].get(name) for name in shared)]
     return standings({key: cells[key] for key in placed}, shared, full)
 
 
 def _order_sequences(board: Board) -> None:
-    rows: dict[str, list[RunRow]] = {}
-    for row in board.rows:
-        rows.setdefault(board.sequence(row), []).append(row)
-    for name, found in rows.items():
-        still = [row.static_camera_ate_rmse_m for row in found if row.static_camera_ate_rmse_m is not None]
-        if still:
-            board.never_move[name] = median(still)
+    """Name the sequences and their groups, static ones first; note what a static camera scores on each."""
+    for name, rows in grouped(board.rows, board.sequence).items():
+        errors = [row.static_camera_ate_rmse_m for row in rows if row.static_camera_ate_rmse_m is not None]
+        if errors:
+            board.static_camera[name] = median(errors)
         else:
             board.unscored.append(name)
-        board.groups[name] = _group(found[0])
+        board.groups[name] = _group(rows[0])
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
-    order = {name: position for position, (_, name) in enumerate(_GROUPS)}
-    board.sequences = sorted(board.never_move, key=lambda key: (order.get(board.groups[key], 9), key))
+    order = list(_GROUPS.values())
+    place = {name: order.index(group) if group in order else len(order) for name, group in board.groups.items()}
+    board.sequences = sorted(board.static_camera, key=lambda name: (place[name], name))
     board.short = shortened(board.sequences)
-
-
-def _real_time(board: Board, key: str) -> bool:
-    """Whether the machine's speed decided which frames a tracker saw."""
-    return "realtime" in board.first(key).variant
 
 
 def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
@@ -262,10 +266,9 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     without any success is not ranked, nor is one that is no better than a static camera, nor one where its network was
     trained (`Board.competes`).
     """
-    firsts = {key: board.first(key) for key in scored}
-    rankable = [key for key, row in firsts.items() if row.ranked and row.is_current and row.provenance != "control"]
-    if not all(_real_time(board, key) for key in rankable):  # real-time runs are ranked among themselves only
-        rankable = [key for key in rankable if not _real_time(board, key)]
+    rankable = [key for key in scored if board.is_rankable(key)]
+    if not all(board.first(key).realtime for key in rankable):  # real-time runs are ranked among themselves only
+        rankable = [key for key in rankable if not board.first(key).realtime]
     rankable = [key for key in rankable if any(cell.success for cell in board.cells[key].values())]
     has = {key: {name for name in _scored(board, key) if board.competes(key, name)} for key in rankable}
     rankable = [key for key in rankable if has[key]]
@@ -296,16 +299,281 @@ def _scored(board: Board, key: str) -> list[str]:
     return [name for name in board.sequences if name in board.cells[key] and board.cells[key][name].scores]
 
 
-def _only_final(board: Board, key: str) -> bool:
-    """Whether a tracker has nothing of the trajectory that the others are judged by."""
-    return all(row.imported and not row.metrics and row.final_ate_m is not None for row in board.runs(key))
-
-
 def _group(row: RunRow) -> str:
-    for tag, name in _GROUPS:
-        if tag in row.tags:
-            return name
-    for part, name in _NAMES:
-        if part in row.sequence:
-            return name
-    return _OTHER
+    tagged = [name for tag, name in _GROUPS.items() if tag in row.sequence.tags]
+    named = [name for part, name in _NAMES if part in row.sequence.id]
+    return next(iter([*tagged, *named]), _OTHER)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All runs of one tracker on one sequence.
+
+    Attributes:
+        rows: The runs, ordered by repeat.
+        kept: Those that count: of runs that differ in their seed only and have equal results, one.
+    """
+
+    rows: tuple[RunRow, ...]
+    kept: tuple[RunRow, ...]
+
+    @cached_property
+    def scores(self) -> tuple[float, ...]:
+        """Errors in metres of the runs that count, failures imputed."""
+        return tuple(score for row in self.kept if (score := row.score_m) is not None)
+
+    @cached_property
+    def succeeded(self) -> tuple[RunRow, ...]:
+        """The runs that count, ended and have an error."""
+        return tuple(row for row in self.kept if not row.failed and row.score_m is not None)
+
+    @cached_property
+    def median(self) -> float | None:
+        """Median error in metres; None without ground truth."""
+        return median(self.scores) if self.scores else None
+
+    @cached_property
+    def failed(self) -> int:
+        """Runs that failed."""
+        return sum(row.failed for row in self.rows)
+
+    @property
+    def success(self) -> int:
+        """Runs that ended and could be evaluated."""
+        return len(self.rows) - self.failed
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether several seeds gave one result to the last digit."""
+        return len(self.kept) == 1 < len(self.rows)
+
+    @cached_property
+    def typical(self) -> RunRow:
+        """The run that stands for the cell: the successful one with the (lower) median error, else its first."""
+        ordered = sorted(self.succeeded, key=lambda row: row.score_m or 0.0)
+        return ordered[(len(ordered) - 1) // 2] if ordered else self.rows[0]
+
+    @cached_property
+    def in_training(self) -> bool:
+        """Whether masks of it come from a network that was trained on the scene."""
+        return any(row.seen_in_training for row in self.rows)
+
+    @cached_property
+    def ending(self) -> str:
+        """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
+        endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))
+        return endings[0] if len(endings) == 1 else f"{self.failed} failed: {'; '.join(endings)}" if endings else ""
+
+    @property
+    def epipolar_skipped(self) -> float | None:
+        """Mean share of the tracked frames on which the fundamental matrix was not used; None without such a test."""
+        return mean_skipped(self.rows)
+
+
+def make_cell(rows: Sequence[RunRow]) -> Cell:
+    """Order the runs of a cell and find the copies among them."""
+    ordered = sorted(rows, key=lambda row: row.repeat_key)
+    kept: list[RunRow] = []
+    for group in grouped(ordered, lambda row: (row.offset, row.sequence.noise, row.imported)).values():
+        results = {_result(row) for row in group}
+        kept += group[:1] if len(results) == 1 else group
+    return Cell(tuple(ordered), tuple(kept))
+
+
+def mean_skipped(rows: Sequence[RunRow]) -> float | None:
+    """Mean over runs of the share of frames on which the fundamental matrix was not used; None if none has it."""
+    shares = [row.epipolar_skipped for row in rows if row.epipolar_skipped is not None]
+    return sum(shares) / len(shares) if shares else None
+
+
+def _result(row: RunRow) -> object:
+    """Everything that two copies have in common."""
+    return row.status, row.n_processed, row.coverage, row.score_m, row.final_ate_m, tuple(sorted(row.metrics.items()))
+
+
+_TEXTS = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
+_TEXTS += ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
+_KINDS = dict.fromkeys(_TEXTS, "string")
+_KINDS |= dict.fromkeys(["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"], "Int64")
+_KINDS |= dict.fromkeys(["ranked", "failed", "cached", "seen_in_training"], "boolean")
+_NUMBERS = ["coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"]
+_NUMBERS += ["real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
+_KINDS |= dict.fromkeys(_NUMBERS, "Float64")
+
+
+def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
+    """Rows as a frame.
+
+    Args:
+        rows: One a run.
+        columns: Column id to the name of its sequence, see `name_columns`.
+        labels: Variant key to the name of the tracker in tables, see `make_labels`.
+
+    Returns:
+        One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``. ``string`` columns:
+        run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
+        ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
+        status, ending (of a failed run), study (of which the run is a trial), protocol_id, protocol_digest, trajectory
+        (``online``, ``final``: whose errors they are), segmentation.
+        ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked. ``boolean``:
+        ranked, failed, cached (whether stage times come from the stage cache), seen_in_training (whether the masks
+        come from a network that was trained on the scene). ``Float64``: coverage and
+        epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
+        failures as a static camera or worse), hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m (metres),
+        frame_ms (median, milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1),
+        rotation_uncertainty_deg (standard error in degrees of the alignment's rotation; above 10 the metrics
+        ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under
+        its own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
+    """
+    import pandas as pd
+
+    ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
+    metrics = sorted({name for row in rows for name in row.metrics} - set(_NUMBERS))
+    kinds = _KINDS | dict.fromkeys(metrics, "Float64")
+    lines = []
+    for row in ordered:
+        values: dict[str, Any] = {
+            "kind": row.origin,
+            "tracker": row.tracker.id,
+            "label": labels[row.variant_key],
+            "settings": "; ".join(assignments(row.variant)),
+            "provenance": row.tracker.provenance,
+            "sequence": columns[row.column_id],
+            "frames": row.frame_words,
+            "split": row.sequence.split,
+            "study": row.trial_of,
+            "noise": row.sequence.noise,
+        }
+        values |= {name: row.metrics.get(name) for name in metrics}
+        lines.append([values[name] if name in values else getattr(row, name) for name in kinds])
+    return pd.DataFrame(lines, columns=list(kinds), dtype=object).astype(kinds)
+
+
+def load_frame(
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    trials: bool = False,
+) -> pd.DataFrame:
+    """All runs of some results folders, scored under one protocol, one row a run.
+
+    Args:
+        results: Results folders, or a store.
+        protocol: How to evaluate; SLAM is never run again for it.
+        trials: As in `build_report`.
+
+    Returns:
+        The frame that `rows_frame` describes.
+
+    Raises:
+        ReportError: There are no runs.
+    """
+    rows = load_runs(open_stores(results), get_protocol(protocol), trials=trials).rows
+    return rows_frame(rows, name_columns(rows), make_labels(rows))
+
+
+def load_board(
+    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    *,
+    reference: str | None = None,
+    on: On = "common",
+    rank_seen: bool = False,
+    trials: bool = False,
+) -> Board:
+    """The board of some results folders: all runs, ordered and ranked as in a report.
+
+    Args:
+        results: Results folders, or a store.
+        protocol: How to evaluate; SLAM is never run again for it.
+        reference: As in `make_board`.
+        on: As in `make_board`.
+        rank_seen: As in `make_board`.
+        trials: As in `build_report`.
+
+    Raises:
+        ReportError: As `make_board`.
+    """
+    rows = load_runs(open_stores(results), get_protocol(protocol), trials=trials).rows
+    return make_board(rows, reference, on, rank_seen=rank_seen)
+
+
+# -- the frames that all runs of a sequence tracked, and the runs that stand for a tracker in figures
+
+MOST_COMPARED = 100
+"""Runs on one sequence of which the common frames are taken, about: of more, as many of every tracker."""
+
+
+def common_errors(
+    board: Board, protocol: Protocol, pool: Executor | None = None
+) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
+    """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are.
+
+    Of more than `MOST_COMPARED` runs on a sequence these are the runs of each tracker around its median error.
+    """
+    jobs = [(around_medians(successful(board, sequence)), protocol) for sequence in board.sequences]
+    answers = run_jobs(pool, common_of, jobs, lambda _: None)
+    errors: dict[tuple[str, str], float] = {}
+    frames: dict[str, str] = {}
+    for sequence, (rows, _), (of_run, count) in zip(board.sequences, jobs, answers, strict=True):
+        if count is None:
+            continue
+        compared = [row for row in rows if row.run_id in of_run]
+        frames[sequence] = f"{count} of {max(row.n_frames for row in compared)}"
+        for key, rows_of_key in grouped(compared, lambda row: row.variant_key).items():
+            values = [error for row in rows_of_key if (error := of_run[row.run_id]) is not None]
+            if values:
+                errors[key, sequence] = median(values)
+    return errors, frames
+
+
+def common_of(rows: Sequence[RunRow], protocol: Protocol) -> tuple[dict[str, float | None], int | None]:
+    """ATE of runs on one sequence on the frames that all of them tracked, by run, and how many those are.
+
+    Returns:
+        Of every run with a trajectory its error, None where it cannot be taken; nothing, and None, for the runs of a
+        single tracker.
+    """
+    pairs = [(row, row.estimate(protocol.trajectory)) for row in rows]
+    tracked = [(row, trajectory) for row, trajectory in pairs if trajectory is not None]
+    if len({row.variant_key for row, _ in tracked}) < 2:
+        return {}, None
+    reduced = common_frames([trajectory for _, trajectory in tracked])
+    errors: dict[str, float | None] = {}
+    for (row, whole), trajectory in zip(tracked, reduced, strict=True):
+        if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # the error is that of the row
+            errors[row.run_id] = row.metrics["ate_rmse_m"]
+            continue
+        truth = row.ground_truth()
+        try:
+            errors[row.run_id] = None if truth is None else ate_rmse_m(trajectory, truth, protocol)
+        except DynslamError:
+            errors[row.run_id] = None
+    return errors, len(reduced[0])
+
+
+def representatives(board: Board, sequence: str) -> dict[str, RunRow]:
+    """Of each tracker the successful run on a sequence whose error is the (lower) median one."""
+    by_key = _by_error(successful(board, sequence))
+    return {key: by_key[key][(len(by_key[key]) - 1) // 2] for key in board.trackers if key in by_key}
+
+
+def around_medians(rows: Sequence[RunRow]) -> Sequence[RunRow]:
+    """All of few runs on a sequence; of many, as many of each tracker: those around its (lower) median error."""
+    if len(rows) <= MOST_COMPARED:
+        return rows
+    by_key = _by_error(rows)
+    most = max(MOST_COMPARED // len(by_key), 1)
+    starts = {key: max((len(ordered) - most) // 2, 0) for key, ordered in by_key.items()}
+    return [row for key, ordered in by_key.items() for row in ordered[starts[key] : starts[key] + most]]
+
+
+def _by_error(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
+    """Runs by tracker, from the smallest to the largest error."""
+    return grouped(sorted(rows, key=lambda row: row.metrics["ate_rmse_m"]), lambda row: row.variant_key)
+
+
+def successful(board: Board, sequence: str) -> list[RunRow]:
+    """The runs on a sequence that ended and could be evaluated, copies left out."""
+    rows = [row for cells in board.cells.values() if sequence in cells for row in cells[sequence].kept]
+    return [row for row in rows if not row.failed and "ate_rmse_m" in row.metrics]

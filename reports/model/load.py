@@ -1,69 +1,353 @@
-"""From results folders to a frame or a board, in one call."""
+"""From results folders to rows: which runs count, scored under one protocol.
+
+Rows of unchanged runs are taken from the store's SQLite index. Many runs are scored by several processes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import signal
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import ModuleType
+from typing import Any, TypeVar
 
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.runs.storage.store import RunStore
+from pydantic import ValidationError
 
-from .board import Board, On, make_board
-from .columns import name_columns
-from .frame import rows_frame
-from .labels import make_labels
-from .rows import load_runs, open_stores
+import dynslam_bench
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError
+from dynslam_bench.core.fingerprint import package_digest
+from dynslam_bench.core.records import digest
+from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
+from dynslam_bench.reports.model.row import RunRow, grouped, make_row
+from dynslam_bench.runs.store import RunStore
 
-if TYPE_CHECKING:
-    import pandas as pd
+T = TypeVar("T")
+OnProgress = Callable[[float, float | None, str], None]
+"""Called as ``on_progress(done, total, what)``; the total is None where it is not known."""
+MANY = 250
+"""Runs from which on worker processes save more time than they need to start."""
+MOST_WORKERS = 8
+JOB = 40
+"""Runs of one job of a worker, at most."""
+_CODE = ("evaluation", "geometry", "reports/model", "runs")
 
 
-def load_frame(
-    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
-    protocol: Protocol | str = "tum-rgbd/v1",
-    *,
-    trials: bool = False,
-) -> pd.DataFrame:
-    """All runs of some results folders, scored under one protocol, one row a run.
+def no_progress(done: float, total: float | None, what: str) -> None:
+    """Ignore progress."""
+
+
+# -- worker processes
+
+
+@contextmanager
+def worker_pool(runs: int) -> Iterator[Executor | None]:
+    """As many worker processes as so many runs are worth on this machine; None where they are worth none."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if runs < MANY or cores == 1:
+        yield None
+        return
+    context = get_context("spawn")  # a library cannot know which threads its caller has: no fork
+    with ProcessPoolExecutor(min(cores, MOST_WORKERS), context, _start_worker) as pool:
+        yield pool
+
+
+def _start_worker() -> None:
+    """Leave Ctrl-C to the parent process, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def run_jobs(
+    pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]], on_answer: Callable[[T], None]
+) -> list[T]:
+    """Call a function once a job, in worker processes or here.
 
     Args:
-        results: Results folders, or a store.
-        protocol: How to evaluate; SLAM is never run again for it.
-        trials: As in `build_report`.
+        pool: The workers; None to call it here.
+        function: A function of a module.
+        jobs: Its arguments.
+        on_answer: Called with every answer as it arrives.
 
     Returns:
-        The frame that `rows_frame` describes.
+        The answers in the order of the jobs.
 
     Raises:
-        ReportError: There are no runs.
+        DynslamError: A job cannot be done.
+        InfrastructureError: A worker has died.
     """
-    rows = [run.row for run in load_runs(open_stores(results), get_protocol(protocol), trials=trials).runs]
-    return rows_frame(rows, name_columns(rows), make_labels(rows))
+    if pool is None:
+        answers = []
+        for job in jobs:
+            answers.append(function(*job))
+            on_answer(answers[-1])
+        return answers
+    with _without_main():
+        futures = [pool.submit(function, *job) for job in jobs]
+    try:
+        for future in as_completed(futures):
+            on_answer(future.result())
+    except BrokenProcessPool as error:
+        raise InfrastructureError(f"a worker process of the report ended early: {error}") from error
+    finally:
+        for future in futures:
+            future.cancel()
+    return [future.result() for future in futures]
 
 
-def load_board(
-    results: Sequence[Path] | Sequence[str] | RunStore | Path | str,
-    protocol: Protocol | str = "tum-rgbd/v1",
-    *,
-    reference: str | None = None,
-    on: On = "common",
-    rank_seen: bool = False,
-    trials: bool = False,
-) -> Board:
-    """The board of some results folders: all runs, ordered and ranked as in a report.
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Let workers start without the caller's script, which need not guard what it does at import."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+# -- rows of unchanged runs
+
+
+class RowCache:
+    """Rows of a store's runs under a protocol, kept in the store's index: an unchanged run is not read again.
 
     Args:
-        results: Results folders, or a store.
-        protocol: How to evaluate; SLAM is never run again for it.
-        reference: As in `make_board`.
-        on: As in `make_board`.
-        rank_seen: As in `make_board`.
-        trials: As in `build_report`.
+        store: The store.
+        protocol: How errors are computed.
+    """
+
+    def __init__(self, store: RunStore, protocol: Protocol) -> None:
+        self.store, self.protocol = store, protocol
+        self._name = f"report {protocol.digest()}"
+        self._version = digest([dynslam_bench.__version__, package_digest(_CODE)])
+
+    def read(self) -> dict[str, RunRow]:
+        """The rows that hold, by run id; damaged rows, and rows of other runs, count as missing."""
+        rows = {}
+        for run_id, text in self.store.index.read(
+            self._name, self._version, self.store.ids(), check_links=True
+        ).items():
+            with suppress(ValidationError):
+                row = RunRow.model_validate_json(text)
+                if (row.run_id, row.protocol_digest) == (run_id, self.protocol.digest()):
+                    rows[run_id] = row.stored_in(self.store)
+        return rows
+
+    def take(self, run_ids: Sequence[str]) -> tuple[list[tuple[RunRow, str]], list[str]]:
+        """Read some runs and score them.
+
+        Returns:
+            The rows with the states of their files, and the folders without a valid record, with reasons.
+        """
+        rows = []
+        unreadable = []
+        for run_id in run_ids:
+            try:
+                record, state = self.store.read_with_state(run_id)
+                rows.append((make_row(self.store, record, self.protocol), state))
+            except DynslamError as error:
+                unreadable.append(f"{self.store.folder(run_id)}: {error}")
+        return rows, unreadable
+
+    def add(self, rows: Iterable[tuple[RunRow, str]]) -> None:
+        """Keep rows for later reports, as far as the store can be written."""
+        entries = []
+        for row, state in rows:
+            with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
+                entries.append((row.run_id, state, row.model_dump_json(exclude_defaults=True)))
+        if entries:
+            self.store.index.write(self._name, self._version, entries)
+
+
+# -- runs that count
+
+
+@dataclass
+class Loaded:
+    """Everything read from the stores.
+
+    Attributes:
+        rows: The newest run of every variant, column and repeat.
+        superseded: How many older ones there were.
+        stopped: How many runs were left out since they were ended on request.
+        without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
+        trials: How many were left out since they are trials of studies.
+        unreadable: Folders without a valid record, with reasons.
+        conflicts: Runs that should be equal and are not, in words.
+    """
+
+    rows: list[RunRow] = field(default_factory=list)
+    superseded: int = 0
+    stopped: int = 0
+    without_scale: int = 0
+    trials: int = 0
+    unreadable: list[str] = field(default_factory=list)
+    conflicts: list[str] = field(default_factory=list)
+
+
+def load_runs(
+    stores: Sequence[RunStore],
+    protocol: Protocol,
+    on_progress: OnProgress = no_progress,
+    pool: Executor | None = None,
+    *,
+    trials: bool = False,
+) -> Loaded:
+    """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
+
+    Args:
+        stores: The stores.
+        protocol: How to evaluate.
+        on_progress: As in `build_report`.
+        pool: Workers that score the runs; None to score them here.
+        trials: Whether trials of studies count like other runs.
 
     Raises:
-        ReportError: As `make_board`.
+        ReportError: There is no run at all.
     """
-    loaded = load_runs(open_stores(results), get_protocol(protocol), reference=reference, trials=trials)
-    rows = [run.row for run in loaded.runs]
-    return make_board(rows, reference, on, rank_seen=rank_seen)
+    on_progress(0, None, "looking for what has changed")
+    loaded = Loaded()
+    everything = _all_rows([RowCache(store, protocol) for store in stores], loaded, on_progress, pool)
+    ended = [row for row in everything if row.status != "stopped"]
+    scaled = [row for row in ended if protocol.finds_scale or row.tracker.sensors != "rgb"]
+    rows = [row for row in scaled if trials or not row.trial_of]
+    loaded.stopped = len(everything) - len(ended)
+    loaded.without_scale, loaded.trials = len(ended) - len(scaled), len(scaled) - len(rows)
+    loaded.conflicts = _two_results(rows)
+    newest: dict[tuple[object, ...], RunRow] = {}
+    for row in sorted(rows, key=lambda row: (row.started, row.run_id)):
+        newest[row.settings_key, row.column_id, row.repeat_key, row.trajectory] = row
+    _split_programs(newest.values())
+    loaded.superseded = len(rows) - len(newest)
+    loaded.rows = list(newest.values())
+    if not newest and loaded.without_scale:
+        raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
+    if not newest and loaded.trials:
+        raise ReportError(f"all {trial_words(loaded.trials)}")
+    if not newest:
+        places = ", ".join(str(store.root) for store in stores)
+        raise ReportError(f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'"))
+    return loaded
+
+
+def _all_rows(
+    caches: Sequence[RowCache], loaded: Loaded, on_progress: OnProgress, pool: Executor | None
+) -> list[RunRow]:
+    """The rows of all runs of some stores: those that hold, and those that are read now."""
+    kept = [cache.read() for cache in caches]
+    jobs = []
+    size = 1 if pool is None else JOB
+    for cache, rows in zip(caches, kept, strict=True):
+        unread = [run_id for run_id in cache.store.ids() if run_id not in rows]
+        jobs += [(cache, unread[first : first + size]) for first in range(0, len(unread), size)]
+    total, done = sum(len(run_ids) for _, run_ids in jobs), 0
+
+    def on_answer(answer: tuple[list[tuple[RunRow, str]], list[str]]) -> None:
+        nonlocal done
+        rows, unreadable = answer
+        done += len(rows) + len(unreadable)
+        on_progress(done, total, f"scoring {rows[-1][0].tracker.id} on {rows[-1][0].sequence.id}" if rows else "")
+
+    taken: dict[int, list[tuple[RunRow, str]]] = {id(cache): [] for cache in caches}
+    for (cache, _), (new_rows, unreadable) in zip(jobs, run_jobs(pool, RowCache.take, jobs, on_answer), strict=True):
+        taken[id(cache)] += new_rows
+        loaded.unreadable += unreadable
+    everything = []
+    for cache, rows in zip(caches, kept, strict=True):
+        cache.add(taken[id(cache)])
+        everything += [*rows.values(), *(row for row, _ in taken[id(cache)])]
+    return everything
+
+
+def without_scale_words(count: int, protocol: Protocol) -> str:
+    """Why runs of monocular trackers are in no table, and what shows them."""
+    return (
+        f"{count} runs of monocular trackers: their scale is unknown and {protocol.id} aligns without scale; "
+        f"--protocol {MONOCULAR} shows them"
+    )
+
+
+def trial_words(count: int) -> str:
+    """Why trials of studies are in no table, and which option shows them."""
+    return (
+        f"{count} runs that studies made with settings of their own, by which such settings are chosen; "
+        "'report --trials' shows them"
+    )
+
+
+def _split_programs(rows: Iterable[RunRow]) -> None:
+    """Make the runs of each program a row of their own, where several made the runs of one tracker and its settings.
+
+    Runs by an older program are not ranked, nor are those whose identity is not verified, which are always marked.
+    """
+    for group in grouped(rows, lambda row: row.settings_key).values():
+        parts = {name: {row.program.get(name) for row in group} - {None} for row in group for name in row.program}
+        varying = {name for name, values in parts.items() if len(values) > 1 or name == "identity"}
+        for row in group:
+            row.split_by = {name: value for name, value in row.program.items() if name in varying}
+        last = max(group, key=lambda row: ("identity" not in row.split_by, row.started)).split_by
+        for row in group:
+            row.is_current = row.split_by == last and "identity" not in row.split_by
+
+
+def _two_results(rows: Iterable[RunRow]) -> list[str]:
+    """Which runs of one id from several stores have different results although they should be equal, in words."""
+    conflicts = []
+    for first, *others in grouped(rows, lambda row: row.run_id).values():
+        errors = sorted({row.metrics["ate_rmse_m"] for row in (first, *others) if "ate_rmse_m" in row.metrics})
+        if len(errors) > 1 and first.tracker.deterministic and not first.realtime:
+            results = ", ".join(f"{1000 * error:.3f}" for error in errors)
+            conflicts.append(f"{first.label} on {first.sequence.id} (run {first.run_id}): ATE {results} mm")
+    return conflicts
+
+
+def check_one_protocol(rows: Sequence[RunRow]) -> None:
+    """Refuse rows whose numbers were taken under different protocols.
+
+    Raises:
+        ReportError: Names the protocols and how many rows each has.
+    """
+    counts = Counter((row.protocol_id, row.protocol_digest) for row in rows)
+    if len(counts) > 1:
+        named = " and ".join(f"{name} [{digest}] ({count} rows)" for (name, digest), count in sorted(counts.items()))
+        raise ReportError(
+            f"one table cannot mix {len(counts)} protocols: {named}", "score all runs under one protocol first"
+        )
+
+
+def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) -> list[RunStore]:
+    """Stores of results folders.
+
+    Raises:
+        ReportError: A folder does not exist or holds no store.
+    """
+    if isinstance(runs, RunStore):
+        return [runs]
+    paths = [Path(runs)] if isinstance(runs, str | Path) else [Path(path) for path in runs]
+    if not paths:
+        raise ReportError("no results folder was given", "for example results")
+    stores = []
+    for folder in (path.expanduser() for path in paths):
+        if not folder.is_dir():
+            raise ReportError(f"there is no results folder {folder}", "make runs first, or name their folder")
+        root = folder.parent if folder.name == "runs" and not (folder / "runs").is_dir() else folder
+        if not (root / "runs").is_dir():
+            raise ReportError(f"{folder} holds no runs: it has no folder 'runs'", "name the folder given as --results")
+        stores.append(RunStore(root))
+    return stores

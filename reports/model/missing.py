@@ -6,24 +6,21 @@ import shlex
 from collections.abc import Iterable
 
 from dynslam_bench.core.toml import setting_text
-
-from .board import Board
-from .row import RunRow
+from dynslam_bench.reports.model.board import Board
+from dynslam_bench.reports.model.row import RunRow, grouped
 
 _MOST = 8
 
 
 def missing_note(board: Board) -> str:
     """One paragraph: what the ranking stands on, and what is missing for more; empty where nothing is."""
-    lacking = {key: board.lacking(key) for key in _candidates(board) if board.lacking(key)}
+    lacking = _lacking(board)
     if not lacking or not board.sequences:
         return ""
     parts = []
-    if board.on == "common" and board.ranked:
-        total = len(board.sequences)
-        common = len(board.common)
-        if common < total:
-            parts.append(f"The ranking stands on the {common} of {total} sequences that all ranked trackers have.")
+    common, total = len(board.common), len(board.sequences)
+    if board.on == "common" and board.ranked and common < total:
+        parts.append(f"The ranking stands on the {common} of {total} sequences that all ranked trackers have.")
     if board.incomplete:
         left = ", ".join(board.labels[key] for key in board.incomplete)
         why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
@@ -37,25 +34,21 @@ def missing_note(board: Board) -> str:
 def missing_commands(board: Board) -> list[str]:
     """Commands that make the runs of the missing cells of all that can be run here."""
     commands: list[str] = []
-    plainest: dict[str, RunRow] = {}  # of every sequence a run without offset or noise, if there is one
-    for row in sorted(board.rows, key=lambda row: (row.noise is not None, row.offset)):
-        plainest.setdefault(board.sequence(row), row)
-    for key in _candidates(board):
+    plainest = sorted(board.rows, key=lambda row: (row.sequence.noise is not None, row.offset))
+    by_sequence = grouped(plainest, board.sequence)
+    for key, lacking in _lacking(board).items():
         row = board.first(key)
-        lacking = board.lacking(key)
-        if not lacking or row.imported:
+        if row.imported:
             continue
         wanted: dict[tuple[str, ...], list[str]] = {}
-        for name in lacking:
-            other = plainest[name]
-            wanted.setdefault(tuple(other.part_options), []).append(other.place or other.sequence)
+        for other in (by_sequence[name][0] for name in lacking):
+            wanted.setdefault(tuple(_part_options(other)), []).append(other.place or other.sequence.id)
         seeds = sorted({run.seed for run in board.runs(key)})
         offsets = sorted({run.offset for run in board.runs(key)})
         repeats = ["--seed", *map(str, seeds)] if seeds != [0] else []
         repeats += ["--offset", *map(str, offsets)] if offsets != [0] else []
         for part, names in wanted.items():
-            words = ["dynslam-bench", "run", row.given or row.tracker, *names, *part, *repeats, *_settings(row)]
-            commands.append(shlex.join(words))
+            commands.append(_command(row, [*names, *part, *repeats]))
     return commands
 
 
@@ -63,16 +56,29 @@ def run_command(row: RunRow) -> str:
     """The command that makes one run again; empty for an imported trajectory."""
     if row.imported:
         return ""
-    words = ["dynslam-bench", "run", row.given or row.tracker, row.place or row.sequence, *row.part_options]
+    words = [row.place or row.sequence.id, *_part_options(row)]
     words += ["--seed", str(row.seed)] if row.seed else []
     words += ["--offset", str(row.offset)] if row.offset else []
-    return shlex.join([*words, *_settings(row)])
+    return _command(row, words)
 
 
-def _candidates(board: Board) -> list[str]:
-    """The trackers that could be ranked."""
-    firsts = {key: board.first(key) for key in board.trackers}
-    return [key for key, row in firsts.items() if row.ranked and row.is_current and row.provenance != "control"]
+def _command(row: RunRow, words: Iterable[str]) -> str:
+    return shlex.join(["dynslam-bench", "run", row.tracker.given or row.tracker.id, *words, *_settings(row)])
+
+
+def _lacking(board: Board) -> dict[str, list[str]]:
+    """The sequences on which each tracker that could be ranked was not run."""
+    lacking = {key: board.lacking(key) for key in board.trackers if board.is_rankable(key)}
+    return {key: names for key, names in lacking.items() if names}
+
+
+def _part_options(row: RunRow) -> list[str]:
+    """Its part of the sequence as options of the command line."""
+    options = []
+    if row.frames is not None:
+        start, stop = row.frames
+        options += ["--frames", f"{start}:{'' if stop is None else stop}"]
+    return options + (["--stride", str(row.stride)] if row.stride != 1 else [])
 
 
 def _settings(row: RunRow) -> list[str]:
@@ -83,7 +89,7 @@ def _settings(row: RunRow) -> list[str]:
         elif name == "device":
             words += ["--device", str(value)] if value not in ("cpu", "") else []
         elif name == "map":
-            words += ["--map", row.map_file]
+            words += ["--map", row.start_map.file if row.start_map else ""]
         elif name == "realtime":
             words.append("--realtime")
         elif name == "drop_share":

@@ -1,14 +1,19 @@
-"""Published numbers as data: what papers report, each with where it was read; never mixed with runs."""
+"""Published numbers as data: what papers report and the lowest errors in print, each with where it was read.
+
+They are never mixed with runs.
+"""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
-from dynslam_bench.evaluation.protocol import Protocol
+import pandas as pd
+
+from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol
 
 CLAIMED = "claimed by the paper"
 _FPS = 30.0
@@ -20,63 +25,13 @@ _LEAST_FRAMES |= {"bonn/crowd": 425}
 """So many frames a recording has at least. TUM: the pairs of colour and depth in the association files that are
 published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last frame of an excerpt that is numbered as
 in the whole, counted from 0. Of others no source was read."""
-
-
-@dataclass(frozen=True)
-class Published:
-    """One published number.
-
-    Attributes:
-        system: Its name; name collisions are told apart, e.g. ``DGS-SLAM (Kong 2024)``.
-        sequence: Sequence id.
-        metric: Metric name as in `Evaluation.metrics`.
-        value: The number.
-        unit: Its unit.
-        alignment: Alignment of the trajectory as far as stated.
-        source: Where it was read; this need not be the system's own paper.
-        remarks: What a reader should know.
-    """
-
-    system: str
-    sequence: str
-    metric: str
-    value: float
-    unit: str
-    alignment: str
-    source: str
-    remarks: str = ""
-
-    def scored_as(self, protocol: Protocol) -> bool:
-        """Whether it was scored as a protocol scores, as far as is known.
-
-        What is aligned by Sim(3) is from tables of WildGS-SLAM's evaluation, which corrects Bonn's truth.
-        """
-        scaled = self.alignment == "Sim(3)"
-        truth = "bonn-droid-w" if scaled and self.sequence.startswith("bonn/") else "as-is"
-        return scaled == (protocol.alignment == "sim3") and truth == protocol.truth
-
-
-@dataclass(frozen=True)
-class Claimed:
-    """One number of the paper that this project implements: claimed by the paper, not reproduced.
-
-    Attributes:
-        table: Table of the paper.
-        system: System as named there.
-        sequence: Sequence id.
-        quantity: ``ape_rmse``, ``rpe_mean``, ``accuracy_percent``, ``time_ms``, ...
-        kind: ``value``, or ``improvement_percent``: the gain of the paper's method over the system.
-        value: The number.
-        digits: Decimals as printed.
-    """
-
-    table: int
-    system: str
-    sequence: str
-    quantity: str
-    kind: str
-    value: float
-    digits: int
+RECORD = "record"
+KINDS = {
+    "best": "lowest error found in print",
+    "cpu": "lowest error found in print, real time on a CPU",
+    "masks": "ORB-SLAM2 with person masks, in print",
+}
+HOW = {"R": "read in its source", "S": "second-hand: another paper's table or notes", "I": "inferred"}
 
 
 @dataclass(frozen=True)
@@ -99,19 +54,45 @@ class ReportedCell:
 
 
 @cache
-def published() -> tuple[Published, ...]:
-    """All published numbers."""
-    return tuple(Published(**(line | {"value": float(line["value"])})) for line in read_data("published.csv"))  # type: ignore[arg-type]
+def published() -> pd.DataFrame:
+    """All published numbers, one a line.
+
+    Columns: system (name collisions are told apart, e.g. ``DGS-SLAM (Kong 2024)``), sequence (its id), metric (as in
+    `Evaluation.metrics`), value, unit, alignment (as far as stated), source (where it was read; this need not be the
+    system's own paper), remarks.
+    """
+    return _read("published.csv").astype({"value": float})
 
 
 @cache
-def claimed() -> tuple[Claimed, ...]:
-    """Tables 1 to 3 of the paper, as printed."""
-    return tuple(_claimed(**line) for line in read_data("claimed.csv"))
+def claimed() -> pd.DataFrame:
+    """Tables 1 to 3 of the paper that this project implements, as printed: claimed, not reproduced.
+
+    Columns: table, system (as named there), sequence (its id), quantity (``ape_rmse``, ``rpe_mean``,
+    ``accuracy_percent``, ``time_ms``, ...), kind (``value``, or ``improvement_percent``: the gain of the paper's method
+    over the system), value, digits (decimals as printed).
+    """
+    frame = _read("claimed.csv")
+    digits = frame["value"].str.partition(".")[2].str.len()
+    return frame.astype({"table": int, "value": float}).assign(digits=digits)
 
 
-def _claimed(*, table: str, value: str, **words: str) -> Claimed:
-    return Claimed(table=int(table), value=float(value), digits=len(value.partition(".")[2]), **words)
+@cache
+def records() -> pd.DataFrame:
+    """The lowest published errors that were found, by sequence and kind (see `KINDS`).
+
+    Columns: sequence, kind, system, value (ATE, RMSE in metres), input (``RGB``, ``RGB-D`` or ``not stated``),
+    alignment (as far as stated), protocol (id of the protocol here that scores alike, empty where that is not known; a
+    table that states no alignment and takes depth is taken for TUM's), hardware, source, how (see `HOW`).
+    """
+    return _read("records.csv").astype({"value": float})
+
+
+@cache
+def static_camera_errors() -> dict[tuple[str, str], float]:
+    """Errors of a static camera by sequence and metric, from the published ground truth."""
+    frame = _read("never_move.csv").astype({"value": float})
+    return dict(zip(zip(frame["sequence"], frame["metric"], strict=True), frame["value"], strict=True))
 
 
 def least_length_s(sequence: str) -> float | None:
@@ -138,26 +119,61 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
     Returns:
         One cell for every system, source and sequence, and those that the implemented paper claims, tagged so.
     """
-    alignment = protocol.alignment
-    if alignment not in ("se3", "sim3") or protocol.thins:
+    if protocol.alignment not in ("se3", "sim3") or protocol.thins:
         return []
-    wanted = set(sequences)
-    from_papers = [
+    frame = published()
+    frame = frame[(frame["metric"] == "ate_rmse_m") & frame["sequence"].isin(sequences)]
+    cells = [
         ReportedCell(f"{p.system} ({p.source})", p.sequence, p.value, "; ".join(filter(None, (p.alignment, p.remarks))))
-        for p in published()
-        if p.metric == "ate_rmse_m" and p.sequence in wanted and p.scored_as(protocol)
+        for p in lines_of(frame)
+        if scored_as(p.alignment, p.sequence, protocol)
     ]
-    remark = "contradicts itself and what the systems' authors published; see the audit"
-    claims = [
-        ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED)
-        for c in claimed()
-        if c.kind == "value" and c.quantity == "ape_rmse" and c.sequence in wanted
-        if alignment == "se3" and protocol.truth == "as-is"
-    ]
-    return from_papers + claims
+    if protocol.alignment == "se3" and protocol.truth == "as-is":
+        remark = "contradicts itself and what the systems' authors published; see the audit"
+        frame = claimed().query("kind == 'value' and quantity == 'ape_rmse'")
+        frame = frame[frame["sequence"].isin(sequences)]
+        cells += [ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED) for c in lines_of(frame)]
+    return cells
 
 
-def read_data(name: str) -> list[dict[str, str]]:
-    """The rows of a table of this package's data."""
-    text = (files("dynslam_bench.reports.model") / "data" / name).read_text(encoding="utf-8")
-    return list(csv.DictReader(text.splitlines()))
+def scored_as(alignment: str, sequence: str, protocol: Protocol) -> bool:
+    """Whether a published number was scored as a protocol scores, as far as is known.
+
+    What is aligned by Sim(3) is from tables of WildGS-SLAM's evaluation, which corrects Bonn's truth.
+    """
+    scaled = alignment == "Sim(3)"
+    truth = "bonn-droid-w" if scaled and sequence.startswith("bonn/") else "as-is"
+    return scaled == (protocol.alignment == "sim3") and truth == protocol.truth
+
+
+def records_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedCell]:
+    """The records of whole sequences that were scored as a protocol scores; no others stand beside measured errors.
+
+    Args:
+        sequences: Names of a report's whole sequences.
+        protocol: The report's protocol.
+    """
+    alike = [name for name, other in PROTOCOLS.items() if other.digest() == protocol.digest()]
+    frame = records()
+    frame = frame[frame["sequence"].isin(sequences) & frame["protocol"].isin(alike)]
+    return [
+        ReportedCell(
+            KINDS[r.kind],
+            r.sequence,
+            r.value,
+            "; ".join((r.system, r.input, r.alignment, r.hardware, r.source, HOW[r.how])),
+            RECORD,
+        )
+        for r in lines_of(frame)
+    ]
+
+
+def lines_of(frame: pd.DataFrame) -> Iterator[Any]:
+    """The lines of a table; attributes are named as its columns."""
+    return iter(frame.itertuples())
+
+
+def _read(name: str) -> pd.DataFrame:
+    """A table of this package's data, all of it as texts."""
+    with (files("dynslam_bench.reports.model") / "data" / name).open(encoding="utf-8") as file:
+        return pd.read_csv(file, dtype=str, keep_default_na=False)

@@ -1,184 +1,190 @@
-"""One row a run: what the report knows of it, whether it was made here, imported or only reported."""
+"""One row type from record to page: a run's record with its errors under a protocol and what follows from both."""
 
 from __future__ import annotations
 
 import json
+import shlex
+from collections.abc import Callable, Hashable, Iterable
 from functools import cached_property
-from typing import Any, Literal
+from itertools import chain
+from pathlib import Path
+from typing import Any, ClassVar, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
-from dynslam_bench.core.records import Record
-from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.files import write_lines
+from dynslam_bench.core.reading import TABLE_BYTES
+from dynslam_bench.core.records import Record, schema
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG
+from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
+from dynslam_bench.evaluation.evaluate import Evaluation
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
+from dynslam_bench.runs.run_index import part_words
+from dynslam_bench.runs.store import RunStore, score
+from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
-Kind = Literal["run here", "imported"]
+K = TypeVar("K", bound=Hashable)
 Which = Literal["online", "final"]
 """Which of a run's two trajectories."""
 SEEN = "§"
 """Behind trackers and numbers whose masks come from a network that was trained on the scene."""
 HINTED = "‡"
 """Behind trackers with runs whose trajectories are probably faulty."""
+REPORT_FILE = "report.json"
+SCHEMA_VERSION = 1
 
 
-class RunRow(Record):
-    """A run as the report shows it.
+class RunRow(RunRecord):
+    """A run as the report shows it: its record, without the settings nobody asked for, and its errors.
+
+    Status, reason, `n_tracked` and `coverage` are those of the trajectory that is scored.
 
     Attributes:
-        run_id: Its id in the store.
-        kind: Made by this toolkit, or a trajectory from elsewhere.
-        tracker: Tracker id.
-        given: What the tracker was named by where that is not its id, e.g. ``/path/file.py:Attr``.
-        label: Tracker's label.
-        variant: What sets runs of one tracker apart besides sequence and repeat: overrides, device, threads, mode.
-        program: Code, weights and library versions that made it, see `RunRecord.program`.
-        split_by: Those of them in which the runs of this tracker and variant differ: each program is a row of its own.
-        is_current: Whether its identity is verified, and no newer program has made runs of this tracker and variant.
-        deterministic: Whether equal runs should give equal results.
-        provenance: How closely the tracker follows its source.
-        ranked: Whether its spec lets it be ranked.
-        monocular: Whether its scale is unknown: a protocol whose alignment finds none leaves it out.
-        sequence: Sequence id.
-        frames: Part of the sequence in words, empty for all of it.
-        part_options: The same as command-line options.
-        block: What one column of a table is: content, camera, frames and stride.
-        content: Digest of the content.
-        camera: Camera in words.
-        map_file: File of the map that it began in, which `variant` names by its digest; empty for none.
-        place: Folder of the sequence where it was named by its path.
-        duration_s: Time between its first and last frame.
-        tags: Tags of the sequence.
-        split: ``tune``, ``held-out`` or empty.
-        seed: Seed.
-        offset: Leading frames that were left out: another repeat.
-        noise: Seed of the sensors' noise: another repeat.
-        status: Status of the run.
-        reason: Why it is not ``ok``.
-        failed: Whether it counts as a failure: it did not end, could not track, or cannot be evaluated.
         protocol_id: Id of the protocol of `metrics`.
         protocol_digest: Its digest.
         trajectory: Which trajectory the metrics are of; an import may hold the final one only.
         metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
-        final_ate_m: ATE of the final trajectory; None if there is none.
-        final_metrics: All errors of the final trajectory; empty if there is none, or in reports of older versions.
+        final_metrics: All errors of the final trajectory; empty if there is none.
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
-        held_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without evaluation.
+        hold_last_pose_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without
+            evaluation.
         static_camera_ate_rmse_m: What a static camera scores there; None without ground truth.
-        n_frames: Input frames.
-        n_processed: Frames that the tracker saw before it ended.
-        n_tracked: Frames that were tracked.
-        coverage: Share of the input frames that was tracked.
-        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
-            without an epipolar test.
-        cached: Whether stage times come from the stage cache and were not taken in this run.
-        frame_ms: Median frame time in milliseconds, None if unknown.
-        real_time_factor: Frame interval over mean frame time, None if unknown.
-        peak_memory_mb: Largest resident memory, None if unknown.
-        mask_iou: Overlap of the dynamic mask with the exact one, None if unknown.
-        segmentation: Source of the masks.
+        not_evaluated: Whether the run ended and cannot be evaluated although there is ground truth.
         seen_in_training: Whether the masks come from a network that was trained on this very scene: a best case, which
             does not rank unless that is asked for.
-        study: Study of which the run is a trial, with settings of its own; empty for any other run.
-        started: UTC, ISO 8601.
-        log: Path of the run's log.
-        command: Command line that made it.
-        machine: Computer and versions in words.
-        notes: Diagnostics of the evaluation and of the run.
         hints: What is probably wrong with the trajectory, see `evaluation.hints`.
+        split_by: Parts of `program` in which the runs of this tracker and variant differ: each program has a line of
+            its own.
+        is_current: Whether its identity is verified, and no newer program has made runs of this tracker and variant.
     """
 
-    run_id: str
-    kind: Kind
-    tracker: str
-    given: str = ""
-    label: str
-    variant: dict[str, Any] = Field(default_factory=dict)
-    program: dict[str, str] = Field(default_factory=dict)
-    split_by: dict[str, str] = Field(default_factory=dict)
-    is_current: bool = True
-    deterministic: bool = True
-    provenance: str = ""
-    ranked: bool = True
-    monocular: bool = False
-    sequence: str
-    frames: str = ""
-    part_options: list[str] = Field(default_factory=list)
-    block: str = ""
-    content: str = ""
-    camera: str = ""
-    map_file: str = ""
-    place: str = ""
-    duration_s: float = 0.0
-    tags: list[str] = Field(default_factory=list)
-    split: str = ""
-    seed: int = 0
-    offset: int = 0
-    noise: int | None = None
-    status: str = "ok"
-    reason: str = ""
-    failed: bool = False
     protocol_id: str
     protocol_digest: str
     trajectory: Which = "online"
     metrics: dict[str, float] = Field(default_factory=dict)
-    final_ate_m: float | None = None
     final_metrics: dict[str, float] = Field(default_factory=dict)
     rotation_uncertainty_deg: float | None = None
-    held_ate_m: float | None = None
+    hold_last_pose_ate_m: float | None = None
     static_camera_ate_rmse_m: float | None = None
-    n_frames: int = 0
-    n_processed: int = 0
-    n_tracked: int = 0
-    coverage: float = 0.0
-    epipolar_skipped: float | None = None
-    cached: bool = False
-    frame_ms: float | None = None
-    real_time_factor: float | None = None
-    peak_memory_mb: float | None = None
-    mask_iou: float | None = None
-    segmentation: str = ""
+    not_evaluated: bool = False
     seen_in_training: bool = False
-    study: str = ""
-    started: str = ""
-    log: str = ""
-    command: str = ""
-    machine: str = ""
-    notes: list[str] = Field(default_factory=list)
     hints: list[str] = Field(default_factory=list)
+    split_by: dict[str, str] = Field(default_factory=dict)
+    is_current: bool = True
+    _store: RunStore = PrivateAttr(default_factory=RunStore)
+
+    def stored_in(self, store: RunStore) -> RunRow:
+        """The same row, which reads its files from a store."""
+        self._store = store
+        return self
 
     @property
-    def column_id(self) -> str:
-        """What one column of a table is; equal for all repeats and for every spelling of the same frames."""
-        return self.block or f"{self.sequence} [{self.frames}]"
+    def folder(self) -> Path:
+        """Folder of the run's files."""
+        return self._store.folder(self.run_id)
+
+    def whole_record(self) -> RunRecord:
+        """The record with all its settings and stage times.
+
+        Raises:
+            DynslamError: It is damaged, or no longer there.
+        """
+        return self._store.read_whole(self.run_id)
+
+    def estimate(self, which: Which) -> Trajectory | None:
+        """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
+        try:
+            return self._store.trajectory(self.run_id, which)
+        except DynslamError:
+            return None
+
+    def ground_truth(self) -> Trajectory | None:
+        """The ground truth of its part of the sequence; None if there is none, or it is damaged."""
+        try:
+            return self._store.ground_truth(self.sequence.part)
+        except DynslamError:
+            return None
 
     @property
-    def repeat_key(self) -> tuple[int, int, int, str]:
-        """Which repeat of its cell it is; every imported file is one of its own."""
-        return self.offset, -1 if self.noise is None else self.noise, self.seed, self.run_id if self.imported else ""
-
-    @property
-    def repeat(self) -> str:
-        """The same in words, e.g. ``seed 0, offset 2``."""
-        if self.imported:
-            return f"import {self.run_id[:6]}"
-        words = [f"seed {self.seed}"] + [f"offset {self.offset}"] * bool(self.offset)
-        return ", ".join(words + ([] if self.noise is None else [f"noise {self.noise}"]))
+    def label(self) -> str:
+        """Label of the tracker."""
+        return self.tracker.label or self.tracker.id
 
     @property
     def imported(self) -> bool:
         """Whether the trajectory comes from elsewhere."""
         return self.kind == "imported"
 
+    @property
+    def origin(self) -> str:
+        """The same in words."""
+        return "imported" if self.imported else "run here"
+
+    @property
+    def only_final(self) -> bool:
+        """Whether an import has nothing of the trajectory that the protocol asks for."""
+        return self.imported and not self.metrics and self.final_ate_m is not None
+
+    @property
+    def ranked(self) -> bool:
+        """Whether it may rank: its tracker's spec lets it, and it began without a map."""
+        return self.tracker.ranked and self.start_map is None
+
+    @property
+    def frame_words(self) -> str:
+        """Part of the sequence in words, empty for all of it."""
+        return part_words(self)
+
+    @property
+    def column_id(self) -> str:
+        """Content, camera, frames and stride: one column of a table; equal for all repeats and spellings."""
+        return self.sequence.block or self.sequence.part
+
+    @property
+    def repeat_key(self) -> tuple[int, int, int, str]:
+        """Which repeat of its cell it is; every imported file is one of its own."""
+        noise = -1 if self.sequence.noise is None else self.sequence.noise
+        return self.offset, noise, self.seed, self.run_id if self.imported else ""
+
+    @property
+    def repeat(self) -> str:
+        """The same in words, e.g. ``seed 0, offset 2``."""
+        return f"import {self.run_id[:6]}" if self.imported else super().repeat
+
     @cached_property
+    def variant(self) -> dict[str, Any]:
+        """What sets runs of one tracker apart besides sequence and repeat: settings, device, threads, mode."""
+        variant: dict[str, Any] = dict(sorted(self.asked.items()))
+        machine = f"{self.machine.cpu}, {self.machine.cores} cores" if self.machine else True
+        variant |= {} if self.imported else {"device": self.device, "threads": self.threads}
+        variant |= {"realtime": machine} if self.realtime else {}
+        variant |= {"drop_share": self.drop_share} if self.drop_share else {}
+        return variant | {f"degrade.{name}": value for name, value in sorted(self.degrade.items())}
+
+    @cached_property
+    def settings_key(self) -> str:
+        """Tracker and settings, whatever program made the run."""
+        return f"{self.tracker.id}|{self.kind}|{json.dumps(self.variant, sort_keys=True, default=str)}"
+
+    @property
     def variant_key(self) -> str:
-        """Tracker and everything that sets its runs apart besides sequence and repeat."""
+        """Tracker, settings and program: everything that sets its runs apart besides sequence and repeat."""
         split = json.dumps(self.split_by, sort_keys=True) if self.split_by else ""
         return f"{self.settings_key}|{split}" if split else self.settings_key
 
     @property
-    def settings_key(self) -> str:
-        """Tracker and settings, whatever program made the run."""
-        return self.tracker + "|" + self.kind + "|" + json.dumps(self.variant, sort_keys=True, default=str)
+    def failed(self) -> bool:
+        """Whether it counts as a failure: it did not end, could not track, or cannot be evaluated."""
+        return super().failed or self.status == "lost" or self.not_evaluated
+
+    @property
+    def final_ate_m(self) -> float | None:
+        """ATE of the final trajectory; None if there is none."""
+        return self.final_metrics.get("ate_rmse_m")
 
     @property
     def score_m(self) -> float | None:
@@ -188,8 +194,18 @@ class RunRow(Record):
         """
         if self.failed:
             static_m = self.static_camera_ate_rmse_m
-            return None if static_m is None else max(static_m, self.held_ate_m or 0.0)
-        return self.held_ate_m if self.held_ate_m is not None else self.metrics.get("ate_rmse_m")
+            return None if static_m is None else max(static_m, self.hold_last_pose_ate_m or 0.0)
+        return self.hold_last_pose_ate_m if self.hold_last_pose_ate_m is not None else self.metrics.get("ate_rmse_m")
+
+    @property
+    def frame_ms(self) -> float | None:
+        """Median frame time in milliseconds, None if unknown."""
+        return None if self.frame_time_s is None else 1000 * self.frame_time_s
+
+    @property
+    def cached(self) -> bool:
+        """Whether stage times come from the stage cache and were not taken in this run."""
+        return bool(self.identity.get("cache"))
 
     @property
     def rotation_reliable(self) -> bool:
@@ -204,3 +220,156 @@ class RunRow(Record):
         if self.status == "lost":
             return f"lost, {self.n_tracked}/{self.n_frames} tracked"
         return "not evaluated" if self.status == "ok" else f"{self.status} at {self.n_processed}/{self.n_frames}"
+
+    @property
+    def machine_words(self) -> str:
+        """Computer and versions in words."""
+        parts = []
+        if self.machine is not None:
+            machine = self.machine
+            parts.append(f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}")
+            parts += [machine.gpu] if machine.gpu else []
+        parts += [f"{name} {version}" for name, version in self.versions.items()]
+        if self.git is not None:
+            parts.append(f"git {self.git.revision[:10]}{' (changed)' if self.git.dirty else ''}")
+        return "; ".join(parts)
+
+
+def grouped(rows: Iterable[RunRow], key: Callable[[RunRow], K]) -> dict[K, list[RunRow]]:
+    """Rows by a key, in their order."""
+    groups: dict[K, list[RunRow]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+class ReportData(Record):
+    """What a report was made of, as it lies beside it; `compare` reads it back.
+
+    Attributes:
+        schema_version: Of this record.
+        title: Title of the report.
+        protocol: Description of the protocol.
+        reference: Tracker that errors are divided by.
+        version: Version of the package.
+        rows: One a run.
+    """
+
+    most_bytes: ClassVar[int] = TABLE_BYTES
+
+    schema_version: int = schema(SCHEMA_VERSION)
+    title: str
+    protocol: str
+    reference: str
+    version: str
+    rows: list[RunRow] = Field(default_factory=list)
+
+    def write(self, path: Path) -> None:
+        """Write it with a line for every row; it is never one text, since there may be a hundred thousand rows.
+
+        Raises:
+            DynslamError: The folder cannot be written.
+        """
+        head = self.model_copy(update={"rows": []}).to_line().removesuffix("]}")
+        last = len(self.rows) - 1
+        rows = (row.to_line() + "," * (at < last) for at, row in enumerate(self.rows))
+        write_lines(path, chain([head], rows, ["]}"]))
+
+
+def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
+    """The row of one stored run, scored under a protocol."""
+    scored = score(store, record, protocol)
+    evaluation = scored.online if protocol.trajectory == "online" else scored.final
+    alignment = None if evaluation is None else evaluation.alignment
+    static_m = static_camera_error(store, record, protocol, evaluation)
+    trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
+    diagnostics = [] if evaluation is None else evaluation.diagnostics
+    scores: dict[str, Any] = dict(
+        settings={name: record.settings[name] for name in record.overrides if name in record.settings},
+        identity={name: value for name, value in record.identity.items() if name != "settings"},
+        timings={name: time for name, time in record.timings.items() if name == "total"},
+        protocol_id=scored.protocol_id,
+        protocol_digest=scored.protocol_digest,
+        metrics={} if evaluation is None else evaluation.metrics,
+        final_metrics={} if scored.final is None else scored.final.metrics,
+        rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
+        hold_last_pose_ate_m=hold_last_pose_error(store, record, protocol, evaluation, static_m),
+        static_camera_ate_rmse_m=static_m,
+        seen_in_training=seen_in_training(record.segmentation, record.sequence.id),
+        notes=[*(f"hint: {hint}" for hint in scored.hints), *trial, *record.notes, *diagnostics],
+        hints=scored.hints,
+    )
+    return RunRow(**(dict(record) | scores | _outcome(record, scored, protocol))).stored_in(store)
+
+
+def _outcome(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> dict[str, Any]:
+    """Whose errors a row holds, how the run ended and what it covered, where that differs from the record."""
+    only_final = record.kind == "imported" and scored.online is None and scored.final is not None
+    which = "final" if only_final else protocol.trajectory
+    outcome: dict[str, Any] = {"trajectory": which}
+    evaluation = scored.online if protocol.trajectory == "online" else scored.final
+    failed = record.failed or record.status == "lost"
+    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
+        reason = record.reason or scored.reasons.get(which, "it cannot be evaluated")
+        return outcome | {"not_evaluated": True, "reason": reason}
+    if record.kind == "imported" or which == "online" or scored.final is None or scored.final.n_tracked is None:
+        return outcome
+    n_tracked = scored.final.n_tracked
+    if scored.final.coverage is not None:
+        outcome |= {"n_tracked": n_tracked, "coverage": scored.final.coverage}
+    due = record.n_frames - record.n_dropped
+    if record.failed or not n_tracked:
+        return outcome
+    if n_tracked < LOST_COVERAGE * due:
+        reason = f"the final trajectory has poses of {n_tracked} of {due} frames"
+        return outcome | {"status": "lost", "reason": reason}
+    if n_tracked >= due:  # frames that were lost online were found later
+        return outcome | {"status": "ok", "reason": ""}
+    return outcome
+
+
+def static_camera_error(
+    store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
+) -> float | None:
+    """What a static camera scores under the protocol's alignment; None without ground truth."""
+    if evaluation is not None and "static_camera_ate_rmse_m" in evaluation.metrics:
+        return evaluation.metrics["static_camera_ate_rmse_m"]
+    try:
+        truth = store.ground_truth(record.sequence.part)
+        if truth is None:
+            return None
+        errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
+    except DynslamError:
+        return None
+    return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+
+
+def hold_last_pose_error(
+    store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None, static_m: float | None
+) -> float | None:
+    """The ATE with every lost frame held at the last tracked pose; None without evaluation.
+
+    Poses that belong to no input frames cannot be held: with lost frames, the error is at least a static camera's.
+    """
+    if evaluation is None:
+        return None
+    error = evaluation.metrics["ate_rmse_m"]
+    if evaluation.coverage == 1.0:
+        return error
+    at_least = error if record.coverage >= 1.0 else max(error, static_m or 0.0)
+    try:
+        trajectory = store.trajectory(record.run_id, protocol.trajectory)
+        truth = store.ground_truth(record.sequence.part)
+        if trajectory is None or truth is None:
+            return at_least
+        return ate_rmse_m(trajectory, truth, protocol, held_at=store.timestamps(record.sequence.part))
+    except DynslamError:
+        return at_least
+
+
+def command_line(command: list[str]) -> str:
+    """The command line as one would type it."""
+    if not command:
+        return ""
+    head = Path(command[0]).name
+    return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *command[1:]])

@@ -83,14 +83,22 @@ def standings(cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Se
     p_values = {key: paired_p_value(logs[key], base) for key in ranked}
     tested = {key: p for key, p in p_values.items() if p is not None}
     corrected = holm(tested) if attainable_p(len(names), len(tested)) <= 0.05 else {}
-    ranks, groups, means = _ranks({key: logs[key] for key in ranked})
-    found = [
+    ranked_logs = {key: logs[key] for key in ranked}
+    ranks: dict[str, int] = {}
+    mean_ranks: dict[str, float] = {}
+    if ranked_logs:
+        means = [round(float(np.mean(log)), 12) for log in ranked_logs.values()]
+        ranks = dict(zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True))
+        by_sequence = scipy.stats.rankdata(np.stack(list(ranked_logs.values())), method="average", axis=0)
+        mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
+    groups = rank_groups(ranked_logs)
+    unordered = [
         Standing(
             key=key,
             ratio=ratio_interval(log - base),
             rank=ranks.get(key),
             group=groups.get(key),
-            mean_rank=means.get(key),
+            mean_rank=mean_ranks.get(key),
             wins=int((log < base).sum()),
             better=_better(cells[key], reference),
             p_value=corrected.get(key),
@@ -98,7 +106,7 @@ def standings(cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Se
         )
         for key, log in logs.items()
     ]
-    return sorted(found, key=lambda s: (s.rank is None, s.rank or 0, s.ratio.value))
+    return sorted(unordered, key=lambda s: (s.rank is None, s.rank or 0, s.ratio.value))
 
 
 def ratio_interval(log_ratios: Array) -> Interval:
@@ -232,19 +240,3 @@ def _better(cell: Mapping[str, Sequence[float]], reference: Mapping[str, Sequenc
         if len(a) and len(b):
             shares.append(float((a[:, None] < b).mean() + 0.5 * (a[:, None] == b).mean()))
     return float(np.mean(shares)) if shares else np.nan
-
-
-def _ranks(logs: Mapping[str, Array]) -> tuple[dict[str, int], dict[str, tuple[int, int]], dict[str, float]]:
-    """Ranks by the mean logarithm, the ranks that the data leave open, and mean ranks over sequences."""
-    if not logs:
-        return {}, {}, {}
-    keys = list(logs)
-    means = {key: float(np.mean(logs[key])) for key in keys}
-    order = scipy.stats.rankdata([round(means[key], 12) for key in keys], method="min")
-    per_sequence = scipy.stats.rankdata(np.stack([logs[key] for key in keys]), method="average", axis=0).mean(axis=1)
-    groups = rank_groups(logs)
-    return (
-        {key: int(order[i]) for i, key in enumerate(keys)},
-        groups,
-        {key: float(per_sequence[i]) for i, key in enumerate(keys)},
-    )

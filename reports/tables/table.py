@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import math
+import re
+import unicodedata
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from math import ceil
 from typing import Literal
 
-import numpy as np
 import pandas as pd
-from pandas.api.types import is_float_dtype, is_numeric_dtype
 
-from dynslam_bench.core.harmless import printable
+from dynslam_bench.core.sanitise import printable
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]
 MOST_ROWS = 1000
@@ -87,60 +88,38 @@ def number(value: float | None, digits: str = "", unit: str = "") -> TableCell:
     return TableCell((format(value, digits) if digits else repr(value)) + unit, value=value)
 
 
+@dataclass
 class Table:
-    """A table with a caption that says how to read it: a frame of what is shown and a frame of what is behind it.
+    """A table with a caption that says how to read it; pages, Markdown, CSV and LaTeX are made of it.
 
     Attributes:
         id: Short name, also the CSV file's.
         title: Heading.
         caption: Everything a reader needs, including the protocol.
         columns: The columns.
-        rows: What is displayed, by row.
-        shown: What is displayed: a frame of `TableCell`, one column for each of `columns` under its `Column.key`.
-        values: The numbers behind it with all their digits, in the units that the caption and the headings name
-            (errors in metres, times in milliseconds, shares from 0 to 1), under the same names. Numeric columns are
-            ``Int64`` if all their numbers are whole, else ``Float64``; ``pd.NA`` where the cell has no number. Columns
-            of text are ``string``.
+        rows: A cell for every column, by row.
         muted_rows: Rows that are shown but do not compete.
         separators: Rows above which a line is drawn.
         brief: Caption where there is little room, without the full stop: what is shown, and its unit.
     """
 
-    def __init__(
-        self,
-        id: str,
-        title: str,
-        caption: str,
-        columns: Sequence[Column],
-        rows: Sequence[Sequence[TableCell]],
-        muted_rows: Collection[int] = (),
-        separators: Collection[int] = (),
-        brief: str = "",
-    ) -> None:
-        """A table of rows with one cell for every column.
-
-        Raises:
-            ValueError: A row has another number of cells than there are columns.
-        """
-        self.id, self.title, self.caption, self.brief = id, title, caption, brief or title
-        self.columns = list(columns)
-        self.muted_rows, self.separators = set(muted_rows), set(separators)
-        self.rows = [list(row) for row in rows]
-        self.shown = pd.DataFrame(self.rows, columns=range(len(self.columns)), dtype=object)
-        series = [_values(column, self.shown[at]) for at, column in enumerate(self.columns)]
-        self.values = pd.concat(series, axis=1)
-        self.shown.columns = self.values.columns = pd.Index([column.key for column in self.columns])
+    id: str
+    title: str
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[TableCell]]
+    muted_rows: Collection[int] = ()
+    separators: Collection[int] = ()
+    brief: str = ""
 
     def frame(self) -> pd.DataFrame:
-        """What CSV holds: the numbers with all their digits, and the words of the cells that have none."""
-        columns = [
-            [
-                _words(cell) if value is pd.NA else value
-                for value, cell in zip(values.astype(object), shown, strict=True)
-            ]
-            for (_, values), (_, shown) in zip(self.values.items(), self.shown.items(), strict=True)
-        ]
-        return pd.DataFrame(list(zip(*columns, strict=True)), columns=self.values.columns, dtype=object)
+        """What CSV holds, in columns named by `Column.key`.
+
+        Numbers have all their digits, in the units that the caption and the headings name (errors in metres, times in
+        milliseconds, shares from 0 to 1); other cells have their words.
+        """
+        lines = [[_words(cell) if cell.value is None else cell.value for cell in row] for row in self.rows]
+        return pd.DataFrame(lines, columns=[column.key for column in self.columns], dtype=object)
 
     def displayed(self) -> Table:
         """The table as pages, Markdown and LaTeX show it; CSV has all.
@@ -158,13 +137,7 @@ class Table:
 
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
-        found: list[tuple[str, int]] = []
-        for column in self.columns:
-            if found and found[-1][0] == column.group:
-                found[-1] = (column.group, found[-1][1] + 1)
-            else:
-                found.append((column.group, 1))
-        return found
+        return [(name, len(list(group))) for name, group in groupby(self.columns, key=lambda column: column.group)]
 
 
 def to_markdown(table: Table) -> str:
@@ -192,37 +165,18 @@ def csv_text(frame: pd.DataFrame) -> str:
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(map(_harmless, frame.columns))
-    writer.writerows(zip(*(_written(values) for _, values in frame.items()), strict=True))
-    return text.getvalue()
-
-
-def _written(values: pd.Series) -> list[object]:
-    """What CSV says of a column; what cannot be harmful is not looked at one by one: there may be millions of it."""
-    if is_float_dtype(values.dtype):
-        numbers = values.to_numpy(dtype=np.float64, na_value=np.nan).tolist()
-        return [None if number != number else number for number in numbers]
-    found = values.astype(object)
-    if is_numeric_dtype(values.dtype):
-        return list(found.where(values.notna(), None))
-    if values.dtype == "string":
-        known = {word: _harmless(word) for word in set(found)}
-        return [known[word] for word in found]
-    return [_harmless(value) for value in found]
+    written = frame.rename(columns=_harmless)
+    for name in written.columns:
+        if written[name].dtype in ("object", "string"):
+            written[name] = written[name].astype(object).map(_harmless)
+    return written.to_csv(index=False, lineterminator="\n")
 
 
 def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
     """Best and second best (smallest) of a column; equal values share the mark."""
     present = sorted({value for value in values if value is not None})
-    marks: list[Emphasis] = []
-    for value in values:
-        if value is None or len(present) < 2:
-            marks.append("")
-        else:
-            marks.append("best" if value == present[0] else "second" if value == present[1] else "")
-    return marks
+    marks: dict[float, Emphasis] = dict(zip(present, ("best", "second"), strict=False)) if len(present) > 1 else {}
+    return ["" if value is None else marks.get(value, "") for value in values]
 
 
 def prose(text: str) -> str:
@@ -244,21 +198,215 @@ def _markdown_cell(cell: TableCell) -> str:
     return " ".join(part for part in parts if part)
 
 
-def _values(column: Column, shown: pd.Series) -> pd.Series:
-    """The numbers behind the cells of a column, or its words."""
-    if not column.numeric and all(cell.value is None for cell in shown):
-        return shown.map(_words).astype("string").rename(column.key)
-    found = [cell.value for cell in shown]
-    present = [value for value in found if value is not None]
-    whole = bool(present) and all(isinstance(value, int) for value in present)
-    return pd.Series(found, dtype="Int64" if whole else "Float64", name=column.key)
-
-
 def _words(cell: TableCell) -> str:
     return " ".join(part for part in (cell.text, cell.small, cell.tag) if part)
 
 
 def _harmless(value: object) -> object:
     if not isinstance(value, str):
-        return None if value is pd.NA or value != value else value
+        return value
     return ("'" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else "") + printable(value)
+
+
+def mm(metres: float) -> str:
+    """Metres as millimetres with three significant digits: 0.0142 is ``14.2``, 2.5 is ``2500``."""
+    return significant_text(1000.0 * metres)
+
+
+def significant_text(value: float, digits: int = 3) -> str:
+    """A number with so many significant digits and no exponent where that can be read."""
+    if not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    text = f"{value:#.{digits}g}"
+    return f"{value:.0f}" if "e+" in text else text.rstrip(".")
+
+
+def percent(share: float) -> str:
+    """A share as whole percents, but nothing short of all is 100 % and nothing above none 0 %."""
+    rounded = round(100 * share)
+    if (rounded == 100 and share < 1) or (rounded == 0 and share > 0):
+        return f"{100 * share:.1f} %" if 0.0005 <= share < 0.9995 else ("< 0.1 %" if share < 0.5 else "> 99.9 %")
+    return f"{rounded} %"
+
+
+COLUMN_PT = 229.0
+"""Width of a column of a two-column article; those of the common conference styles are wider."""
+MOST_LINES = 48
+"""Lines of a table in this size that stand in a column of a page."""
+_GAP_PT = 6.0
+_DIGIT_PT = 4.3
+_LETTER_PT = 4.6
+_NAMES_PT = 92.0
+_HEADING = 11
+OUR_BACK_END = " (our back end)"
+_STAR = r"\rlap{$^*$}"
+_LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
+_LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "|": r"\textbar{}"}
+_LATEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "·": r"\textperiodcentered{}", "—": "---", "–": "--"}
+_LATEX |= {
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "°": r"$^\circ$",
+    "²": r"$^2$",
+    "§": r"\S{}",
+    "¶": r"\P{}",
+}
+_LATEX |= {"†": r"$^\dagger$", "‡": r"$^\ddagger$", "…": r"\ldots{}", "’": "'", "“": "``", "”": "''", '"': "''"}
+
+
+def to_latex(table: Table, protocol: str = "") -> str:
+    """The table as one or several LaTeX tables that fit a column; needs the package ``booktabs`` and nothing else.
+
+    Columns that do not fit stand in further blocks below, and rows that do not fit in further tables. Captions are
+    short: what is shown, its unit and the protocol's name; everything else is in the other formats.
+
+    Args:
+        table: The table.
+        protocol: Name of the protocol that its numbers were taken under, for the caption.
+    """
+    table = table.displayed()
+    parts = [part for columns in _blocks(table) for part in _parts(table, columns)]
+    floats: list[list[str]] = [[]]
+    used = 0
+    for text, lines in parts:
+        if floats[-1] and used + lines > MOST_LINES:
+            floats.append([])
+            used = 0
+        floats[-1].append(text)
+        used += lines
+    return "\n".join(_float(table, blocks, number, protocol) for number, blocks in enumerate(floats))
+
+
+def escape_latex(text: str) -> str:
+    """Text with LaTeX's special characters made harmless, on one line.
+
+    Letters of other alphabets than the Latin one and pictures, which ``pdflatex`` has no glyphs for, are named by their
+    code point: ``[U+1F600]``.
+    """
+    return "".join(_character(character) for character in " ".join(text.split()))
+
+
+def _character(character: str) -> str:
+    if character in _LATEX:
+        return _LATEX[character]
+    if character.isascii():
+        return character if character.isprintable() else " "
+    if "\u00c0" <= character <= "\u017e" and character not in "×÷":
+        return character
+    plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
+    return "".join(_LATEX.get(letter, letter) for letter in plain) if plain else f"[U+{ord(character):04X}]"
+
+
+def _float(table: Table, blocks: Sequence[str], number: int, protocol: str) -> str:
+    words = [table.brief or table.title] + [f"protocol {protocol}"] * bool(protocol) + ["continued"] * bool(number)
+    note = " $^*$\\,our back end." if any(_STAR in block for block in blocks) else ""
+    lines = [
+        "\\begin{table}[htbp]",
+        "\\centering\\footnotesize\\setlength{\\tabcolsep}{3pt}",
+        f"\\caption{{{escape_latex(', '.join(words))}.{note}}}",
+        f"\\label{{tab:{table.id}{f'-{number + 1}' if number else ''}}}",
+        "\n\\par\\medskip\n".join(blocks),
+        "\\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _blocks(table: Table) -> list[list[int]]:
+    """Which columns stand side by side; the names of the rows stand in every block."""
+    shown = [at for at, column in enumerate(table.columns) if column.latex]
+    names = next((at for at in shown if not table.columns[at].numeric), 0)
+    widths = {at: _width_pt(table, at) for at in shown}
+    available = COLUMN_PT - min(widths.get(names, 0.0), _NAMES_PT)
+    blocks: list[list[int]] = [[]]
+    for at in (at for at in shown if at != names):
+        by_group = groupby([*blocks[-1], at], key=lambda other: table.columns[other].group)
+        groups = [(name, sum(widths[other] + _GAP_PT for other in group)) for name, group in by_group]
+        if blocks[-1] and sum(max(width, _text_pt(name) + _GAP_PT) for name, width in groups) > available:
+            blocks.append([])
+        blocks[-1].append(at)
+    return [[names, *columns] for columns in blocks]
+
+
+def _width_pt(table: Table, at: int) -> float:
+    """About how wide a column is, in points."""
+    return max(map(_text_pt, [*(_plain(row[at]) for row in table.rows), *_heading(table.columns[at].name)]))
+
+
+def _text_pt(text: str) -> float:
+    return sum(_DIGIT_PT if character.isdigit() else _LETTER_PT for character in text)
+
+
+def _heading(name: str) -> list[str]:
+    """A heading in lines of about ten characters, broken behind blanks, slashes and the like."""
+    lines = [""]
+    for word in re.findall(r"[^ /_@?,-]*[ /_@?,-]?", name):
+        if lines[-1] and len(lines[-1]) + len(word) > _HEADING:
+            lines.append("")
+        lines[-1] += word
+    return [line.strip() for line in lines if line.strip()] or [""]
+
+
+def _plain(cell: TableCell) -> str:
+    """What LaTeX shows of a cell, unescaped."""
+    if cell.emphasis == "failed":
+        return "failed"
+    text = cell.text.replace(OUR_BACK_END, "*")
+    return f"{text} {cell.small}" if cell.small.startswith("[") else text
+
+
+def _parts(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
+    """Columns as one tabular, or as several where they have too many lines; each with its height in lines."""
+    chosen = [table.columns[at] for at in columns]
+    wide = _width_pt(table, columns[0]) > _NAMES_PT
+    kinds = (f"p{{{_NAMES_PT:.0f}pt}}" if wide else "l") + "".join("r" if c.numeric else "l" for c in chosen[1:])
+    head = [_groups(chosen)] if any(column.group for column in chosen) else []
+    head.append(" & ".join(_stacked(column.name) for column in chosen) + " \\\\")
+    top = len(head) + max(len(_heading(column.name)) for column in chosen) + 1
+    bodies: list[list[str]] = []
+    used = MOST_LINES
+    heights: list[int] = []
+    for position, row in enumerate(table.rows):
+        lines = ceil(1.2 * _text_pt(_plain(row[columns[0]])) / _NAMES_PT) if wide else 1
+        if used + lines > MOST_LINES:
+            bodies.append([])
+            heights.append(top)
+            used = top
+        if position in table.separators and bodies[-1]:
+            bodies[-1].append("\\midrule")
+        first, *others = (_cell(row[at]) for at in columns)
+        bodies[-1].append(" & ".join([f"\\raggedright {first}" if wide else first, *others]) + " \\\\")
+        heights[-1] += lines
+        used += lines
+    begin = [f"\\begin{{tabular}}{{@{{}}{kinds}@{{}}}}", "\\toprule", *head, "\\midrule"]
+    end = ["\\bottomrule", "\\end{tabular}"]
+    return [("\n".join([*begin, *body, *end]), height) for body, height in zip(bodies, heights, strict=True)]
+
+
+def _stacked(name: str) -> str:
+    lines = [escape_latex(line) for line in _heading(name)]
+    return lines[0] if len(lines) == 1 else "\\shortstack{" + " \\\\ ".join(lines) + "}"
+
+
+def _cell(cell: TableCell) -> str:
+    if cell.emphasis == "failed":
+        return "failed"
+    text = escape_latex(cell.text.replace(OUR_BACK_END, ""))
+    if text and cell.emphasis in ("best", "second"):
+        text = f"\\text{'bf' if cell.emphasis == 'best' else 'it'}{{{text}}}"
+    text += _STAR if OUR_BACK_END in cell.text else ""
+    return f"{text}~{{\\scriptsize {escape_latex(cell.small)}}}" if cell.small.startswith("[") else text
+
+
+def _groups(columns: Sequence[Column]) -> str:
+    """The line of headings above the columns' own, with a rule below each."""
+    cells, rules, at = [], [], 1
+    for name, group in groupby(columns, key=lambda column: column.group):
+        width = len(list(group))
+        cells.append(f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}" if name else " & ".join([""] * width))
+        rules += [f"\\cmidrule(lr){{{at}-{at + width - 1}}}"] if name else []
+        at += width
+    return " & ".join(cells) + " \\\\ " + " ".join(rules)

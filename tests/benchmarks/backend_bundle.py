@@ -19,8 +19,11 @@ import numpy as np  # noqa: E402
 
 from dynslam_bench.geometry import se3  # noqa: E402
 from dynslam_bench.geometry.camera import Camera  # noqa: E402
-from dynslam_bench.slam.bundle.schur import BundleProblem, adjust_bundle  # noqa: E402
-from dynslam_bench.slam.bundle.with_gtsam import adjust_bundle_gtsam  # noqa: E402
+from dynslam_bench.slam.bundle_adjustment import (  # noqa: E402
+    BundleProblem,
+    adjust_bundle,
+    adjust_bundle_gtsam,
+)
 
 
 def problem(observations: int, seed: int, poses: int = 14, variable: int = 8) -> tuple[BundleProblem, np.ndarray]:

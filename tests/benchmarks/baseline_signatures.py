@@ -27,21 +27,21 @@ and clear if exactly one of the two holds. Sim(3)-aligned numbers and ablations 
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports.model.published import published
-from dynslam_bench.reports.model.rows import LoadedRun, load_runs, open_stores
-from dynslam_bench.runs.frame_row import read_csv
-from dynslam_bench.runs.storage.scoring import DEFAULT_PROTOCOL
+from dynslam_bench.reports.model.load import load_runs, open_stores
+from dynslam_bench.reports.model.published import published, static_camera_errors
+from dynslam_bench.reports.model.row import RunRow
+from dynslam_bench.runs.frames import read_csv
+from dynslam_bench.runs.record import FAILED
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.trackers.registry import TRACKERS
 
@@ -62,7 +62,7 @@ class Cell:
     standstills: list[float] = field(default_factory=list)
 
     @property
-    def never_move(self) -> float | None:
+    def static_camera(self) -> float | None:
         """Median ATE in metres of a camera that never moves; None where no run says it."""
         return float(np.median(self.standstills)) if self.standstills else None
 
@@ -84,10 +84,16 @@ class Cell:
 
 
 def classify(
-    ate: float, coverage: float, never_move: float, yardstick: float, broken: bool = False, *, fails_first: bool = False
+    ate: float,
+    coverage: float,
+    static_camera: float,
+    yardstick: float,
+    broken: bool = False,
+    *,
+    fails_first: bool = False,
 ) -> str:
     """The measured class of a cell; where both hold it survives, unless `fails_first`."""
-    fails = broken or not np.isfinite(ate) or coverage < 0.8 or ate >= 0.5 * never_move
+    fails = broken or not np.isfinite(ate) or coverage < 0.8 or ate >= 0.5 * static_camera
     survives = np.isfinite(ate) and ate <= 3 * yardstick and coverage >= 0.8 and not broken
     if fails and survives:
         return FAILS if fails_first else SURVIVES
@@ -121,16 +127,14 @@ def published_values(names: Iterable[str], sequence: str) -> list[float]:
     wanted = set(names)
     return [
         p.value
-        for p in published()
+        for p in published().itertuples()
         if p.system in wanted and p.sequence == sequence and p.metric == "ate_rmse_m" and p.alignment != "Sim(3)"
     ]
 
 
 def published_never_move() -> dict[str, float]:
     """ATE of a camera that never moves on recorded sequences, metres."""
-    text = (files("dynslam_bench.reports.model") / "data" / "never_move.csv").read_text(encoding="utf-8")
-    lines = csv.DictReader(text.splitlines())
-    return {line["sequence"]: float(line["value"]) for line in lines if line["metric"] == "ape_rmse"}
+    return {sequence: value for (sequence, metric), value in static_camera_errors().items() if metric == "ape_rmse"}
 
 
 def published_class(tracker: str, sequence: str) -> str | None:
@@ -162,31 +166,31 @@ def read_cells(
     cells: dict[tuple[str, str], Cell] = {}
     yardstick: dict[str, Cell] = {}
     provenance: dict[str, str] = {}
-    for run in load_runs(open_stores(folder), get_protocol(DEFAULT_PROTOCOL)).runs:
-        if run.record.kind != "run" or run.record.degrade or run.record.drop_share or run.record.realtime:
+    for run in load_runs(open_stores(folder), get_protocol(DEFAULT_PROTOCOL)).rows:
+        if run.kind != "run" or run.degrade or run.drop_share or run.realtime:
             continue
-        if instances is not None and instance_of(run.row.sequence) not in instances:
+        if instances is not None and instance_of(run.sequence.id) not in instances:
             continue
-        if run.row.tracker == "mask-rcnn" and run.record.overrides == {"segmentation.source": "oracle"}:
-            add(yardstick.setdefault(run.row.sequence, Cell()), run)
-        elif not run.record.overrides:
-            add(cells.setdefault((run.row.tracker, run.row.sequence), Cell()), run)
-            provenance[run.row.tracker] = run.row.provenance
+        if run.tracker.id == "mask-rcnn" and run.overrides == {"segmentation.source": "oracle"}:
+            add(yardstick.setdefault(run.sequence.id, Cell()), run)
+        elif not run.overrides:
+            add(cells.setdefault((run.tracker.id, run.sequence.id), Cell()), run)
+            provenance[run.tracker.id] = run.tracker.provenance
     return cells, yardstick, provenance
 
 
-def add(cell: Cell, run: LoadedRun) -> None:
+def add(cell: Cell, run: RunRow) -> None:
     """Take one repeat's run into its cell."""
-    ate = run.row.metrics.get("ate_rmse_m")
+    ate = run.metrics.get("ate_rmse_m")
     if ate is not None:
         cell.ates.append(ate)
-    cell.coverages.append(run.row.coverage)
-    cell.broken += run.record.failed
-    if run.row.static_camera_ate_rmse_m is not None:
-        cell.standstills.append(run.row.static_camera_ate_rmse_m)
-    stages = [time.median_s for name, time in run.record.timings.items() if name.startswith("culling_")]
+    cell.coverages.append(run.coverage)
+    cell.broken += run.status in FAILED
+    if run.static_camera_ate_rmse_m is not None:
+        cell.standstills.append(run.static_camera_ate_rmse_m)
+    stages = [time.median_s for name, time in run.whole_record().timings.items() if name.startswith("culling_")]
     cell.filter_ms.append(1e3 * sum(stages))
-    cell.culled += culled(run.store.folder(run.record.run_id) / "frames.csv")
+    cell.culled += culled(run.folder / "frames.csv")
 
 
 def culled(path: Path) -> list[float]:
@@ -275,7 +279,7 @@ def report(folder: Path, instances: range | None = None) -> str:
 
 def standstill_of(twin: str, cells: dict[tuple[str, str], Cell], yardstick: dict[str, Cell]) -> float:
     """ATE of a camera that never moves on a twin, metres; NaN where no run says it."""
-    known = yardstick[twin].never_move
+    known = yardstick[twin].static_camera
     return cells["never-move", twin].ate if known is None and ("never-move", twin) in cells else known or float("nan")
 
 

@@ -23,8 +23,8 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.calibration import Quantity, calibrate
+from dynslam_bench.sequences.synthetic import loops as fast
 from dynslam_bench.sequences.synthetic import open_synthetic
-from dynslam_bench.sequences.synthetic.families import fast
 
 SHARED = Path(__file__).resolve().parents[3] / "shared/data"
 REAL = ("tum/rgbd_dataset_freiburg1_xyz", "tum/rgbd_dataset_freiburg1_rpy", "bonn/rgbd_bonn_crowd")
@@ -53,7 +53,7 @@ def recordings(options: argparse.Namespace) -> Iterator[tuple[str, float | None,
         if (SHARED / folder).is_dir():
             yield folder, None, open_sequence(SHARED / folder)
         else:
-            sys.stdout.write(f"{folder}: not judged, nothing under {SHARED}\n")
+            sys.stdout.write(f"{folder}: not measured, nothing under {SHARED}\n")
 
 
 def text(quantity: Quantity, scale: float) -> str:
@@ -78,11 +78,11 @@ def main() -> None:
     for name, truth, sequence in recordings(options):
         began = time.process_time()
         try:
-            found = calibrate(sequence)
+            result = calibrate(sequence)
         except SequenceError as error:
             sys.stdout.write(f"{name} | {error}\n")
             continue
-        readout, delay, factor = found.quantities
+        readout, delay, factor = result.quantities
         within = None
         if truth is not None and readout.low is not None and readout.high is not None:
             within = 1e3 * readout.low <= truth <= 1e3 * readout.high

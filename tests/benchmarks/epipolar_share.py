@@ -25,14 +25,14 @@ sys.path.insert(0, str(ROOT))
 import numpy as np  # noqa: E402
 
 from dynslam_bench.envs.slam_env import SlamEnv  # noqa: E402
-from dynslam_bench.runs.frame_row import FrameRow  # noqa: E402
-from dynslam_bench.runs.storage.frames import FrameLog  # noqa: E402
+from dynslam_bench.runs.frames import FrameLog, FrameRow  # noqa: E402
 from dynslam_bench.trackers import TRACKERS  # noqa: E402
 
 TRACKERS_WITH_F = (
-    "emfoa-oft", "emfoa-oft-no-depth-test", "emfoa-oft-lk", "emfoa-oft-patchmatch", "emfoa-oft-literal",
-    "emfoa-oft-object", "emfoa-oft-object-depth-test", "emfoa-oft-no-masks", "emfoa-oft-no-masks-no-depth-test",
-    "emfoa-oft-paper", "emfoa-oft-paper-sparse", "emfoa-oft-paper-no-masks", "opf-slam", "chen-slam", "blitz-slam",
+    "emfoa-oft", "emfoa-oft?depth=none", "emfoa-oft?flow=lucas-kanade", "emfoa-oft?search=patchmatch",
+    "emfoa-oft?search=emfoa-literal", "emfoa-oft?masks=vote&depth=none", "emfoa-oft?masks=vote",
+    "emfoa-oft?masks=none", "emfoa-oft?masks=none&depth=none", "emfoa-oft-paper",
+    "emfoa-oft-paper?flow=sparse", "emfoa-oft-paper?masks=none", "opf-slam", "chen-slam", "blitz-slam",
     "mor-slam", "sgc-slam", "di-slam", "ds-slam", "sof-slam", "seg-slam",
 )  # fmt: skip
 SEQUENCES = ("synthetic/walking_xyz?scene=100", "synthetic/walking_halfsphere?scene=100")

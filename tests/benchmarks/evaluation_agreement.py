@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 
 DELTAS = ((1, "f"), (10, "f"), (1, "s"), (0.1, "m"), (0.5, "m"), (5, "deg"), (0.2, "rad"))
 

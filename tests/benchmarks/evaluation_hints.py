@@ -22,10 +22,10 @@ from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.hints import hints
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import FileNotes, load_tum, read_tum
+from dynslam_bench.geometry.trajectory_files import FileNotes, load_tum, read_tum
 from dynslam_bench.runs import RunStore
 from dynslam_bench.sequences import open_sequence
-from dynslam_bench.sequences.synthetic.families.registry import SYNTHETIC_IDS
+from dynslam_bench.sequences.synthetic.ids import SYNTHETIC_IDS
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "trajectories"
 FR3 = "rgbd-vo/rgbd_dataset_freiburg3_"

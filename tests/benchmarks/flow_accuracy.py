@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from flow_data import Pair, kitti, real, synthetic
 
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.dense.labels import DenseDaisyFlow
-from dynslam_bench.flow.dis import DisFlow
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow
+from dynslam_bench.flow.opencv import DisFlow
+from dynslam_bench.flow.registry import build_flow
+from dynslam_bench.flow.settings import DenseFlowSettings, FlowSettings
 
 KINDS = ("translation", "scale", "rotation", "similarity", "homography", "foreground")
 SEARCHES = ("emfoa+propagation", "patchmatch", "emfoa", "mfo", "emfoa-literal", "random")
@@ -114,12 +114,12 @@ def dense_table(budgets: Sequence[int]) -> None:
 
     for preset in ("ultrafast", "fast", "medium"):
         row(f"DIS {preset}", DisFlow(FlowSettings(method="dis", dis_preset=preset)).dense(*gray), None, 0)
-    settings = [FlowSettings(dense_budget=b, search=s) for s in ("emfoa+propagation", "patchmatch") for b in budgets]
+    settings = [DenseFlowSettings(budget=b, search=s) for s in ("emfoa+propagation", "patchmatch") for b in budgets]
     for each in settings:
         dense = DenseDaisyFlow(each)
         result = dense.flow(dense.prepare(gray[0]), dense.prepare(gray[1]))
-        star = " (default)" if each == FlowSettings() else ""
-        name = f"DAISY Filter Flow, {each.search}, {each.dense_budget}{star}"
+        star = " (default)" if each == DenseFlowSettings() else ""
+        name = f"DAISY Filter Flow, {each.search}, {each.budget}{star}"
         row(name, result.flow, result.valid, result.stats["evaluations"])
 
 

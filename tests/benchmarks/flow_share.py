@@ -19,8 +19,8 @@ from flow_data import Pair, real
 from flow_rendered import rendered
 from scipy import stats
 
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.searches.schedule import STRATEGIES
+from dynslam_bench.flow.label_search import STRATEGIES
+from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 
 BASE = "emfoa+propagation"

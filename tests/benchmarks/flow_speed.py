@@ -22,8 +22,8 @@ from flow_accuracy import SEARCHES
 from flow_data import Pair, corners, synthetic
 
 from dynslam_bench.contracts.flow import FlowEstimator
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.dense.labels import DenseDaisyFlow
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow
+from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 
 
@@ -125,7 +125,7 @@ def main() -> None:
     maps = timed(lambda: build_flow(FlowSettings()).prepare(second), repeats)
     print(f"\norientation maps alone, 1 thread: {maps[0]:.1f} / {maps[1]:.1f} ms (processor {maps[2]:.1f})")
     for threads in (1, 2):
-        dense = DenseDaisyFlow(FlowSettings(), threads=threads)
+        dense = DenseDaisyFlow(threads=threads)
         took = timed(lambda dense=dense: dense.flow(dense.prepare(first), dense.prepare(second)), 3)
         print(
             f"dense 640x480 both ways, {threads} thread(s): {took[0]:.0f} / {took[1]:.0f} ms (processor {took[2]:.0f})"

@@ -45,18 +45,18 @@ from faults import Injector  # noqa: E402
 from test_runs_infrastructure import STRAYS  # noqa: E402
 
 from dynslam_bench.cli import main as main_of_the_command_line  # noqa: E402
-from dynslam_bench.core.temporary import SHARED_MEMORY  # noqa: E402
-from dynslam_bench.runs.process.family import children, family  # noqa: E402
-from dynslam_bench.runs.process.server import SERVER  # noqa: E402
+from dynslam_bench.core.files import SHARED_MEMORY  # noqa: E402
+from dynslam_bench.runs.process.fork_server import SERVERS  # noqa: E402
+from dynslam_bench.runs.process.tree import process_tree  # noqa: E402
 
 SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
 STUDY = (
     'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\nseeds = [0]\noffsets = [0]\nallow_overlap = true\n'
 )
 LIGHT_SERVER = """#!/bin/sh
-exec {python} -c "import sys; import dynslam_bench.runs.process.server as server
-server.PRELOADED = ('numpy', 'cv2', 'gymnasium', 'dynslam_bench.envs', 'dynslam_bench.runs.process.keeper')
-server.serve(int(sys.argv[-1]))" "$@"
+exec {python} -c "import sys; import dynslam_bench.runs.process.fork_server as server
+server.PRELOADED = ('numpy', 'cv2', 'gymnasium', 'dynslam_bench.envs', 'dynslam_bench.runs.process.child')
+server.serve(int(sys.argv[-2]), sys.argv[-1])" "$@"
 """
 """A fork server that has imported what the toys need, which is a third of what systems need."""
 
@@ -68,7 +68,7 @@ def environment() -> dict[str, str]:
 
 def command(*arguments: str) -> list[str]:
     """The command line in this interpreter."""
-    return [sys.executable, "-m", "dynslam_bench.cli", *arguments]
+    return [sys.executable, "-c", "from dynslam_bench.cli import main; main()", *arguments]
 
 
 def outcome(results: Path) -> dict[str, tuple[str, str]]:
@@ -125,7 +125,7 @@ def operations(work: Path, which: list[str], every: int) -> Counter[str]:
     sys.executable = str(work / "python")
     os.chdir(work)
     bench()  # here, so that no fork has to import what it needs
-    SERVER.close()
+    SERVERS["fork"].close()
     expected = outcome(work / "results")
     counted: Counter[str] = Counter()
     _, total, said = disturb(work, 0, "kill")
@@ -179,7 +179,7 @@ def in_fork(work: Path, injector: Injector) -> tuple[int, int, str]:
             traceback.print_exc()
             code = 99
         sys.stdout.flush()
-        SERVER.close()
+        SERVERS["fork"].close()
         counted.write_text(str(injector.count))
         os._exit(code)
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
@@ -225,7 +225,7 @@ def signals(work: Path) -> Counter[str]:
     counted: Counter[str] = Counter()
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
     cases = [(whom, number) for whom in ("command", "group") for number in numbers]
-    for whom, number in [*cases, ("server", signal.SIGKILL), ("server", signal.SIGTERM), ("keeper", signal.SIGKILL)]:
+    for whom, number in [*cases, ("server", signal.SIGKILL), ("server", signal.SIGTERM), ("run", signal.SIGKILL)]:
         pids = work / f"pids.{whom}.{number.name}"
         tracker = f"subprocess:{sys.executable} {work / 'strays.py'} {pids}"
         program = subprocess.Popen(
@@ -235,10 +235,9 @@ def signals(work: Path) -> Counter[str]:
         while not (pids.is_file() and len(pids.read_text().split()) >= 4):
             time.sleep(0.05)
         mine = [int(line) for line in pids.read_text().split()]
-        server = children(program.pid)[0]
-        keeper = children(server)[0]
-        mine += family(server) if whom in ("command", "group") else family(keeper)
-        target = {"command": program.pid, "group": program.pid, "server": server, "keeper": keeper}[whom]
+        _, server, run, *_ = (process.pid for process in process_tree(program.pid))
+        mine += [process.pid for process in process_tree(server if whom in ("command", "group") else run)]
+        target = {"command": program.pid, "group": program.pid, "server": server, "run": run}[whom]
         (os.killpg if whom == "group" else os.kill)(target, number)
         took = until_gone(mine)
         if whom not in ("command", "group"):

@@ -25,20 +25,18 @@ sys.path.insert(0, str(ROOT))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
-from synthetic_judge import SideBySide, error, trajectory  # noqa: E402
+from synthetic_difficulty import SideBySide, error, trajectory  # noqa: E402
 
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides  # noqa: E402
 from dynslam_bench.evaluation.alignment import align  # noqa: E402
-from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
+from dynslam_bench.features.registry import build_extractor  # noqa: E402
 from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
 from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
 from dynslam_bench.sequences import open_sequence  # noqa: E402
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence  # noqa: E402
-from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
-from dynslam_bench.slam.monocular import MonocularBackend  # noqa: E402
-from dynslam_bench.slam.monocular_settings import MonocularBackendSettings  # noqa: E402
-from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
+from dynslam_bench.slam.backend import build_backend  # noqa: E402
+from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings  # noqa: E402
 
 SETTINGS = {
     "off": {},
@@ -49,9 +47,9 @@ SETTINGS = {
 
 def features_of(source: str, stride: int, rivals: int) -> tuple[SyntheticSequence, list[FrameBundle], SideBySide]:
     """The sequence, every `stride`-th of its frames without pixels, and the rivals, which have seen them."""
-    found = open_sequence(source)
-    assert isinstance(found, SyntheticSequence), "rendered sequences alone"
-    sequence = SyntheticSequence(found._id, None, found.settings, 1)  # private: the same sequence without a cache
+    opened = open_sequence(source)
+    assert isinstance(opened, SyntheticSequence), "rendered sequences alone"
+    sequence = SyntheticSequence(opened._id, None, opened.settings, 1)  # private: the same sequence without a cache
     together = SideBySide(sequence, list(range(rivals)), sequence.fps / stride)
     camera, extractor, frames = sequence.camera, build_extractor(FeatureSettings()), []
     blank = np.zeros((camera.height, camera.width, 3), np.uint8)
@@ -66,41 +64,39 @@ def features_of(source: str, stride: int, rivals: int) -> tuple[SyntheticSequenc
     return sequence, frames, together
 
 
-def drive(sequence: SyntheticSequence, frames: list[FrameBundle], backend: RgbdBackend) -> str:
-    """One run, in words."""
+def drive(sequence: SyntheticSequence, frames: list[FrameBundle], backend) -> str:
+    """One run as a line of text."""
     backend.reset(sequence.camera, 0)
     truth = sequence.ground_truth
     true = truth.T_world_cam[np.searchsorted(truth.timestamps, [frame.timestamp - 1e-6 for frame in frames])][:, :3, 3]
     online, spent, loops = [], 0.0, []
     for number, frame in enumerate(frames):
         begin = time.process_time()
-        found = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
+        result = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
         spent += time.process_time() - begin
-        if found.state == "ok" and found.T_world_cam is not None:
-            online.append((frame.timestamp, found.T_world_cam))
+        if result.state == "ok" and result.T_world_cam is not None:
+            online.append((frame.timestamp, result.T_world_cam))
         for loop in backend.loops.closed[len(loops) :]:
-            apart = np.linalg.norm(true[number] - true[loop.frame])
-            kind = "join" if loop.joins else "loop"
+            distance = np.linalg.norm(true[number] - true[loop.frame])
+            kind = "merge" if loop.merges else "loop"
             scale = "" if backend.uses_depth else f", scale x {loop.scale:.2f}"
-            loops.append(f"{kind} {number} -> {loop.frame}, {loop.inliers} points, {apart:.2f} m apart{scale}")
+            loops.append(f"{kind} {number} -> {loop.frame}, {loop.inliers} points, {distance:.2f} m apart{scale}")
     final = backend.finalize()
 
-    def measured(found: Trajectory) -> float | None:
-        return error(found, truth) if backend.uses_depth else scaled_error(found, truth)
-
+    rmse = error if backend.uses_depth else scaled_error
     return (
-        f"online {measured(trajectory(online))} m on {len(online)}, "
-        f"final {measured(final)} m on {len(final)} of {len(frames)} frames, "
+        f"online {rmse(trajectory(online), truth)} m on {len(online)}, "
+        f"final {rmse(final, truth)} m on {len(final)} of {len(frames)} frames, "
         f"{1e3 * spent / len(frames):.0f} ms a frame, {'; '.join(loops) or 'no loop'}"
     )
 
 
-def scaled_error(found: Trajectory, truth: Trajectory) -> float | None:
+def scaled_error(estimate: Trajectory, truth: Trajectory) -> float | None:
     """RMSE of positions after the best similarity, metres; None for fewer than three poses."""
-    if len(found) < 3:
+    if len(estimate) < 3:
         return None
-    true = truth.T_world_cam[np.searchsorted(truth.timestamps, found.timestamps - 1e-6)]
-    moved = align(found.T_world_cam, true, "sim3").apply(found.T_world_cam)
+    true = truth.T_world_cam[np.searchsorted(truth.timestamps, estimate.timestamps - 1e-6)]
+    moved = align(estimate.T_world_cam, true, "sim3").apply(estimate.T_world_cam)
     return round(float(np.sqrt(np.square(moved[:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean())), 5)
 
 
@@ -121,10 +117,11 @@ def main() -> None:
         if options.without_depth:
             frames = [replace(frame, z=np.zeros_like(frame.z)) for frame in frames]
         for name in options.settings:
-            if options.without_depth:
-                backend: RgbdBackend = MonocularBackend(apply_overrides(MonocularBackendSettings(), SETTINGS[name]))
-            else:
-                backend = RgbdBackend(apply_overrides(BackendSettings(), SETTINGS[name]))
+            defaults = MonocularBackendSettings() if options.without_depth else BackendSettings()
+            features = FeatureSettings()
+            backend = build_backend(
+                apply_overrides(defaults, SETTINGS[name]), features.scale_factor, features.levels, features.extractor
+            )
             print(f"{source}, closing {name}: {drive(sequence, frames, backend)}", flush=True)
         for row in together.results():
             print(f"{source}, ORB-SLAM3: {row}", flush=True)

@@ -1,4 +1,4 @@
-"""Black frames and kidnapped cameras in rendered rooms: when the camera knows where it is, and what it says until then.
+"""Blackouts and kidnapped cameras in rendered scenes: after how many frames the camera is relocalised.
 
     python tests/benchmarks/lost_and_found.py [--sequences ID ...] [--frames 300] [--black 20] [--cases 6]
 
@@ -33,7 +33,7 @@ import numpy as np  # noqa: E402
 from dynslam_bench.contracts.features import Keypoints  # noqa: E402
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
 from dynslam_bench.core.settings import apply_overrides, parse_assignments  # noqa: E402
-from dynslam_bench.features.build_extractor import build_extractor  # noqa: E402
+from dynslam_bench.features.registry import build_extractor  # noqa: E402
 from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
 from dynslam_bench.geometry import se3  # noqa: E402
 from dynslam_bench.geometry.camera import Camera  # noqa: E402
@@ -42,7 +42,7 @@ from dynslam_bench.sequences import open_sequence  # noqa: E402
 from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
 from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
 
-ROOMS = [
+SCENES = [
     *(f"synthetic/sitting_{motion}?scene={scene}" for motion in ("xyz", "halfsphere", "rpy") for scene in (3, 103)),
     *(f"synthetic/walking_halfsphere?scene={instance}" for instance in (3, 103)),
     *(f"synthetic/loop_room?scene={instance}&frames=1800" for instance in (3, 103)),
@@ -51,7 +51,7 @@ BEFORE = {"black": 100, "kidnapped": 200, "carried": 200}
 BACK, AFTER, SOON = 150, 30, 10
 NEAR_M, NEAR_DEG, WRONG_M = 0.3, 20.0, 0.1
 HEAD = (
-    "| room, loss | cases | known and found within 10 | frames, median / most | known, never found "
+    "| scene, loss | cases | known and found within 10 | frames, median / most | known, never found "
     "| other views, found | wrong frames | worst mm | `ok` frames |\n|" + " --- |" * 9 + "\n"
 )
 DILATION = 15
@@ -59,8 +59,8 @@ DILATION = 15
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """A frame: features of the room alone, their depth, and where people are (packed bits)."""
+class SceneFrame:
+    """A frame: static features, their depth, and the mask of people (packed bits)."""
 
     keypoints: Keypoints
     z: np.ndarray
@@ -68,28 +68,28 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
-    """What the camera saw: the camera, the frames, true poses ``[N, 4, 4]``, frames a second."""
+class Scene:
+    """The camera's view: the camera, the frames, true poses ``[N, 4, 4]``, frames a second."""
 
     camera: Camera
-    seen: list[Seen]
+    seen: list[SceneFrame]
     poses: np.ndarray
     fps: float
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case: whether the view was known, frames until `ok` (None: never), wrong ones, frames `ok`."""
+    """Result of a case: whether the view was known, frames until `ok` (None: never), wrong ones, frames `ok`."""
 
     known: bool
-    found: int | None
+    frames_lost: int | None
     wrong: int
     worst_m: float
     tracked: int
     frames: int
 
 
-def rendered(source: str, count: int) -> Room:
+def rendered(source: str, count: int) -> Scene:
     """Features of the first `count` frames of a sequence; of every second one where the camera walks."""
     stride = 2 if "loop" in source else 1
     sequence, extractor = (
@@ -103,19 +103,19 @@ def rendered(source: str, count: int) -> Room:
         people = np.isin(masks.instances, [n for n, name in masks.class_names.items() if name == "person"])
         mask = cv2.dilate(people.astype(np.uint8), kernel) > 0
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        keypoints = extractor.extract_beside(gray, mask, SegmentationSettings().outside_share)
+        keypoints = extractor.extract_masked(gray, mask, SegmentationSettings().outside_share)
         column, row = np.rint(keypoints.xy).astype(int).T
         at = row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)
         mine = np.flatnonzero(~mask[at])
-        seen.append(Seen(keypoints.select(mine), frame.depth[at][mine].clip(min=0), np.packbits(mask)))
+        seen.append(SceneFrame(keypoints.select(mine), frame.depth[at][mine].clip(min=0), np.packbits(mask)))
     stamps, truth = sequence.timestamps, sequence.ground_truth
     nearest = np.abs(truth.timestamps[:, None] - stamps[None]).argmin(axis=0)
-    return Room(sequence.camera, seen, truth.T_world_cam[nearest], sequence.fps / stride)
+    return Scene(sequence.camera, seen, truth.T_world_cam[nearest], sequence.fps / stride)
 
 
-def frame_of(room: Room, index: int | None, number: int) -> FrameBundle:
+def frame_of(scene: Scene, index: int | None, number: int) -> FrameBundle:
     """A frame of the case; None is a black one."""
-    seen, size = room.seen[0 if index is None else index], (room.camera.height, room.camera.width)
+    seen, size = scene.seen[0 if index is None else index], (scene.camera.height, scene.camera.width)
     mask = np.unpackbits(seen.mask).reshape(size).astype(bool)
     keypoints, z = seen.keypoints, seen.z
     if index is None:
@@ -123,66 +123,70 @@ def frame_of(room: Room, index: int | None, number: int) -> FrameBundle:
     blank = np.zeros((*size, 3), np.uint8)
     pictures = blank, blank[..., 0], np.zeros(size, np.float32)
     xy = keypoints.xy.astype(np.float64)
-    return FrameBundle(number, number / room.fps, *pictures, keypoints, xy, z, mask=mask)
+    return FrameBundle(number, number / scene.fps, *pictures, keypoints, xy, z, mask=mask)
 
 
-def way_of(kind: str, start: int, black: int) -> list[int | None]:
+def path_of(kind: str, start: int, black: int) -> list[int | None]:
     """Which frames a case shows, in order."""
     left = start + BEFORE[kind]
     back = left + black if kind == "black" else left - BACK
     return [*range(start, left), *[None] * (0 if kind == "kidnapped" else black), *range(back, back + AFTER)]
 
 
-def is_known(room: Room, view: int, mapped: list[int]) -> bool:
+def is_known(scene: Scene, view: int, mapped: list[int]) -> bool:
     """Whether the camera was near a view before."""
-    apart = se3.inverse(room.poses[view]) @ room.poses[mapped]
-    near = np.linalg.norm(apart[:, :3, 3], axis=1) <= NEAR_M
-    turned = np.degrees(np.arccos(np.clip((np.trace(apart[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    return bool((near & (turned <= NEAR_DEG)).any())
+    relative = se3.inverse(scene.poses[view]) @ scene.poses[mapped]
+    near = np.linalg.norm(relative[:, :3, 3], axis=1) <= NEAR_M
+    rotated = np.degrees(np.arccos(np.clip((np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    return bool((near & (rotated <= NEAR_DEG)).any())
 
 
-def case(room: Room, kind: str, start: int, black: int, settings: BackendSettings) -> Outcome:
+def case(scene: Scene, kind: str, start: int, black: int, settings: BackendSettings) -> Outcome:
     """Drive one case."""
-    way, before = way_of(kind, start, black), BEFORE[kind]
+    path, before = path_of(kind, start, black), BEFORE[kind]
     backend = RgbdBackend(settings)
-    backend.reset(room.camera, 0)
-    ok, error = np.zeros(len(way), bool), np.zeros(len(way))
-    for number, index in enumerate(way):
-        frame = frame_of(room, index, number)
-        found = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
-        ok[number] = found.state == "ok"
+    backend.reset(scene.camera, 0)
+    ok, error = np.zeros(len(path), bool), np.zeros(len(path))
+    for number, index in enumerate(path):
+        frame = frame_of(scene, index, number)
+        result = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))
+        ok[number] = result.state == "ok"
         if ok[number] and index is not None:
-            true = (se3.inverse(room.poses[start]) @ room.poses[index])[:3, 3]
-            error[number] = np.linalg.norm(found.T_world_cam[:3, 3] - true)
-    dark = np.array([index is None for index in way])
+            true = (se3.inverse(scene.poses[start]) @ scene.poses[index])[:3, 3]
+            error[number] = np.linalg.norm(result.T_world_cam[:3, 3] - true)
+    dark = np.array([index is None for index in path])
     drift = error[:before].max()
     wrong = int(np.count_nonzero(ok & (dark | (error > drift + WRONG_M))))
     again = np.flatnonzero(ok[-AFTER:])
-    mapped = [way[number] for number in np.flatnonzero(ok[:before])]
-    found_after = int(again[0]) + 1 if len(again) else None
-    known = bool(mapped) and is_known(room, way[-AFTER], mapped)
-    return Outcome(known, found_after, wrong, float(error[ok].max(initial=0)), int(ok.sum()), len(way))
+    mapped = [path[number] for number in np.flatnonzero(ok[:before])]
+    frames_lost = int(again[0]) + 1 if len(again) else None
+    known = bool(mapped) and is_known(scene, path[-AFTER], mapped)
+    return Outcome(known, frames_lost, wrong, float(error[ok].max(initial=0)), int(ok.sum()), len(path))
 
 
 def row(words: str, outcomes: list[Outcome]) -> str:
     """One row of the table."""
-    known = [each for each in outcomes if each.known]
-    soon = sum(each.found is not None and each.found <= SOON for each in known)
-    needed = [each.found for each in known if each.found is not None]
-    never = sum(each.found is None for each in known)
-    others = [each for each in outcomes if not each.known]
-    cells = (words, len(outcomes), f"{soon} of {len(known)}", 
-             f"{np.median(needed):.0f} / {max(needed)}" if needed else "-", never,
-             f"{sum(each.found is not None for each in others)} of {len(others)}", sum(each.wrong for each in outcomes),
-             f"{1e3 * max(each.worst_m for each in outcomes):.0f}",
-             f"{sum(each.tracked for each in outcomes)} of {sum(each.frames for each in outcomes)}")  # fmt: skip
+    known = [outcome.frames_lost for outcome in outcomes if outcome.known]
+    others = [outcome.frames_lost for outcome in outcomes if not outcome.known]
+    needed = [frames for frames in known if frames is not None]
+    cells = (
+        words,
+        len(outcomes),
+        f"{sum(frames <= SOON for frames in needed)} of {len(known)}",
+        f"{np.median(needed):.0f} / {max(needed)}" if needed else "-",
+        known.count(None),
+        f"{len(others) - others.count(None)} of {len(others)}",
+        sum(outcome.wrong for outcome in outcomes),
+        f"{1e3 * max(outcome.worst_m for outcome in outcomes):.0f}",
+        f"{sum(outcome.tracked for outcome in outcomes)} of {sum(outcome.frames for outcome in outcomes)}",
+    )
     return "| " + " | ".join(map(str, cells)) + " |\n"
 
 
 def main() -> int:
-    """Print a row for each room and kind; 1 if the bar is missed or a frame is wrong."""
+    """Print a row for each scene and kind; 1 if the bar is missed or a frame is wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sequences", nargs="+", default=ROOMS)
+    parser.add_argument("--sequences", nargs="+", default=SCENES)
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--black", type=int, default=20)
     parser.add_argument("--cases", type=int, default=6)
@@ -193,17 +197,20 @@ def main() -> int:
     sys.stdout.write(HEAD)
     every: list[Outcome] = []
     for source in options.sequences:
-        room = rendered(source, options.frames)
+        scene = rendered(source, options.frames)
         for kind in BEFORE:
-            length = max(index for index in way_of(kind, 0, options.black) if index is not None) + 1
+            length = max(index for index in path_of(kind, 0, options.black) if index is not None) + 1
             starts = np.linspace(0, options.frames - length, options.cases).astype(int)
-            outcomes = [case(room, kind, int(start), options.black, settings) for start in starts]
+            outcomes = [case(scene, kind, int(start), options.black, settings) for start in starts]
             every += outcomes
             sys.stdout.write(row(f"{source.removeprefix('synthetic/')}, {kind}", outcomes))
             sys.stdout.flush()
     sys.stdout.write(row("all", every))
-    known = [each for each in every if each.known]
-    return int(any(each.wrong for each in every) or any(each.found is None or each.found > SOON for each in known))
+    known = [outcome for outcome in every if outcome.known]
+    return int(
+        any(outcome.wrong for outcome in every)
+        or any(outcome.frames_lost is None or outcome.frames_lost > SOON for outcome in known)
+    )
 
 
 if __name__ == "__main__":

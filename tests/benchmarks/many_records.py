@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import os
 import resource
 import shutil
@@ -22,9 +21,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from dynslam_bench.runs import RunStore  # noqa: E402
+
 FIXTURE = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
 TRACKERS, SEQUENCES = 20, 50
 SETTINGS = 120
@@ -32,49 +36,45 @@ SETTINGS = 120
 
 
 def fill(results: Path, records: int) -> None:
-    """Store so many runs; every file is written, none is a link."""
-    shutil.copytree(FIXTURE / "sequences", results / "sequences")
-    (metrics,) = (FIXTURE / "metrics").iterdir()
-    old = min((FIXTURE / "runs").iterdir())
-    record, scored = json.loads((old / "run.json").read_text()), json.loads((metrics / f"{old.name}.json").read_text())
-    track = (old / "trajectory_online.txt").read_text()
-    record["settings"] = {f"group_{at % 12}.setting_{at}": 0.5 * at for at in range(SETTINGS)}
-    record["identity"]["settings"] = record["settings"]
-    record |= {
-        "run_id": "<run>",
-        "seed": "<seed>",
-        "coverage": "<coverage>",
-        "started": "2026-01-<day>T<time>.000+00:00",
-    }
-    record["tracker"] |= {"id": "tracker-<tracker>", "label": "Tracker <tracker>"}
-    record["sequence"] |= {"id": "sequence/<sequence>", "content": "<digest>", "block": "<digest>"}
-    scored["run_id"] = "<run>"
-    scored["online"]["metrics"]["ate_rmse_m"] = "<error>"
-    patterns = [json.dumps(each, indent=2) + "\n" for each in (record, scored)]
-    (results / "metrics" / metrics.name).mkdir(parents=True)
+    """Store so many runs with their errors; every file is written, none is a link."""
+    shutil.copytree(FIXTURE, results)
+    store = RunStore(results)
+    old = store.all()[0][0]
+    scored = store.score(old)
+    track = (store.folder(old.run_id) / "trajectory_online.txt").read_text()
+    shutil.rmtree(store.runs)
+    part, entries = old.sequence.part, []
     for number in range(records):
         tracker, sequence, repeat = number % TRACKERS, number // TRACKERS % SEQUENCES, number // (TRACKERS * SEQUENCES)
         run = hashlib.sha256(str(number).encode()).hexdigest()[:16]
-        values = {
-            **{"<run>": run, '"<seed>"': repeat, '"<coverage>"': 1 - repeat / 1000, "<tracker>": tracker},
-            **{"<sequence>": sequence, "<digest>": f"{sequence:016x}", "<day>": f"{1 + number // 86400:02d}"},
-            "<time>": f"{number // 3600 % 24:02d}:{number // 60 % 60:02d}:{number % 60:02d}",
-            '"<error>"': 0.01 * (1 + tracker) + 1e-3 * sequence + 1e-5 * repeat,
-        }
-        texts = list(patterns)
-        for name, value in values.items():
-            texts = [text.replace(name, str(value)) for text in texts]
-        folder = results / "runs" / run
-        folder.mkdir(parents=True)
-        (folder / "run.json").write_text(texts[0])
-        (folder / "trajectory_online.txt").write_text(track)
-        (results / "metrics" / metrics.name / f"{run}.json").write_text(texts[1])
+        content = f"{sequence:016x}"
+        record = old.model_copy(
+            update={
+                "run_id": run,
+                "seed": repeat,
+                "coverage": 1 - repeat / 1000,
+                "started": (datetime(2026, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=number)).isoformat(),
+                "settings": {f"group_{at % 12}.setting_{at}": 0.5 * at for at in range(SETTINGS)},
+                "tracker": old.tracker.model_copy(update={"id": f"tracker-{tracker}", "label": f"Tracker {tracker}"}),
+                "sequence": old.sequence.model_copy(
+                    update={"id": f"sequence/{sequence}", "content": content, "block": content}
+                ),
+            }
+        )
+        store.folder(run).mkdir(parents=True)
+        (store.folder(run) / "run.json").write_text(record.to_json())
+        (store.folder(run) / "trajectory_online.txt").write_text(track)
+        error = {"ate_rmse_m": 0.01 * (1 + tracker) + 1e-3 * sequence + 1e-5 * repeat}
+        online = scored.online.model_copy(update={"metrics": scored.online.metrics | error})
+        metrics = scored.model_copy(update={"run_id": run, "online": online})
+        entries.append((run, store.index.state(run, part), metrics.to_line()))
+    store.index.write(f"metrics {scored.protocol_digest}", scored.code, entries)
 
 
 def timed(*arguments: str) -> tuple[float, float, float]:
     """Wall and processor seconds of a command of the command line, and the megabytes of the largest process yet."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    command = [sys.executable, "-m", "dynslam_bench.cli", *arguments]
+    command = [sys.executable, "-c", "from dynslam_bench.cli import main; main()", *arguments]
     subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     used = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime

@@ -37,8 +37,8 @@ from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
 
 RECORDED = Path(__file__).with_suffix(".json")
 TRACKERS = (
-    "orb-slam2", "mask-rcnn", "emfoa-oft", "emfoa-oft-no-masks", "emfoa-oft-paper", "dynaslam", "dynaslam-g", "ds-slam",
-    "dai-slam", "di-slam", "huai-slam", "ngd-slam",
+    "orb-slam2", "mask-rcnn", "emfoa-oft", "emfoa-oft?masks=none", "emfoa-oft-paper", "dynaslam", "dynaslam-g",
+    "ds-slam", "dai-slam", "di-slam", "huai-slam", "ngd-slam",
 )  # fmt: skip
 EXCERPT = ROOT.parent / "shared/data/bonn/rgbd_bonn_crowd"
 SEQUENCES = ("synthetic/walking_xyz?scene=100", "synthetic/sitting_rpy?scene=101", str(EXCERPT))
@@ -60,7 +60,7 @@ def run(tracker_id: str, name: str, frames: int) -> tuple[str, list[float]]:
     """Digest of everything a tracker says about a sequence's first frames, and its frame times in seconds."""
     sequence = open_sequence(name, frames=(0, frames))
     rendered = name.startswith("synthetic/")
-    masked = tracker_id not in ("orb-slam2", "emfoa-oft-no-masks", "dynaslam-g", "dai-slam")
+    masked = tracker_id not in ("orb-slam2", "emfoa-oft?masks=none", "dynaslam-g", "dai-slam")
     overrides = {"segmentation.source": "embedded" if rendered else MASKS} if masked else {}
     tracker = build_tracker(tracker_id, overrides, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))

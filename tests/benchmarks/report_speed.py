@@ -28,13 +28,13 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "reports")]
 from reports_browser import EXECUTABLE, Browser  # noqa: E402
 from reports_fake_store import add_run  # noqa: E402
 
-from dynslam_bench.contracts.result import TrackResult  # noqa: E402
+from dynslam_bench.contracts.tracker import TrackResult  # noqa: E402
 from dynslam_bench.envs.episode import FrameOutcome  # noqa: E402
 from dynslam_bench.evaluation.online import OnlineSample  # noqa: E402
 from dynslam_bench.reports import build_report  # noqa: E402
-from dynslam_bench.runs.frame_row import FrameRow, write_csv  # noqa: E402
-from dynslam_bench.runs.snapshots import SnapshotWriter  # noqa: E402
-from dynslam_bench.runs.storage.store import RUN_FILE, RunStore  # noqa: E402
+from dynslam_bench.runs.artifacts import SnapshotWriter  # noqa: E402
+from dynslam_bench.runs.frames import FrameRow, write_csv  # noqa: E402
+from dynslam_bench.runs.store import RUN_FILE, RunStore  # noqa: E402
 
 STAGES = "segmentation features culling_box_depth culling_reseeding tracking mapping bundle_adjustment".split()
 STATS = [*"keypoints culled matches inliers mask_fraction".split(), *(f"figure_{k}" for k in range(16))]

@@ -1,30 +1,28 @@
-"""What undoing the rolling shutter is worth: each tracker with and without it, start by start.
+"""The effect of rolling-shutter compensation: each tracker with and without it, start by start.
 
     python tests/benchmarks/rolling_shutter.py [TRACKER ...] [--part fr1_xyz fr1_rpy bonn fast] [--starts 12]
-        [--readouts 0 0.013 0.02 0.026 0.033] [--rival] [--results FOLDER]
+        [--rival] [--results FOLDER]
 
 Printed is the online ATE with : without, paired by start (lost frames held; protocol tum-rgbd/v1), and the medians.
 Recordings are looked for in ``../shared``; what is not there is named. Starts of one recording share nearly all of
-their frames: an interval over them says nothing beyond it. `--readouts` prints the first tracker's error by readout
-time instead, `--rival` runs ORB-SLAM3 once a start beside them.
+their frames: an interval over them says nothing beyond it. `--rival` runs ORB-SLAM3 once a start beside
+them.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs import RunStore
-from dynslam_bench.sequences.published.cameras import find_camera, write_camera
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning.blocks import Block, parse_blocks
 from dynslam_bench.tuning.evaluate import Outcome, evaluate
-from dynslam_bench.tuning.ratio import compared
+from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
+from dynslam_bench.tuning.summary import compared
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 NETWORK = SHARED / "weights/yolov8n-seg_480x640_fp32.onnx"
@@ -38,14 +36,14 @@ FAST = tuple(f"synthetic/fast_{kind}?scene={{instances}}&frames=120" for kind in
 OFF = {"backend.tracking.rolling_shutter": False}
 
 
-def blocks_of(part: str, starts: int) -> list[Block]:
+def instances_of(part: str, starts: int) -> list[ProblemInstance]:
     """Starts 0, 1, 2 ... of a recording; instances 100, 101 ... of the fast sequences."""
     texts = (
         [text.format(instances=f"100-{99 + starts}") for text in FAST]
         if part == "fast"
         else [f"{FOLDERS[part]}?offsets=0-{starts - 1}"]
     )
-    return [block for text in texts for block in parse_blocks(text)]
+    return [instance for text in texts for instance in parse_instances(text)]
 
 
 def own_masks(tracker: str, part: str) -> dict[str, str]:
@@ -54,41 +52,23 @@ def own_masks(tracker: str, part: str) -> dict[str, str]:
     return {"segmentation.source": "oracle" if part == "fast" else f"onnx:{NETWORK}"} if asks else {}
 
 
-def worth(tracker: str, part: str, options: argparse.Namespace) -> str:
+def effect(tracker: str, part: str, options: argparse.Namespace) -> str:
     """One line: with it beside without it."""
     source, store = own_masks(tracker, part), RunStore(options.results)
-    found: list[dict[Block, Outcome]] = [{}, {}, {}]
-    for block in blocks_of(part, options.starts):
-        for each, settings in zip(found, (source, source | OFF), strict=False):
-            each |= evaluate(tracker, settings, [block], results=store)
+    outcomes: list[dict[ProblemInstance, Outcome]] = [{}, {}, {}]
+    for instance in instances_of(part, options.starts):
+        for runs, settings in zip(outcomes, (source, source | OFF), strict=False):
+            runs |= evaluate(tracker, settings, [instance], results=store)
         if options.rival:
-            found[2] |= evaluate("orbslam3", {"vocabulary": str(VOCABULARY)}, [block], results=store)
+            outcomes[2] |= evaluate("orbslam3", {"vocabulary": str(VOCABULARY)}, [instance], results=store)
     names = ("with", "without", "ORB-SLAM3")
     medians = [
-        f"{name} {1e3 * np.median([each.ate_m for each in outcomes.values()]):.1f} mm"
-        for name, outcomes in zip(names, found, strict=True)
-        if outcomes
+        f"{name} {1e3 * np.median([run.ate_m for run in runs.values()]):.1f} mm"
+        for name, runs in zip(names, outcomes, strict=True)
+        if runs
     ]
-    lost = max(1 - run.coverage for run in found[0].values())
-    return f"{tracker}, {part}: {compared(found[0], found[1])}; {', '.join(medians)}; most frames lost {lost:.1%}"
-
-
-def readouts(part: str, options: argparse.Namespace) -> str:
-    """One line: the median ATE of the first tracker by readout time."""
-    told = []
-    for seconds in options.readouts:
-        camera, fps = find_camera(FOLDERS[part])
-        with tempfile.TemporaryDirectory() as scratch:
-            folder = Path(scratch) / FOLDERS[part].name
-            folder.mkdir()
-            for each in FOLDERS[part].iterdir():
-                (folder / each.name).symlink_to(each)
-            write_camera(folder / "camera.toml", type(camera)(**{**vars(camera), "readout_s": seconds}), fps=fps)
-            blocks = parse_blocks(f"{folder}?offsets=0-{options.starts - 1}")
-            source = own_masks(options.trackers[0], part)
-            runs = evaluate(options.trackers[0], source, blocks, results=RunStore(Path(scratch) / "runs"))
-        told.append(f"{1e3 * seconds:g} ms: {1e3 * np.median([run.ate_m for run in runs.values()]):.1f} mm")
-    return f"{options.trackers[0]}, {part}, by readout: {', '.join(told)}"
+    lost = max(1 - run.coverage for run in outcomes[0].values())
+    return f"{tracker}, {part}: {compared(outcomes[0], outcomes[1])}; {', '.join(medians)}; most frames lost {lost:.1%}"
 
 
 def main() -> None:
@@ -97,18 +77,15 @@ def main() -> None:
     parser.add_argument("trackers", nargs="*", metavar="TRACKER", default=["orb-slam2"])
     parser.add_argument("--part", nargs="+", default=[*FOLDERS, "fast"], choices=[*FOLDERS, "fast"])
     parser.add_argument("--starts", type=int, default=12)
-    parser.add_argument("--readouts", nargs="+", type=float)
     parser.add_argument("--rival", action="store_true")
     parser.add_argument("--results", type=Path, default=Path("results/rolling_shutter"))
     options = parser.parse_args()
     for part in options.part:
         if part != "fast" and not FOLDERS[part].is_dir():
             sys.stdout.write(f"{part}: not judged, no recording under {SHARED}\n")
-        elif options.readouts:
-            sys.stdout.write(f"{readouts(part, options)}\n")
         else:
             for tracker in options.trackers:
-                sys.stdout.write(f"{worth(tracker, part, options)}\n")
+                sys.stdout.write(f"{effect(tracker, part, options)}\n")
         sys.stdout.flush()
 
 

@@ -2,14 +2,13 @@
 
     python tests/benchmarks/shipped_presets.py [TRACKER ...] [--part rendered bonn fr1] [--results FOLDER]
 
-Both run block by block in turn, so that whatever else the machine does slows them alike. Rendered scenes are instances
-that no choice has seen, two start offsets each; the Bonn excerpt has 23 start offsets, others than the choice saw; the
-fr1 excerpts, with nobody in view, have four each, likewise. Masks, where a tracker asks for them, are YOLO's on Bonn
-and the embedded network's elsewhere. Recordings are looked for in ``../shared``; what is not there is named. Ratios
-are preset : default, with 95 % intervals over scenes (over starts where there is one scene). "Not worse" is said where
-the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in anything differ by 0.12 to
-0.27 in the logarithm: a closer margin takes hundreds of runs.
-"""
+Both run instance by instance in turn, so that whatever else the machine does slows them alike. Rendered scenes are
+instances that no choice has seen, two start offsets each; the Bonn excerpt has 23 start offsets, others than the
+choice saw; the fr1 excerpts, with nobody in view, have four each, likewise. Masks, where a tracker asks for them, are
+YOLO's on Bonn and the embedded network's elsewhere. Recordings are looked for in ``../shared``; what is not there is
+named. Ratios are preset : default, with 95 % intervals over scenes (over starts where there is one scene). "Not
+worse" is said where the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in
+anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes hundreds of runs."""
 
 from __future__ import annotations
 
@@ -19,10 +18,10 @@ from pathlib import Path
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs import RunStore
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning.blocks import Block, parse_blocks
 from dynslam_bench.tuning.evaluate import Outcome, evaluate
+from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
 from dynslam_bench.tuning.objectives import SPEED
-from dynslam_bench.tuning.ratio import compared
+from dynslam_bench.tuning.summary import compared
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 NETWORK = SHARED / "weights/yolov8n-seg_480x640_fp32.onnx"
@@ -45,12 +44,12 @@ def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> 
     spec = TRACKERS.get(tracker)
     network = f"onnx:{NETWORK}" if part == "bonn" else "embedded"
     source = {name: network for name in field_names(spec.settings) if name == "segmentation.source"}
-    blocks = [block for text in PARTS[part] for block in parse_blocks(text)]
+    instances = [instance for text in PARTS[part] for instance in parse_instances(text)]
     settings = [source, {**source, **spec.presets[preset]}]
-    outcomes: list[dict[Block, Outcome]] = [{}, {}]
-    for block in blocks:
+    outcomes: list[dict[ProblemInstance, Outcome]] = [{}, {}]
+    for instance in instances:
         for found, values in zip(outcomes, settings, strict=True):
-            found |= evaluate(tracker, values, [block], results=RunStore(options.results))
+            found |= evaluate(tracker, values, [instance], results=RunStore(options.results))
     default, own = outcomes
     error, time_taken = compared(own, default), compared(own, default, objective=SPEED)
     lost = max(1 - run.coverage for run in own.values())

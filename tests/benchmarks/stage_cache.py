@@ -31,7 +31,7 @@ def study(sequence: str, segmenter: str, trials: int, cache: bool, results: Path
     from dynslam_bench.tuning import SpaceSpec, StudySpec, run_study
 
     spec = StudySpec(
-        name="epipolar", tune=(sequence,), seeds=(0,), trials=trials, sampler="random", race="none",
+        name="epipolar", tune=(sequence,), seeds=(0,), trials=trials, sampler="random", pruner="none",
         min_coverage=None, cache=cache,
         space=SpaceSpec(include=("epipolar.threshold_px",), fixed={"segmentation.source": segmenter}),
     )  # fmt: skip
@@ -41,7 +41,7 @@ def study(sequence: str, segmenter: str, trials: int, cache: bool, results: Path
     store = RunStore(results)
     found, seconds = {}, []
     for trial in tuner.study.get_trials():
-        run_id = trial.user_attrs["blocks"][0][1]
+        run_id = trial.user_attrs["instances"][0][1]
         run = store.get(run_id), store.trajectory(run_id, "online"), trial.value
         found[trial.params["epipolar.threshold_px"]] = run
         seconds.append(trial.user_attrs["wall_s"])
@@ -65,9 +65,9 @@ def full_size(folder: Path) -> str:
     """Source of a Mask R-CNN of the published size with random weights."""
     import torch
 
-    from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig
-    from dynslam_bench.segmentation.networks.mask_rcnn.loading import save_network
-    from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
+    from dynslam_bench.segmentation.networks.backbone import NetworkConfig
+    from dynslam_bench.segmentation.networks.loading import save_network
+    from dynslam_bench.segmentation.networks.network import MaskRCNN
 
     torch.manual_seed(0)
     save_network(MaskRCNN(NetworkConfig()), folder / "resnet50.pt")

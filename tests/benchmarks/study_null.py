@@ -1,11 +1,11 @@
-"""What studies claim where nothing is better, and what the race costs: simulated studies.
+"""What studies claim where nothing is better, and what pruning saves: simulated studies.
 
     python tests/benchmarks/study_null.py [--studies 400]
 
-Whole studies (race, choice, held-out check) over runs from a noise model with the measured spread between starts: every
+Whole studies (trials, choice, held-out check) over runs from a noise model with the measured spread of starts: each
 setting is as good as the default, up to a share of 0.15 in log that differs from scene to scene. `best trial` is what a
-study without the choice on unseen blocks would go by: the best trial's own value. The second table races settings of
-which the best is known; a run is one of a configuration on one block.
+study without the choice on unseen instances would go by: the best trial's own value. The second table compares pruners
+on settings of which the best is known; a run is one of a configuration on one instance.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ def null(studies: int, spread: float, folder: Path) -> str:
     return f"{spread:24.2f}{shares}"
 
 
-def race(rule: str, studies: int, folder: Path) -> str:
-    """One line: regret of a race, and its runs."""
+def pruned(pruner: str, studies: int, folder: Path) -> str:
+    """One line: regret of a pruner, and its runs."""
     import simulated
 
     regret, runs = [], 0
     for seed in range(studies):
-        spec = simulated.make_spec(race=rule, trials=24, sampler_seed=seed)
-        tuner = simulated.SimulatedTuner(spec, folder / f"{rule}-{seed}", effect=simulated.valley, seed=seed)
+        spec = simulated.make_spec(pruner=pruner, trials=24, sampler_seed=seed)
+        tuner = simulated.SimulatedTuner(spec, folder / f"{pruner}-{seed}", effect=simulated.valley, seed=seed)
         regret.append(simulated.valley(tuner.run().best_trial.params))
         runs += tuner.runs - len(tuner.design.reference)
-    return f"{rule:24}{np.mean(regret):12.3f}{runs / studies:12.0f}"
+    return f"{pruner:24}{np.mean(regret):12.3f}{runs / studies:12.0f}"
 
 
 def main() -> None:
@@ -63,9 +63,9 @@ def main() -> None:
         print(f"{'sd between starts':24}{'best trial':>14}{'chosen':>14}{'Better':>14}")
         for spread in (0.24, 0.28, 0.31):
             print(null(studies, spread, Path(temporary)), flush=True)
-        print(f"\n{'race':24}{'regret':>12}{'runs':>12}")
-        for rule in ("none", "halving", "rejection", "wilcoxon"):
-            print(race(rule, max(1, studies // 10), Path(temporary)), flush=True)
+        print(f"\n{'pruner':24}{'regret':>12}{'runs':>12}")
+        for pruner in ("none", "halving", "wilcoxon"):
+            print(pruned(pruner, max(1, studies // 10), Path(temporary)), flush=True)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ def results(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def program(*arguments: object, **environment: str) -> subprocess.CompletedProcess[bytes]:
-    command = [sys.executable, "-m", "dynslam_bench.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "dynslam_bench", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, env={**os.environ, **environment}, check=False)
 
 

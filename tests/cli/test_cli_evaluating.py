@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from cli_errors import one_line
+from cli_helpers import one_line
 
 from dynslam_bench.evaluation import evaluate_files
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
-from dynslam_bench.runs.exchange.pose_tables import write_euroc, write_vslam_lab
+from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.runs.exchange.formats import write_euroc, write_vslam_lab
 from dynslam_bench.sequences import open_sequence
 
 

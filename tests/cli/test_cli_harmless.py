@@ -8,15 +8,18 @@ from pathlib import Path
 
 import pytest
 
-FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
+from dynslam_bench.runs import RunSpec, run_many
+
 HOSTILE = "\x1b[2J\x1b]0;owned\x07\u202egnp\n"
 
 
-@pytest.fixture
-def results(tmp_path: Path) -> Path:
-    """Two runs, one of which names itself and all it knows by escape sequences."""
-    folder = shutil.copytree(FIXTURE, tmp_path / "results")
-    path = folder / "runs" / "a7abe04996a79cc4" / "run.json"
+@pytest.fixture(scope="module")
+def stored(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs, the latest of which holds escape sequences in all of its texts."""
+    folder = tmp_path_factory.mktemp("results")
+    specs = [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)]
+    _, last = run_many(specs, results=folder)
+    path = folder / "runs" / last.run_id / "run.json"
     record = json.loads(path.read_text())
     record |= {"reason": HOSTILE, "notes": [HOSTILE], "command": [HOSTILE], "overrides": {HOSTILE: HOSTILE}}
     record["tracker"] |= {"id": HOSTILE, "label": HOSTILE}
@@ -25,13 +28,23 @@ def results(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture
+def results(stored: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(stored, tmp_path / "results", symlinks=True)
+
+
+def hostile_run(results: Path) -> str:
+    return next(path.parent.name for path in results.glob("runs/*/run.json") if "owned" in path.read_text())
+
+
 def harmless(text: str) -> bool:
     return not set(text) & {"\x1b", "\x07", "\u202e"}
 
 
-@pytest.mark.parametrize("arguments", [("list",), ("show", "a7ab"), ("list", "--json"), ("show", "a7ab", "--json")])
+@pytest.mark.parametrize("arguments", [("list",), ("show", "RUN"), ("list", "--json"), ("show", "RUN", "--json")])
 def test_names_are_shown_as_text(cli, results: Path, arguments: tuple[str, ...]) -> None:
-    code, out, err = cli("runs", *arguments, "--results", results)
+    run = hostile_run(results)
+    code, out, err = cli("runs", *[run if word == "RUN" else word for word in arguments], "--results", results)
     assert code == 0 and harmless(out + err) and "owned" in out
 
 
@@ -42,9 +55,9 @@ def test_errors_are_shown_as_text(cli, results: Path) -> None:
 
 
 def test_one_unreadable_record_is_named_and_the_others_are_listed(cli, results: Path) -> None:
-    (results / "runs" / "a7abe04996a79cc4" / "run.json").write_bytes(b"\xff\xfe")
+    (results / "runs" / hostile_run(results) / "run.json").write_bytes(b"\xff\xfe")
     code, out, err = cli("runs", "list", "--results", results)
-    assert code == 0 and "e7f8d4df9db4bb16" in out
+    assert code == 0 and "never-move" in out
     assert err.startswith("unreadable: ") and err.count("\n") == 1 and "is not a text file" in err
 
 

@@ -52,7 +52,7 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     pids = tmp_path / "pids"
     values = {"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}
     (tmp_path / "what.toml").write_text(text.format(**values).replace("'", '"'))
-    command = [sys.executable, "-m", "dynslam_bench.cli", *verb.split(), "what.toml"]
+    command = [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"]
     program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive)
     try:
         deadline = time.monotonic() + 300
@@ -74,7 +74,7 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
 
 def test_ctrl_c_while_everything_still_loads_is_one_line_and_stores_nothing(walk, tmp_path):
     """To the whole group, as a terminal sends it: the fork server is not hit, nothing counts as a crash."""
-    command = [sys.executable, "-m", "dynslam_bench.cli", "run", "never-move", str(walk), "--frames", "0:4"]
+    command = [sys.executable, "-m", "dynslam_bench", "run", "never-move", str(walk), "--frames", "0:4"]
     for delay in (0.3, 0.9):
         program = subprocess.Popen(
             command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive, start_new_session=True

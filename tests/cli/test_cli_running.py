@@ -13,46 +13,37 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from cli_errors import one_line
+from cli_helpers import one_line
 
-from dynslam_bench.cli import output, run_rows, running
+from dynslam_bench.cli import output, running, runs
 from dynslam_bench.cli.output import progress
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.segmentation import build_segmenter
 from dynslam_bench.segmentation.networks import checkpoints
 
 
-def test_a_row_says_what_was_run_and_where_it_comes_from(cli, walk):
+def test_a_row_names_the_part_the_settings_and_its_origin(cli, walk):
     command = ("run", "constant-velocity", walk, "--frames", "0:3", "--stride", "2", "--set", "frames=4")
-    code, out, _ = cli(*command, "--label", "my control")
-    assert code == 0 and "0:3, every 2nd" in out and "frames=4" in out and "from the store" not in out
-    code, out, _ = cli(*command)
-    assert code == 0 and "from the store" in out and "yes" in out.splitlines()[1]
+    assert "from the store" not in cli(*command, "--label", "my control")[1]
+    assert "from the store" in cli(*command)[1]
     (row,) = json.loads(cli(*command, "--json")[1])
     assert row["from_store"] is True and row["settings"] == "frames=4" and row["frames"] == "0:3, every 2nd"
     assert row["repeat"] == "seed 0"
-    listed = cli("runs", "list")[1]
-    assert "0:3, every 2nd" in listed and "frames=4" in listed and "from the store" not in listed
-    assert "my control" in cli("runs", "show")[1]
+    assert "0:3, every 2nd" in cli("runs", "list")[1] and "my control" in cli("runs", "show")[1]
     cli(*command, "--label", "another name")
     assert "another name [constant-velocity" in cli("runs", "show")[1]
 
 
-def test_frames_and_measured_time_are_said_before_the_run(cli, walk):
+def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(cli, walk):
     command = ("run", "constant-velocity", walk, "--set")
-    err = cli(*command, "frames=3")[2]
-    assert err.splitlines()[0] == "1 run, 4 frames"
-    err = cli(*command, "frames=4", "--offset", "0", "1")[2]
-    first = err.splitlines()[0]
-    told = re.fullmatch(
-        r"2 runs, 7 frames, about (\S+) (s|ms) \(stored runs on this machine took (\S+) (s|ms) a frame\)", first
-    )
-    assert told, first
-    whole, each = (float(told[n]) * {"s": 1.0, "ms": 0.001}[told[n + 1]] for n in (1, 3))
+    assert cli(*command, "frames=3")[2].splitlines()[0] == "1 run, 4 frames"
+    first = cli(*command, "frames=4", "--offset", "0", "1")[2].splitlines()[0]
+    times = re.findall(r"(\S+) (s|ms)\b", first.removeprefix("2 runs, 7 frames, about "))
+    total_s, frame_s = (float(value) * {"s": 1.0, "ms": 0.001}[unit] for value, unit in times)
     (record,) = [row for row in json.loads(cli("runs", "list", "--json")[1]) if row["settings"] == "frames=3"]
-    measured = json.loads((Path(record["folder"]) / "run.json").read_text())
-    assert each == pytest.approx(measured["wall_s"] / 4, rel=0.06) and whole == pytest.approx(7 * each, rel=0.12)
+    measured_s = json.loads((Path(record["folder"]) / "run.json").read_text())["wall_s"] / 4
+    assert frame_s == pytest.approx(measured_s, rel=0.06) and total_s == pytest.approx(7 * frame_s, rel=0.12)
     assert "frames" not in cli(*command, "frames=4")[2], "it is stored: nothing will be tracked"
     assert cli(*command, "frames=5", "--json")[2] == ""
 
@@ -63,7 +54,7 @@ def test_a_row_names_files_without_their_folders(cli, walk):
     assert code == 0 and "replay:groundtruth.txt" in out and str(walk) not in out
     (row,) = json.loads(cli(*command, "--json")[1])
     assert row["tracker"] == f"replay:{walk / 'groundtruth.txt'}", "scripts get the whole name"
-    assert run_rows.shown_cell("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
+    assert runs.shown_cell("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
         "a=1, s.source=onnx:net.onnx, v=ORBvoc.txt, r=recorded:n"
     )
 
@@ -71,41 +62,32 @@ def test_a_row_names_files_without_their_folders(cli, walk):
 def test_a_recording_without_ground_truth_says_where_its_trajectory_is(cli, walk, tmp_path):
     shutil.copytree(walk, tmp_path / "mine")
     (tmp_path / "mine" / "groundtruth.txt").unlink()
-    code, out, err = cli("run", "never-move", "mine")
-    told = err.splitlines()[-1]
-    assert code == 0 and "ok" in out and told.startswith("folder/mine has no ground truth")
-    assert len(read_tum(Path(told.rpartition(": ")[2]))) == 4
+    code, _, err = cli("run", "never-move", "mine")
+    assert code == 0 and len(read_tum(Path(err.splitlines()[-1].rpartition(": ")[2]))) == 4
 
 
-def test_a_folder_whose_camera_is_not_known_says_how_to_name_it(cli, walk, tmp_path):
+def test_a_folder_whose_camera_is_not_known_names_the_choices(cli, walk, tmp_path):
     shutil.copytree(walk, tmp_path / "mine")
     (tmp_path / "mine" / "camera.toml").rename("cam.toml")
-    code, _, err = cli("run", "never-move", "mine")
-    first, *options = err.splitlines()
-    assert code == 1 and "the camera of" in first and len(options) == 2 and "tum-fr1" in options[0]
-    assert cli("run", "never-move", "mine", "--camera", "cam.toml")[0] == 0
+    for command in (("run", "never-move", "mine"), ("sequences", "verify", "mine")):
+        code, _, err = cli(*command)
+        assert code == 1 and len(err.splitlines()) == 3 and "tum-fr1" in err
+        assert cli(*command, "--camera", "cam.toml")[0] == 0
 
 
-def test_runs_list_refuses_what_is_not_there(cli, walk):
-    code, out, err = cli("runs", "list", "--results", "nowhere")
-    assert code == 1 and out == "" and "there are no runs in" in one_line(err)
-    assert cli("run", "never-move", walk)[0] == 0
-    code, _, err = cli("runs", "list", "--status", "crashd")
-    assert code == 1 and "unknown status 'crashd' (did you mean 'crashed'?)" in one_line(err)
-
-
-def test_a_mistake_is_one_line_and_leaves_nothing(cli, walk):
-    for arguments in (
-        ("run", "mask-rcnn", walk, "--set", "segmentation.source=onnx:none.onnx"),
-        ("run", "mask-rcnn", walk, "--set", "segmentation.source=oracle"),
-        ("run", "replay:none.txt", walk),
-        ("run", "orb-slam2", walk, "--map", "none.npz"),
-        ("run", "orb-slam2", walk, "--localisation-only"),
-        ("run", "never-move", walk, "--map", "none.npz"),
-    ):
-        code, _, err = cli(*arguments)
-        assert code == 1 and one_line(err)
-        assert "there are no runs" in cli("runs", "list")[2]
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("mask-rcnn", "--set", "segmentation.source=onnx:none.onnx"),
+        ("mask-rcnn", "--set", "segmentation.source=oracle"),
+        ("replay:none.txt",),
+        ("orb-slam2", "--map", "none.npz"),
+        ("orb-slam2", "--localisation-only"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(cli, walk, tmp_path, arguments):
+    code, _, err = cli("run", arguments[0], walk, *arguments[1:])
+    assert code == 1 and one_line(err) and not list(tmp_path.glob("results/runs/*"))
 
 
 @pytest.fixture
@@ -134,29 +116,19 @@ def published(tmp_path, monkeypatch):
 def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, published, monkeypatch):
     command = ("run", "mask-rcnn", walk)
     code, out, err = cli(*command)
-    first, *options = err.splitlines()
-    assert code == 1 and not out and not published.exists() and "there are no runs" in cli("runs", "list")[2]
-    assert first.startswith("error: no masks for 'folder/walk'") and "170 MB" in first
-    assert len(options) == 4 and all(re.match("  - .{20,130}$", option) for option in options)
-    questions = []
-    monkeypatch.setattr(running, "can_ask", lambda: True)
-    monkeypatch.setattr(running.typer, "confirm", lambda text, **_: questions.append(text))
-    assert cli(*command)[0] == 1 and len(questions) == 1 and not published.exists(), "answered no"
-    monkeypatch.setattr(running, "can_ask", lambda: False)
-    code, out, _ = cli(*command, "--yes", "--json")
-    assert code == 0 and published.is_file()
-    (row,) = json.loads(out)
-    assert (row["status"], row["segmentation"]) == ("ok", "coco")
-    assert cli("run", "mask-rcnn", walk, "--frames", "0:3")[0] == 0, "nobody is asked again"
-
-
-def test_who_agrees_on_a_terminal_gets_the_download(published, monkeypatch, capsys):
-    monkeypatch.setattr(running, "can_ask", lambda: True)
+    _, *options = err.splitlines()
+    assert code == 1 and not out and not published.exists() and len(options) == 4
+    monkeypatch.setattr(running, "is_interactive", lambda: True)
+    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
+    code, _, err = cli(*command)
+    assert code == 1 and "170 MB" in err and str(published.parent) in err and not published.exists()
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
-    error = build_segmenter.NetworkNotFetched("no masks")
-    assert running.agreed_to_fetch(error.checkpoint)
-    told = capsys.readouterr().err
-    assert "170 MB" in told and error.checkpoint.url in told and str(published.parent) in told
+    (row,) = json.loads(cli(*command, "--json")[1])
+    assert (row["status"], row["segmentation"]) == ("ok", "coco") and published.is_file()
+    published.unlink()
+    monkeypatch.setattr(running, "is_interactive", lambda: False)
+    assert cli(*command, "--frames", "0:3", "--yes")[0] == 0 and published.is_file()
+    assert cli(*command, "--frames", "0:2")[0] == 0, "nobody is asked again"
 
 
 def test_bench_has_limits(cli, walk, tmp_path):
@@ -172,28 +144,22 @@ def test_bench_has_limits(cli, walk, tmp_path):
     assert code == 3 and json.loads(out)[0]["status"] in ("timeout", "out-of-memory")
 
 
-def test_sheet_and_video_of_a_stored_run_are_made(cli, walk, tmp_path):
+def test_pictures_of_a_stored_run_are_made(cli, walk):
     (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
     folder = Path(row["folder"])
-    assert row["status"] == "ok", row
-    assert not (folder / "sheet.png").exists()
-    (row,) = json.loads(cli("run", "orb-slam2", walk, "--sheet", "--json")[1])
-    assert row["from_store"] is False and (folder / "sheet.png").is_file()
-    (row,) = json.loads(cli("run", "orb-slam2", walk, "--sheet", "--json")[1])
-    assert row["from_store"] is True
-    assert not (folder / "video.webm").exists()
-    (row,) = json.loads(cli("run", "orb-slam2", walk, "--video", "--json")[1])
-    assert Path(row["folder"]) == folder and (folder / "video.webm").read_bytes().startswith(b"\x1aE\xdf\xa3")
+    for option, name in (("--sheet", "sheet.png"), ("--video", "video.webm")):
+        assert not (folder / name).exists()
+        (row,) = json.loads(cli("run", "orb-slam2", walk, option, "--json")[1])
+        assert row["from_store"] is False and Path(row["folder"]) == folder and (folder / name).is_file()
+        assert json.loads(cli("run", "orb-slam2", walk, option, "--json")[1])[0]["from_store"] is True
+    assert (folder / "video.webm").read_bytes().startswith(b"\x1aE\xdf\xa3")
     assert cli("run", "never-move", walk, "--sheet")[0] == 0
-    assert "no sheet.png: the tracker offers neither keyframes nor a map" in cli("runs", "show")[1]
-    assert json.loads(cli("run", "never-move", walk, "--sheet", "--json")[1])[0]["from_store"] is True
+    assert "no sheet.png: " in cli("runs", "show")[1]
 
 
-def test_a_map_that_cannot_be_had_is_said_and_no_success(cli, walk):
-    for options in ((), ("--json",)):
-        code, _, err = cli("run", "never-move", walk, "--save-map", *options)
-        assert code == 3 and "no map.npz: tracker 'never-move' cannot save its map" in err
-        assert err.count("\n") == (1 if options else 2), "without --json also how many frames it has"
+def test_a_map_that_cannot_be_had_is_no_success(cli, walk):
+    code, _, err = cli("run", "never-move", walk, "--save-map", "--json")
+    assert code == 3 and err.startswith("no map.npz: ") and err.count("\n") == 1
     code, out, err = cli("run", "orb-slam2", walk, "--save-map")
     assert code == 0 and "no map.npz" not in err and "map.npz" in out
 
@@ -204,85 +170,45 @@ def test_a_run_that_was_lost_is_no_success(cli, walk):
     assert json.loads(out)[0]["status"] == "lost" and code == 3
 
 
-def test_people_who_watch_are_told_of_a_long_way_without_loop_closing(cli, walk, monkeypatch):
+def test_a_long_path_without_loop_closing_is_noted(cli, walk, monkeypatch):
     notes: list[str] = []
     monkeypatch.setattr(running, "note", notes.append)
 
-    def told(tracker, *settings, frames="0:4"):
+    def noted(tracker, *settings, frames="0:4"):
         notes.clear()
         assert cli("run", tracker, walk, "--frames", frames, *settings)[0] in (0, 3)
-        return [text for text in notes if "without loop closing" in text]
+        return any("without loop closing" in text for text in notes)
 
-    assert not told("orb-slam2", frames="0:3"), "its way is short"
-    monkeypatch.setattr(run_rows, "LONG_WAY_M", 0.001)
-    (text,) = told("orb-slam2")
-    assert text.startswith("1 of 1 runs went more than 0 m, the first 0 m on folder/walk, without")
-    assert not told("orb-slam2"), "it was said when it was run"
-    assert not told("orb-slam2", "--set", "backend.loop_closing.enabled=true")
-    assert not told("orb-slam2-mono"), "its unit of length is not known"
-    assert not told("constant-velocity"), "it has no loops to close"
+    assert not noted("orb-slam2", frames="0:3"), "its path is short"
+    monkeypatch.setattr(runs, "LONG_PATH_M", 0.001)
+    assert noted("orb-slam2") and not noted("orb-slam2"), "of new runs only"
+    assert not noted("orb-slam2", "--set", "backend.loop_closing.enabled=true")
+    assert not noted("orb-slam2-mono"), "its unit of length is not known"
+    assert not noted("constant-velocity"), "it has no loop closing"
 
 
-def test_show_counts_frames_that_were_initialising_and_closed_loops(cli, walk):
+def test_show_counts_closed_loops(cli, walk):
     (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
-    out = cli("runs", "show")[1]
-    assert "initialising" not in out and re.search(r"^loops closed +0$", out, re.MULTILINE), out
-    folder = Path(row["folder"])
-    record = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps(record | {"n_initialising": 3}))
-    heading, *lines = (folder / "frames.csv").read_text().splitlines()
-    at = heading.split(",").index("stat_loops")
+    assert re.search(r"^loops closed +0$", cli("runs", "show")[1], re.MULTILINE)
+    table = Path(row["folder"]) / "frames.csv"
+    heading, *lines = table.read_text().splitlines()
     cells = lines[-1].split(",")
-    last = ",".join([*cells[:at], "2.0", *cells[at + 1 :]])
-    (folder / "frames.csv").write_text("\n".join([heading, *lines[:-1], last, ""]))
-    out = cli("runs", "show")[1]
-    assert re.search(r"^initialising +3$", out, re.MULTILINE)
-    assert re.search(r"^loops closed +2$", out, re.MULTILINE)
-    (folder / "frames.csv").write_text("damaged")
+    cells[heading.split(",").index("stat_loops")] = "2.0"
+    table.write_text("\n".join([heading, *lines[:-1], ",".join(cells), ""]))
+    assert re.search(r"^loops closed +2$", cli("runs", "show")[1], re.MULTILINE)
+    table.write_text("damaged")
     code, out, _ = cli("runs", "show")
-    assert code == 0 and "loops" not in out
-    cli("run", "never-move", walk)
-    assert "loops" not in cli("runs", "show")[1]
+    assert code == 0 and "loops closed" not in out
 
 
-def test_info_tells_a_program_what_it_may_set(cli):
-    described = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])["parameters"]
-    by_name = {each["name"]: each for each in described}
-    threshold = by_name["segmentation.confidence"]
-    assert (threshold["low"], threshold["high"], threshold["scale"], threshold["online"]) == (0.1, 0.9, "linear", True)
-    assert by_name["segmentation.schedule"]["choices"] == ["every", "every_nth", "keyframes"]
-    assert by_name["segmentation.dilation_px"]["unit"] == "px"
-    assert by_name["segmentation.source"] == {
-        "name": "segmentation.source",
-        "default": "auto",
-        "tunable": False,
-        "online": False,
-    }
-
-
-def test_info_says_what_a_preset_sets(cli):
-    told = " ".join(cli("trackers", "info", "mask-rcnn")[1].split())
-    assert "segmentation.schedule=every_nth, segmentation.n=2, segmentation.crowded_share=0.5)" in told
-    facts = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])
-    assert facts["presets"] == {"fast": {"segmentation.schedule": "every_nth", "segmentation.n": 2, "flow.budget": 24}}
-
-
-def test_progress_where_nobody_watches(capsys, monkeypatch):
+def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
     monkeypatch.setattr(output, "HEARTBEAT_S", 0.05)
     with progress("3 runs") as advance:
         advance(1.5, 3, "orb-slam2 on walk, frame 5 of 10")
         time.sleep(0.4)
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) >= 2 and said[0].startswith("3 runs: 1.5 of 3, about ")
-    assert "(orb-slam2 on walk, frame 5 of 10)" in said[0]
-    with progress("reading runs") as advance:
-        advance(2.0, 3)
-        counted, deadline = "", time.monotonic() + 10
-        while "2 of 3" not in counted and time.monotonic() < deadline:
-            time.sleep(0.02)
-            counted += capsys.readouterr().err
-    assert "reading runs: 2 of 3, about " in counted
-    capsys.readouterr()
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= 2 and lines[0].startswith("3 runs: 1.5 of 3, about ")
+    assert "(orb-slam2 on walk, frame 5 of 10)" in lines[0]
     with progress("nothing"):
         pass
     assert capsys.readouterr().err == ""
@@ -291,18 +217,13 @@ def test_progress_where_nobody_watches(capsys, monkeypatch):
 def test_with_json_nothing_but_errors_goes_to_standard_error(cli, capsys, monkeypatch):
     monkeypatch.setattr(output, "HEARTBEAT_S", 0.01)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(output, "_for_scripts", True)
+    monkeypatch.setattr(output, "_json_mode", True)
     with output.progress("things") as advance, output.heartbeat() as beat:
         advance(1, 3)
         time.sleep(0.1)
-        beat("still there")
+        beat("still running")
         output.note("one of them")
     assert capsys.readouterr().err == ""
     assert cli("protocols", "list", "--json")[2] == ""
-    output.note("seen")  # that command is over
-    assert capsys.readouterr().err == "seen\n"
-
-
-@pytest.mark.parametrize("argument", ["abc", "-1"])
-def test_limits_are_numbers(cli, walk, argument):
-    assert cli("run", "never-move", walk, "--memory-limit", argument)[0] == 2
+    output.note("text")  # that command is over
+    assert capsys.readouterr().err == "text\n"

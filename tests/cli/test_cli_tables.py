@@ -1,11 +1,9 @@
 """What a terminal shows: tables as wide as it is, no Markdown, a leaderboard, grouped help, completion."""
 
-import json
-
 import pytest
-from cli_errors import one_line
+from cli_helpers import one_line
 
-from dynslam_bench.cli import output, run_rows
+from dynslam_bench.cli import output, runs
 from dynslam_bench.cli.output import fitted, write_table
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
 
@@ -52,11 +50,10 @@ def test_a_reports_table_has_no_markup(capsys):
     assert max(map(len, out.splitlines())) <= 120
 
 
-def test_an_error_of_the_tracked_frames_alone_is_said_to_be_one(capsys):
+def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
     def shown(coverage):
-        row = dict.fromkeys((*run_rows.TITLES, *run_rows.WHERE_SAID), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
-        row |= {"static_camera_ate_rmse_m": 0.2}
-        run_rows.show_rows([row], None, "p", as_json=False)
+        row = dict.fromkeys((*runs.TITLES, *runs.OPTIONAL), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
+        runs.show_rows([row | {"static_camera_ate_rmse_m": 0.2}], None, "p")
         return capsys.readouterr().out
 
     assert "of the tracked frames alone" in shown(0.5) and "tracked frames" not in shown(1.0)
@@ -81,26 +78,6 @@ def test_help_is_grouped(cli):
     out = cli("--help")[1]
     places = [out.index(title) for title in ("Begin here", "Run and measure", "Report and tune", "Extend and care")]
     assert places == sorted(places) and "─ Commands" not in out
-    out = cli("run", "--help")[1]
-    assert all(title in out for title in ("Which frames", "The tracker's settings", "The machine", "What is kept"))
-
-
-def test_sequences_are_listed_by_data_set_and_the_heading_holds_for_all_of_them(cli):
-    listed = json.loads(cli("sequences", "list", "--json")[1])
-    groups = {each["dataset"]: [] for each in listed}
-    for each in listed:
-        groups[each["dataset"]].append(each)
-    out = cli("sequences", "list")[1]
-    blocks = [block.splitlines() for block in out.strip().split("\n\n")]
-    assert [len(block) - 2 for block in blocks] == [len(group) for group in groups.values()] and len(blocks) == 9
-    for (heading, columns, *rows), (title, group) in zip(blocks, groups.items(), strict=True):
-        assert len({(each["license"], each["layout"], each["by_hand"]) for each in group}) == 1, title
-        assert heading.startswith(f"{title} ({len(group)} listed, ") and f"licence: {group[0]['license']}" in heading
-        assert ("layout: " in heading) == (title != "rendered rooms with exact poses, masks and flow")
-        assert [row.split()[0] for row in rows] == [each["id"] for each in group]
-        assert columns.split()[:4] == ["sequence", "here", "size", "tags"] and all(each["size"] for each in group)
-    static = cli("sequences", "list", "synthetic/*", "--tag", "static")[1]
-    assert "synthetic/fast_spin" in static and "synthetic/fast_walking" not in static
 
 
 @pytest.mark.parametrize(
@@ -123,41 +100,3 @@ def test_the_shell_completes(cli, monkeypatch, words, expected):
     code, out, _ = cli()
     found = set(out.split())
     assert code == 0 and (expected <= found if expected else not found), out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["sequences", "list", "--tag", "dynamic"], "no sequence has the tag 'dynamic' (known: "),
-        (["sequences", "list", "tum/fr3/wlking_xyz"], "did you mean 'tum/fr3/walking_xyz'"),
-        (["runs", "rm", "--failed", "--results", "nowhere"], "there are no runs in"),
-        (["runs", "list", "--results", "nowhere"], "there are no runs in"),
-        (["run", "replay:nowhere.txt", "synthetic/sitting_xyz?frames=3"], "nowhere.txt"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--frames", "2:2"], "2:2"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--degrade", "blur=-1"], "blur"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--camera", "tum-fr9"], "camera"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--device", "gpu"], "gpu"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--time-limit", "-1"], "time"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--retry", "craashed"], "craashed"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--seed", "-1"], "seed"),
-        (["run", "never-move", "synthetic/sitting_xyz?frames=3", "--degrade", "blur=nan"], "blur"),
-        (["bench", "smoke", "--tracker", "orb-slm2"], "did you mean 'orb-slam2'"),
-        (["report", "compare", "nowhere", "nowhere"], "nowhere"),
-    ],
-)
-def test_wrong_input_is_refused_in_one_line(cli, tmp_path, arguments, words):
-    code, out, err = cli(*arguments)
-    assert code in (1, 2) and out == "" and words in err and "Traceback" not in err, err
-    assert not (tmp_path / "results").exists() or not list((tmp_path / "results").glob("runs/*"))
-
-
-def test_a_folder_without_a_camera_needs_one_named(cli, walk, tmp_path):
-    import shutil
-
-    copy = shutil.copytree(walk, tmp_path / "walk")
-    (copy / "camera.toml").rename(tmp_path / "mine.toml")
-    code, _, err = cli("sequences", "verify", copy)
-    assert code == 1 and "is not known" in err and err.count("--camera") == 2
-    assert cli("sequences", "verify", copy, "--camera", tmp_path / "mine.toml")[0] == 0
-    code, _, err = cli("sequences", "verify", copy, "--camera", "tum-fr9")
-    assert code == 1 and "tum-fr9" in one_line(err)

@@ -4,19 +4,28 @@ import json
 from pathlib import Path
 
 import pytest
-from cli_errors import one_line
+from cli_helpers import one_line
 
 from dynslam_bench.trackers import TRACKERS
 
 
-def test_trackers_list_and_info(cli):
-    _, out, _ = cli("trackers", "list", "--json")
-    ids = {each["id"]: each for each in json.loads(out)}
-    assert {"never-move", "orb-slam2", "mask-rcnn", "emfoa-oft", "orbslam3"} <= set(ids)
-    _, out, _ = cli("trackers", "info", "orb-slam2")
-    assert "| setting | default |" in out and "provenance" in out
-    _, out, _ = cli("trackers", "info", "orb-slam2", "--json")
-    assert json.loads(out)["settings"]
+def test_the_list_fits_one_screen_and_holds_every_tracker(cli):
+    rows = {row["id"]: row for row in json.loads(cli("trackers", "list", "--json")[1])}
+    assert {"never-move", "orb-slam2", "mask-rcnn", "emfoa-oft", "orbslam3"} <= set(rows)
+    lines = cli("trackers", "list")[1].splitlines()
+    assert len(lines) < 50
+    shown = "\n".join(lines)
+    assert [name for name in rows if "?" not in name and f"  {name} " not in shown] == []
+    assert [name for name in rows if name.partition("?")[2] and name[name.index("?") :] not in shown] == []
+
+
+def test_info_describes_settings_and_presets(cli):
+    assert "| setting | default |" in cli("trackers", "info", "orb-slam2")[1]
+    facts = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])
+    by_name = {setting["name"]: setting for setting in facts["parameters"]}
+    threshold = by_name["segmentation.confidence"]
+    assert (threshold["low"], threshold["high"], threshold["scale"]) == (0.1, 0.9, "linear")
+    assert by_name["segmentation.source"]["tunable"] is False and facts["presets"]["fast"]["flow.budget"] == 24
 
 
 def test_trackers_info_tells_what_others_report_and_where(cli):

@@ -21,7 +21,7 @@ from dynslam_bench.contracts.checks import (
 from dynslam_bench.features.registry import FeatureSpec
 from dynslam_bench.flow.registry import FlowSpec
 from dynslam_bench.geometry import se3
-from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
+from dynslam_bench.segmentation.build_segmenter import SegmenterContext, SegmenterSpec
 from dynslam_bench.sequences import DatasetSpec
 
 HEAVY = ("torch", "cv2", "numba", "scipy", "gymnasium", "optuna", "pandas")

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from dynslam_bench.core.address import check_address
-from dynslam_bench.core.download import download
+from dynslam_bench.core.download import check_address, download
 from dynslam_bench.core.errors import DownloadError
 
 

@@ -23,7 +23,7 @@ def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pyte
 
 
 def test_kernels_are_cached_and_release_the_lock() -> None:
-    from dynslam_bench.slam.mapping import map_kernels
+    from dynslam_bench.slam import map_kernels
 
     options = map_kernels.project.targetoptions
     assert options["nogil"] and map_kernels.project.stats.cache_path

@@ -15,10 +15,17 @@ from faults import survey, tree
 
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.files import atomic_folder, replace_folder, sweep_temporary, write_atomic
-from dynslam_bench.core.locks import claimed, is_abandoned
+from dynslam_bench.core.files import (
+    TemporaryFolder,
+    atomic_folder,
+    claimed,
+    is_abandoned,
+    replace_folder,
+    sweep,
+    sweep_temporary,
+    write_atomic,
+)
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.core.temporary import TemporaryFolder, sweep
 
 BODY = bytes(range(256)) * 40
 
@@ -163,15 +170,3 @@ def test_temporary_folders_go_with_their_process(tmp_path: Path, monkeypatch: py
 
 def _one_of(found: object, *allowed: object) -> None:
     assert found in allowed
-
-
-def test_a_folder_that_goes_while_it_is_looked_at_stops_no_sweep(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its own process removes it at the same moment; the sweep is the fork server's, too."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    for name in ("dynslam-held-a", "dynslam-held-b"):
-        (tmp_path / name).mkdir()
-    monkeypatch.setattr(Path, "is_dir", lambda path: not (path.name.endswith("-a") and path.rmdir()))
-    sweep()
-    assert list(tmp_path.iterdir()) == []

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from dynslam_bench.core import plugin_probe
+from dynslam_bench.core import plugins as plugin_probe
 from dynslam_bench.core.errors import PluginError
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, Registry, load_object
 

@@ -114,11 +114,6 @@ def test_a_text_stays_the_text_that_it_is(text):
     assert apply_overrides(Texts(choice="34"), {"choice": "2"}).choice == 2
 
 
-def test_unknown_keys_of_a_file_are_errors():
-    with pytest.raises(SettingsError, match=r"unknown setting 'epipolar.tresh'.*did you mean"):
-        build(Root, {"epipolar": {"tresh": 1}})
-
-
 def test_settings_are_frozen_and_tables_hold_every_leaf():
     with pytest.raises(Exception, match="frozen"):
         Root().features = 5

@@ -88,7 +88,7 @@ def scene(
     before = CAMERA.project(previous_points) + rng.normal(0, noise_px, xy.shape)
     visible = (before > 5).all(axis=1) & (before < (634, 474)).all(axis=1)
     visible &= on_top(xy, z) & on_top(before, previous_points[:, 2])
-    xy, z, moving, before, previous_points = (each[visible] for each in (xy, z, moving, before, previous_points))
+    xy, z, moving, before, previous_points = (array[visible] for array in (xy, z, moving, before, previous_points))
     frame = bundle(xy, z, splat(xy, z), 1.0)
     previous = bundle(before, previous_points[:, 2], splat(before, previous_points[:, 2]), 1.0 - 1 / 30)
     state = FilterState(
@@ -109,14 +109,24 @@ def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> In
     return Instances(mask, np.array([[x0, y0, x1, y1]], np.float32), (name,), np.ones(1, np.float32))
 
 
+def on_rectangle(made: Scene | FrameBundle, x0: int, y0: int, x1: int, y1: int) -> np.ndarray:
+    """Which keypoints, rounded to pixels, lie on a rectangle."""
+    frame = made.frame if isinstance(made, Scene) else made
+    x, y = np.rint(frame.keypoints.xy).T
+    return (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+
+
 def keyframe(T_world_cam: np.ndarray, depth: np.ndarray, timestamp: float) -> KeyframeView:
     empty = np.zeros((0, 2))
     return KeyframeView(T_world_cam, keypoints(empty), empty, np.zeros(0, np.float32), depth, timestamp)
 
 
-def on_box(made: Scene) -> np.ndarray:
-    x, y = made.frame.keypoints.xy.T
-    return (x >= BOX[0]) & (x < BOX[2]) & (y >= BOX[1]) & (y < BOX[3])
+def at_rest(frame: FrameBundle, previous: FrameBundle | None = None, keyframes: tuple = ()) -> FilterState:  # type: ignore[type-arg]
+    """The state of a camera at rest at the origin."""
+    pose = np.eye(4)
+    return FilterState(
+        CAMERA, np.ones(len(frame), bool), previous=previous, T_world_prev=pose, T_world_pred=pose, keyframes=keyframes
+    )
 
 
 def texture(seed: int) -> np.ndarray:

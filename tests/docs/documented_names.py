@@ -132,5 +132,5 @@ def links() -> Iterator[Mention]:
 
 
 def exists(path: str) -> bool:
-    """Whether a path is there, from the root, from the package, or from a room (``culling/blocks/epipolar.py``)."""
+    """Whether a path is there, from the root, from the package, or from a room (``culling/epipolar.py``)."""
     return any((base / path).exists() for base in (ROOT, ROOT / "dynslam_bench", ROOT / "docs", ROOT.parent))

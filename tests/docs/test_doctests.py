@@ -17,10 +17,6 @@ def module_of(file: Path) -> str:
 WITH_EXAMPLES = [module_of(file) for file in sources() if ">>> " in file.read_text(encoding="utf-8")]
 
 
-def test_there_are_examples() -> None:
-    assert {"dynslam_bench.contracts", "dynslam_bench.core.settings"} <= set(WITH_EXAMPLES)
-
-
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
 def test_examples_give_what_they_say(name: str) -> None:
     outcome = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)

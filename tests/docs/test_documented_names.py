@@ -9,9 +9,6 @@ from typing import Any
 
 import typer.main
 from documented_names import (
-    IDENTIFIER,
-    PAGES,
-    ROOT,
     SUFFIXES,
     Mention,
     exists,
@@ -19,13 +16,11 @@ from documented_names import (
     in_docstrings,
     in_pages,
     links,
-    sources,
     words,
 )
 
 from dynslam_bench.cli.app import app
 from dynslam_bench.core.settings import field_names
-from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.testing.pytest_plugin import OPTIONS as CHECKED_KINDS
 from dynslam_bench.trackers import TRACKERS
 
@@ -103,19 +98,11 @@ def test_bare_file_names_exist() -> None:
     name = re.compile(rf"[\w-]*[A-Za-z_][\w-]*(?:\.[\w-]+)*\.{SUFFIXES}")
     named = [m for m in mentions() if name.fullmatch(m.text)]
     assert len(named) > 100
-    known = file_names() | set(FOREIGN_FILES)
-    assert not missing(named, known.__contains__)
-    assert missing([Mention("a page", "splitss.py"), Mention("a page", "runs.jsom")], known.__contains__)
-    assert not set(FOREIGN_FILES) & file_names(), "no exception without need"
+    assert not missing(named, (file_names() | set(FOREIGN_FILES)).__contains__)
 
 
 def test_links_lead_somewhere() -> None:
     assert not missing(list(links()), lambda text: Path(text).exists())
-
-
-def test_scripts_in_commands_exist() -> None:
-    named = [Mention(m.where, s) for m in mentions() for s in re.findall(r"python (tests/[\w/]+\.py)", m.text)]
-    assert not missing(named, exists)
 
 
 def test_settings_exist() -> None:
@@ -141,32 +128,7 @@ def test_identifiers_exist() -> None:
     assert not missing(named, lambda text: text in words() | FOREIGN or POSE.fullmatch(text) is not None)
 
 
-def test_dotted_symbols_exist() -> None:
-    dotted = re.compile(r"[A-Za-z_][\w]*(?:\.[A-Za-z_]\w*)+(?:\(.*\))?")
-    named = [m for m in mentions() if dotted.fullmatch(m.text)]
-    assert not missing(named, lambda text: _is_known(IDENTIFIER.findall(text.partition("(")[0])))
-
-
-def _is_known(parts: list[str]) -> bool:
-    return parts[0] in FOREIGN or all(part in words() for part in parts)
-
-
 def test_options_exist() -> None:
     option = re.compile(r"(?<![\w-])--[a-z][a-z_-]*")
     named = [Mention(m.where, found) for m in mentions() for found in option.findall(m.text)]
     assert not missing(named, lambda text: text in options())
-
-
-def test_hyphenated_ids_exist() -> None:
-    hyphenated = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+")
-    named = [m for m in mentions() if hyphenated.fullmatch(m.text)]
-    assert not missing(
-        named, lambda text: text in words() or text in {found.spec.id for found in TRACKERS.all()} or text in PROTOCOLS
-    )
-
-
-def test_extras_are_installed_from_the_checkout() -> None:
-    """This package is on no index yet: ``pip install 'dynslam-bench[x]'`` finds nothing."""
-    read = [*PAGES, *sources(), *sorted((ROOT / "examples").rglob("*.*"))]
-    texts = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8", errors="replace") for path in read}
-    assert len(texts) > 100 and [name for name, text in texts.items() if "dynslam-bench[" in text] == []

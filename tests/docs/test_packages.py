@@ -31,11 +31,6 @@ def test_every_package_is_listed(project: dict) -> None:
     assert set(project["tool"]["setuptools"]["packages"]) == found
 
 
-def test_every_extra_says_what_it_is_for_or_is_known(project: dict) -> None:
-    extras = project["project"]["optional-dependencies"]
-    assert {"rerun", "onnx", "bags", "tensorboard", "mlflow"} <= set(extras)
-
-
 def test_the_recipe_names_what_the_package_needs(project: dict) -> None:
     recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text()
     other = {"opencv-python-headless": "py-opencv", "torch": "pytorch"}

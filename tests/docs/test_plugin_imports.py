@@ -4,17 +4,15 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-from documented_names import PAGES, ROOT
+from documented_names import ROOT
 
-from dynslam_bench import contracts
 from dynslam_bench.testing.template import write_tracker_template
 
 OPEN = {"dynslam_bench.contracts", "dynslam_bench.core.settings", "dynslam_bench.core.errors"}
 COMPOSING = "dynslam_bench.trackers.systems.composition"
 """Puts filters on our back end: the one thing that a plug-in may take from us that is no contract."""
 
-RULES = "dynslam_bench.culling.blocks.semantic"
+RULES = "dynslam_bench.culling.semantic"
 """The filter that an own one is put beside."""
 
 
@@ -41,15 +39,3 @@ def test_the_template_imports_from_the_contracts_only(tmp_path: Path) -> None:
     found = imports(write_tracker_template("my-slam", tmp_path).read_text())
     assert ("dynslam_bench.contracts", "TrackerSpec") in found
     assert {module for module, _ in found} <= OPEN
-
-
-def test_every_page_takes_a_contract_from_the_contracts() -> None:
-    found = [(page.name, *each) for page in PAGES for code in blocks(page) for each in imports(code)]
-    assert len({page for page, _, _ in found}) > 2
-    assert [each for each in found if each[2] in contracts.__all__ and each[1] != "dynslam_bench.contracts"] == []
-
-
-@pytest.mark.parametrize("name", sorted(contracts.__all__))
-def test_every_contract_says_what_it_is(name: str) -> None:
-    value = getattr(contracts, name)
-    assert not isinstance(value, type) or (value.__doc__ or "").strip()

@@ -9,9 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
-from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.contracts.tracker import TrackerSpec, TrackResult
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera

@@ -15,7 +15,7 @@ from envs_toys import TARGET, ToySequence
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.envs import DegradeFrames, SlamEnv
 from dynslam_bench.testing import CornerSequence
-from dynslam_bench.trackers.adapters.opencv_odometry import unavailable
+from dynslam_bench.trackers.adapters.odometry import unavailable
 
 STILL = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
 PROGRAM = f"""
@@ -87,7 +87,7 @@ def test_copies_before_and_after_an_episode() -> None:
     assert ended.episode.over and ended.episode_metrics() == env.episode_metrics()
 
 
-@pytest.mark.parametrize("tracker", ["orb-slam2", "emfoa-oft-no-masks", "never-move", "dynaslam-g"])
+@pytest.mark.parametrize("tracker", ["orb-slam2", "emfoa-oft?masks=none", "never-move", "dynaslam-g"])
 def test_built_in_trackers_go_on_to_the_bit(tracker: str) -> None:
     env = started(SlamEnv(CornerSequence(6), tracker, threads=2), 3)
     twin = copy.deepcopy(env)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from envs_toys import CAMERA, TARGET, ToySequence, images
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.envs import STATS_LAYOUT, SlamEnv
-from dynslam_bench.envs.observation import MAX_DEPTH_M, ObservationContext, stats_observation, stats_space
+from dynslam_bench.envs.spaces import MAX_DEPTH_M, ObservationContext, stats_observation, stats_space
 from dynslam_bench.geometry import se3
 
 FRAME = Frame(3, 1.0, *images(3))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from envs_toys import TARGET, ToySequence
@@ -12,7 +11,7 @@ from envs_toys import TARGET, ToySequence
 import dynslam_bench.envs  # noqa: F401
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.envs import SlamEnv, SmallImages
-from dynslam_bench.envs.observation import MAX_DEPTH_M
+from dynslam_bench.envs.spaces import MAX_DEPTH_M
 
 
 def test_they_show_the_same_smaller() -> None:
@@ -50,8 +49,3 @@ def test_stable_baselines3_takes_it_without_a_word() -> None:
         checks.check_env(env)
     with pytest.warns(UserWarning, match="unconventional shape"):
         checks.check_env(SlamEnv(ToySequence(6), TARGET, observation="rgbd", control=["noise.level_m"]))
-
-
-def test_it_is_named_in_a_spec() -> None:
-    env = SmallImages(gym.make("dynslam/Sequence-v0", sequence=ToySequence(4), tracker=TARGET, observation="rgbd"))
-    assert env.spec is not None and env.spec.additional_wrappers[-1].kwargs == {"width": 80, "height": 60}

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.conditioning import RELIABLE_DEG
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG, align
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -99,22 +98,3 @@ def _pose(rotation: np.ndarray) -> np.ndarray:
     pose = np.eye(4)[None].copy()
     pose[0, :3, :3] = rotation
     return pose
-
-
-def test_a_short_straight_path_is_marked_too() -> None:
-    generator = np.random.default_rng(0)
-    along = np.linspace(0.0, 1.0, 20)
-
-    def stated(side: float) -> list[float]:
-        truth = np.tile(np.eye(4), (20, 1, 1))
-        truth[:, :3, 3] = np.c_[along, side * np.sin(3 * along), side * np.cos(5 * along)]
-        found = []
-        for _ in range(20):
-            estimate = truth.copy()
-            estimate[:, :3, 3] += generator.normal(0.0, 0.005, (20, 3))
-            uncertainty = align(estimate, truth, "se3").uncertainty_deg
-            assert uncertainty is not None
-            found.append(uncertainty)
-        return found
-
-    assert min(stated(0.001)) > RELIABLE_DEG > max(stated(0.2))

@@ -9,7 +9,7 @@ import pytest
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory_files import read_tum
 
 pytest.importorskip("evo")
 from evo.core import metrics, sync

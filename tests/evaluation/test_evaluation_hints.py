@@ -8,7 +8,7 @@ import pytest
 from dynslam_bench.evaluation import evaluate, hints
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import load_tum, write_tum
+from dynslam_bench.geometry.trajectory_files import load_tum, write_tum
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "trajectories"
 FR3 = "rgbd-vo/rgbd_dataset_freiburg3_"

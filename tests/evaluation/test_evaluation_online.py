@@ -24,15 +24,17 @@ def estimate_of(truth, seed=1):
     return se3.exp(rng.normal(size=6)) @ noisy
 
 
+TRUTH = walk()
+POSES = estimate_of(TRUTH)
+
+
 def run(error, truth, poses, ok):
     return [error.update(t, p, o) for t, p, o in zip(truth.timestamps, poses, ok, strict=True)]
 
 
 def test_cumulative_error_is_the_origin_aligned_ape():
-    truth = walk()
-    poses = estimate_of(truth)
-    samples = run(OnlineError(truth), truth, poses, [True] * len(truth))
-    result = evaluate(Trajectory(truth.timestamps, poses), truth, Protocol(id="x", alignment="origin"))
+    samples = run(OnlineError(TRUTH), TRUTH, POSES, [True] * len(TRUTH))
+    result = evaluate(Trajectory(TRUTH.timestamps, POSES), TRUTH, Protocol(id="x", alignment="origin"))
     assert np.sqrt(np.mean([s.trans_m**2 for s in samples])) == pytest.approx(result.metrics["ate_rmse_m"], abs=1e-12)
     assert max(s.rot_deg for s in samples) == pytest.approx(result.metrics["ape_rot_max_deg"], abs=1e-9)
     assert samples[0].trans_m == pytest.approx(0, abs=1e-12)
@@ -40,11 +42,9 @@ def test_cumulative_error_is_the_origin_aligned_ape():
 
 
 def test_frame_to_frame_error_is_eq_26_over_one_frame():
-    truth = walk()
-    poses = estimate_of(truth)
-    samples = run(OnlineError(truth), truth, poses, [True] * len(truth))
+    samples = run(OnlineError(TRUTH), TRUTH, POSES, [True] * len(TRUTH))
     protocol = Protocol(id="x", rpe=(RPESpec(delta=1, unit="f", pairs="all"),))
-    metrics = evaluate(Trajectory(truth.timestamps, poses), truth, protocol).metrics
+    metrics = evaluate(Trajectory(TRUTH.timestamps, POSES), TRUTH, protocol).metrics
     frame = np.array([s.frame_trans_m for s in samples[1:]])
     assert np.sqrt((frame**2).mean()) == pytest.approx(metrics["rpe_1f_trans_rmse_m"], abs=1e-12)
     rotation = np.array([s.frame_rot_deg for s in samples[1:]])
@@ -52,46 +52,39 @@ def test_frame_to_frame_error_is_eq_26_over_one_frame():
 
 
 def test_a_lost_frame_counts_as_the_last_tracked_pose_repeated():
-    truth = walk()
-    poses = estimate_of(truth)
-    ok = np.ones(len(truth), dtype=bool)
+    ok = np.ones(len(TRUTH), dtype=bool)
     ok[20:30] = False
-    samples = run(OnlineError(truth), truth, poses, ok)
-    moved = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
+    samples = run(OnlineError(TRUTH), TRUTH, POSES, ok)
+    moved = se3.inverse(TRUTH.T_world_cam[:-1]) @ TRUTH.T_world_cam[1:]
     way = np.linalg.norm(moved[:, :3, 3], axis=1)
     for i in range(20, 30):
         assert samples[i].frame_trans_m == pytest.approx(way[i - 1], abs=1e-12)
     assert [s.lost_way_m for s in samples[19:32]] == pytest.approx([0, *np.cumsum(way[19:29]), way[19:29].sum(), 0])
-    held = hold(Trajectory(truth.timestamps, poses).select(ok), truth.timestamps)
-    expected = run(OnlineError(truth), truth, held.T_world_cam, [True] * len(truth))
+    held = hold(Trajectory(TRUTH.timestamps, POSES).select(ok), TRUTH.timestamps)
+    expected = run(OnlineError(TRUTH), TRUTH, held.T_world_cam, [True] * len(TRUTH))
     assert [s.trans_m for s in samples] == pytest.approx([s.trans_m for s in expected], abs=1e-12)
     jumps = [[s.frame_trans_m for s in found[1:]] for found in (samples, expected)]
     assert jumps[0] == pytest.approx(jumps[1], abs=1e-12)
 
 
 def test_a_predicted_pose_of_a_lost_frame_counts_for_nothing():
-    truth = walk()
-    poses = estimate_of(truth)
-    ok = np.arange(len(truth)) < 25
-    without = [pose if good else None for pose, good in zip(poses, ok, strict=True)]
-    assert run(OnlineError(truth), truth, poses, ok) == run(OnlineError(truth), truth, without, ok)
+    ok = np.arange(len(TRUTH)) < 25
+    without = [pose if good else None for pose, good in zip(POSES, ok, strict=True)]
+    assert run(OnlineError(TRUTH), TRUTH, POSES, ok) == run(OnlineError(TRUTH), TRUTH, without, ok)
 
 
 def test_a_tracker_that_never_starts_stands_at_the_first_true_pose():
-    truth = walk()
-    samples = run(OnlineError(truth), truth, [None] * len(truth), [False] * len(truth))
-    way = np.linalg.norm(truth.positions - truth.positions[0], axis=1)
+    samples = run(OnlineError(TRUTH), TRUTH, [None] * len(TRUTH), [False] * len(TRUTH))
+    way = np.linalg.norm(TRUTH.positions - TRUTH.positions[0], axis=1)
     assert [s.trans_m for s in samples] == pytest.approx(way.tolist(), abs=1e-12)
 
 
 def test_joined_at_the_first_frame_that_has_both():
-    truth = walk()
-    poses = estimate_of(truth)
-    ok = np.arange(len(truth)) >= 5
-    samples = run(OnlineError(truth), truth, poses, ok)
+    ok = np.arange(len(TRUTH)) >= 5
+    samples = run(OnlineError(TRUTH), TRUTH, POSES, ok)
     assert samples[5].trans_m == pytest.approx(0, abs=1e-12)
-    late = OnlineError(truth.select(slice(10, None)))
-    joined = run(late, truth, poses, [True] * len(truth))
+    late = OnlineError(TRUTH.select(slice(10, None)))
+    joined = run(late, TRUTH, POSES, [True] * len(TRUTH))
     assert joined[:10] == [None] * 10
     assert joined[10].trans_m == pytest.approx(0, abs=1e-12)
     assert joined[10].frame_trans_m is None
@@ -99,11 +92,9 @@ def test_joined_at_the_first_frame_that_has_both():
 
 
 def test_holes_give_none_and_the_pose_goes_on():
-    truth = walk()
-    poses = estimate_of(truth)
-    hole = truth.select(np.r_[0:20, 30 : len(truth)])
-    whole = run(OnlineError(truth), truth, poses, [True] * len(truth))
-    samples = run(OnlineError(hole), truth, poses, [True] * len(truth))
+    hole = TRUTH.select(np.r_[0:20, 30 : len(TRUTH)])
+    whole = run(OnlineError(TRUTH), TRUTH, POSES, [True] * len(TRUTH))
+    samples = run(OnlineError(hole), TRUTH, POSES, [True] * len(TRUTH))
     assert samples[20:30] == [None] * 10
     assert samples[30].frame_trans_m is None
     assert samples[30].trans_m == pytest.approx(whole[30].trans_m, abs=1e-12)
@@ -111,13 +102,12 @@ def test_holes_give_none_and_the_pose_goes_on():
 
 
 def test_the_true_way_goes_straight_across_holes():
-    truth = walk()
-    seen = np.r_[0:20, 30 : len(truth)]
-    samples = run(OnlineError(truth.select(seen)), truth, estimate_of(truth), [True] * len(truth))
-    steps = np.linalg.norm(np.diff(truth.positions[seen], axis=0), axis=1)
+    seen = np.r_[0:20, 30 : len(TRUTH)]
+    samples = run(OnlineError(TRUTH.select(seen)), TRUTH, estimate_of(TRUTH), [True] * len(TRUTH))
+    steps = np.linalg.norm(np.diff(TRUTH.positions[seen], axis=0), axis=1)
     ways = [samples[index].way_m for index in seen]
     assert ways == pytest.approx([0.0, *np.cumsum(steps)], abs=1e-12)
-    whole = run(OnlineError(truth), truth, estimate_of(truth), [True] * len(truth))
+    whole = run(OnlineError(TRUTH), TRUTH, estimate_of(TRUTH), [True] * len(TRUTH))
     assert ways[-1] < whole[-1].way_m
 
 
@@ -129,14 +119,12 @@ def test_without_ground_truth_there_is_no_error():
 
 
 def test_causal_and_repeatable():
-    truth = walk()
-    poses = estimate_of(truth)
-    error = OnlineError(truth)
-    whole = run(error, truth, poses, [True] * len(truth))
+    error = OnlineError(TRUTH)
+    whole = run(error, TRUTH, POSES, [True] * len(TRUTH))
     error.reset()
-    other = poses.copy()
+    other = POSES.copy()
     other[30:] = np.eye(4)
-    assert run(error, truth, other, [True] * len(truth))[:30] == whole[:30]
+    assert run(error, TRUTH, other, [True] * len(TRUTH))[:30] == whole[:30]
 
 
 def test_the_tolerance_is_strict():

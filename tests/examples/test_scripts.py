@@ -53,5 +53,5 @@ def test_own_tracker_keeps_the_contract(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_ppo_trains_and_is_judged(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("stable_baselines3", reason="the extra [rl] is not installed")
-    main_of("ppo.py")(8, frames=4, rooms=1)
-    assert "settings as they are: -0.0" in (told := capsys.readouterr().out) and "after 8 steps" in told
+    main_of("ppo.py")(8, frames=4, scenes=1)
+    assert "default settings:" in (text := capsys.readouterr().out) and "after 8 steps" in text

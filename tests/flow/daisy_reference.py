@@ -12,7 +12,7 @@ import torch.nn.functional as functional
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dynslam_bench.flow.daisy import layout
+from dynslam_bench.flow import layout
 
 PARTIAL_FLOOR = 0.01
 

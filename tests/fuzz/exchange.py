@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.contracts.map_outputs import MapOutputs
-from dynslam_bench.runs.exchange import colmap, pose_tables, provenance, reading
-from dynslam_bench.runs.exchange.provenance import PROVENANCE_FILE, Provenance
-from dynslam_bench.slam.outputs import map_files
+from dynslam_bench.contracts.tracker import MapOutputs
+from dynslam_bench.runs.exchange import export as provenance
+from dynslam_bench.runs.exchange import formats as colmap
+from dynslam_bench.runs.exchange import formats as pose_tables
+from dynslam_bench.runs.exchange import formats as reading
+from dynslam_bench.runs.exchange.export import PROVENANCE_FILE, Provenance
+from dynslam_bench.slam import map_files
 
 from .target import Target, at
 
@@ -58,10 +61,8 @@ TARGETS = [
         "table of poses",
         lambda data, folder: reading.read_trajectory(at(folder, "data.csv", data)),
         lambda: [EUROC, VSLAM_LAB],
-        (pose_tables.read_pose_table, pose_tables.is_pose_table),
     ),
-    Target("COLMAP images", _read_colmap, lambda: [IMAGES, IMAGES + b"\n"], (colmap.read_colmap, colmap._stamp)),
-    Target("map of points", lambda data, folder: map_files.read_ply(at(folder, "map.ply", data)), _maps,
-           (map_files.read_ply,)),
-    Target("provenance of an export", _read_provenance, _provenances, (provenance.stated_provenance,)),
-]  # fmt: skip
+    Target("COLMAP images", _read_colmap, lambda: [IMAGES, IMAGES + b"\n"]),
+    Target("map of points", lambda data, folder: map_files.read_ply(at(folder, "map.ply", data)), _maps),
+    Target("provenance of an export", _read_provenance, _provenances),
+]

@@ -11,19 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences.readers import (
-    arrays,
-    bodies,
-    eth3d,
-    euroc,
-    icl_nuim,
-    nanoseconds,
-    openloris,
-    seven_scenes,
-    tartanair_shibuya,
-    vslam_lab,
-    yaml_numbers,
-)
 from dynslam_bench.sequences.readers.layouts import layout_of
 from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
 
@@ -71,18 +58,9 @@ def _attacked(name: str, damaged: tuple[str, ...]) -> Target:
             found += [bytes([which]) + re.sub(old, new, content) for place, old, new in ODD[name] if place == file]
         return found
 
-    return Target(f"layout {name}", read, seeds, COVERS[name])
+    return Target(f"layout {name}", read, seeds)
 
 
-COVERS = {
-    "eth3d": (eth3d.read,),
-    "icl-nuim": (icl_nuim.read,),
-    "7-scenes": (seven_scenes.read, seven_scenes.read_pose),
-    "tartanair-shibuya": (tartanair_shibuya.read, arrays.read_metres),
-    "openloris": (openloris.read, openloris.T_base_cam, yaml_numbers.read_yaml, yaml_numbers.numbers),
-    "vslam-lab": (vslam_lab, nanoseconds.read_rows, nanoseconds.column, nanoseconds.nanoseconds),
-    "euroc": (euroc, bodies.camera_on_body, bodies.camera_truth, nanoseconds.floats),
-}
 DAMAGED = {
     "eth3d": ("associated.txt", "calibration.txt", "groundtruth.txt"),
     "icl-nuim": ("livingRoom0.gt.freiburg", "second.gt.freiburg", "rgb/1.png"),

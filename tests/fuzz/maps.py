@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.mapping import map_store, saved_map, saved_map_faults
-from dynslam_bench.slam.mapping.saved_map import HEADER, MapFeatures, MapHeader, described
+from dynslam_bench.slam.atlas import open_atlas, packed
+from dynslam_bench.slam.map_files import HEADER, MapFeatures, MapHeader, described
 
-from .records import rezipped
+from .mutate import mutate_zip
 from .target import Target, at
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
@@ -20,13 +20,13 @@ FEATURES = MapFeatures(extractor="orb", levels=8, scale_factor=1.2)
 
 
 def _sound() -> dict[str, Any]:
-    """Two keyframes of three and two features, two points that both see, an island."""
+    """Two keyframes of three and two features, two points that both see, a submap."""
     header = MapHeader(
         sensors="rgbd", camera=described(CAMERA), features=FEATURES, next_keyframe=4, next_point=9, made_by="nobody"
     )
     return {
         HEADER: np.frombuffer(header.to_json().encode(), np.uint8),
-        "kf_id": np.array([0, 2]), "kf_island": np.array([0, 1]), "kf_pose": np.tile(np.eye(4), (2, 1, 1)),
+        "kf_id": np.array([0, 2]), "kf_map": np.array([0, 1]), "kf_pose": np.tile(np.eye(4), (2, 1, 1)),
         "kf_count": np.array([3, 2]), "kf_raw": np.full((5, 2), 4.0, np.float32), "kf_response": np.ones(5, np.float32),
         "kf_xy": np.full((5, 2), 4.0), "kf_right": np.array([1.0, np.nan, 1.0, 1.0, 1.0]),
         "kf_z": np.array([1, 0, 1, 1, 1], np.float32), "kf_octave": np.array([0, 1, 2, 7, 0], np.int8),
@@ -36,8 +36,8 @@ def _sound() -> dict[str, Any]:
         "far": np.ones(2), "words": np.zeros((2, 4), np.uint64), "rgb": np.zeros((2, 3), np.uint8),
         "visible": np.ones(2, np.int32), "found": np.ones(2, np.int32), "born": np.array([0, 1]),
         "n_obs": np.array([2, 2], np.int32), "obs_kf": np.array([0, 1, 0, 1], np.int32),
-        "obs_ft": np.array([2, 0, 0, 1], np.int32), "island_start": np.zeros((1, 3)),
-        "island_anchor": np.zeros((1, 3)), "island_reach": np.array([np.inf]),
+        "obs_ft": np.array([2, 0, 0, 1], np.int32), "submap_start": np.zeros((1, 3)),
+        "submap_anchor": np.zeros((1, 3)), "submap_bound": np.array([np.inf]),
     }  # fmt: skip
 
 
@@ -63,21 +63,14 @@ def _npz(arrays: dict[str, Any]) -> bytes:
 
 def _read(data: bytes | None, folder: Path) -> None:
     """What is read is worked on as a run does, whose compiled loops check no index."""
-    world, islands = map_store.begin_map(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    atlas = open_atlas(str(at(folder, "map.npz", data)), CAMERA, FEATURES, depth=True)
+    world = atlas.world
     world.refresh(world.points)
     for slot in world.keyframes.tolist():
         world.covisible(slot)
         world.project(world.kf_pose[slot], world.points)
-    map_store.packed(world, islands)
+    packed(atlas)
     world.remove_keyframe(int(world.keyframes[0]))
 
 
-TARGETS = [
-    Target(
-        "map of a run",
-        _read,
-        _seeds,
-        (saved_map.read_map, saved_map_faults, map_store.restored, map_store._table, map_store._islands),
-        rezipped,
-    )
-]
+TARGETS = [Target("map of a run", _read, _seeds, mutate_zip)]

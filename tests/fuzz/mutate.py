@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import struct
+import zipfile
 import zlib
 from random import Random
 from typing import Any
@@ -107,6 +109,23 @@ def mutate_lines(data: bytes, random: Random) -> bytes:
     at = random.randrange(len(lines))
     lines[at] = mutate_json(lines[at], random)
     return b"\n".join(lines)
+
+
+def mutate_zip(data: bytes, random: Random) -> bytes:
+    """A sound zip archive with right checksums, one of whose files or names is damaged."""
+    buffer = io.BytesIO()
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
+            chosen = random.choice(old.namelist())
+            for name in old.namelist():
+                content = old.read(name) if old.getinfo(name).file_size < 1 << 16 else b""
+                if name == chosen:
+                    content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
+                    name = random.choice((name, name, name, "../x.txt", "/etc/passwd", f"runs/{'0' * 16}/run.json"))
+                new.writestr(name, content)
+    except Exception:  # a seed that is no archive any more is damaged as bytes
+        return mutate(data, [data], random)
+    return buffer.getvalue()
 
 
 def mutate_png(data: bytes, random: Random) -> bytes:

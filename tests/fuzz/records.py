@@ -10,28 +10,25 @@ import tempfile
 import zipfile
 from functools import cache
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import numpy as np
 
-from dynslam_bench.core import array_files, reading
 from dynslam_bench.core.records import Record
-from dynslam_bench.core.stage_cache import StageCache, _unpack  # what of the cache reads
+from dynslam_bench.core.stage_cache import StageCache  # what of the cache reads
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports.model import known_rows
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.runs import RunRecord, RunStore, snapshots
-from dynslam_bench.runs import frame_row as rows
-from dynslam_bench.runs.storage import line_file, packing, run_index, run_list
-from dynslam_bench.runs.storage.evaluating import evaluate_run
-from dynslam_bench.runs.storage.frame_table import load_frames
-from dynslam_bench.runs.storage.frames import FrameLog
+from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.runs import RunStore
+from dynslam_bench.runs import artifacts as snapshots
+from dynslam_bench.runs import frames as rows
+from dynslam_bench.runs import many as packing
+from dynslam_bench.runs.frames import FrameLog, load_frames
+from dynslam_bench.runs.run_index import INDEX_FILE
+from dynslam_bench.runs.store import list_runs
 from dynslam_bench.sequences.fetch import Receipt
-from dynslam_bench.tuning import Study, StudySummary, cmaes_state, python_study
-from dynslam_bench.tuning import frame as study_frame
+from dynslam_bench.tuning import Study, StudySummary, samplers
 
-from .mutate import mutate, mutate_json, mutate_lines
+from .mutate import mutate_json, mutate_lines, mutate_zip
 from .target import Target, at
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
@@ -70,53 +67,25 @@ def _read_run(data: bytes | None, folder: Path) -> None:
     store.score(record)
 
 
-def _read_list(data: bytes | None, folder: Path) -> None:
-    """A damaged index of the runs is made again; whatever it says, the runs are those that lie there."""
+def _read_index(data: bytes | None, folder: Path) -> None:
+    """Whatever the index holds, lists, scores and reports are of the runs that lie there, and of no other."""
     store = _store(folder, _stored(f"runs/{RUN}/run.json"))
     at(store.runs / ("0" * 16), "run.json", b"{")
-    at(store.root / "metrics" / get_protocol("tum-rgbd/v1").digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
-    path = run_index.index_file(store.root, get_protocol("tum-rgbd/v1"))
-    at(path.parent, path.name, data)
-    rows, unreadable = run_list.list_runs(store)
+    for file in store.root.rglob("*.*"):
+        os.utime(file, (1, 1))  # values that were computed from another copy hold
+    at(store.root, INDEX_FILE, data)
+    rows, unreadable = list_runs(store)
     assert [row["run_id"] for row in rows] == [RUN] and len(unreadable) == 1
+    assert store.score(store.read(RUN)).run_id == RUN
+    loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
+    assert [row.run_id for row in loaded.rows] == [RUN] and len(loaded.unreadable) == 1
 
 
 @cache
 def _index() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        _read_list(None, Path(folder))
-        (path,) = Path(folder).glob("results/index/*.jsonl")
-        return path.read_bytes()
-
-
-def _read_known_rows(data: bytes | None, folder: Path) -> None:
-    """Whatever an earlier report has kept, this one has a row of every run that lies there, and no other."""
-    store, protocol = _store(folder, _stored(f"runs/{RUN}/run.json")), get_protocol("tum-rgbd/v1")
-    at(store.root / "metrics" / protocol.digest(), f"{RUN}.json", _stored(f"metrics/*/{RUN}.json"))
-    for file in store.root.rglob("*.*"):
-        os.utime(file, (1, 1))  # lines that were made of another copy hold
-    path = known_rows.KnownRows(store, protocol)._path  # only it knows the name
-    at(path.parent, path.name, data)
-    loaded = load_runs([store], protocol)
-    assert [run.row.run_id for run in loaded.runs] == [RUN] and not loaded.unreadable
-    assert loaded.runs[0].row.log == str(store.folder(RUN) / "log.txt")
-
-
-@cache
-def _known_rows() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        _read_known_rows(None, Path(folder))
-        (path,) = Path(folder).glob("results/index/rows-*")
-        return path.read_bytes()
-
-
-def _read_metrics(data: bytes | None, folder: Path) -> None:
-    """Damaged metrics count as none: they are taken from the trajectories again."""
-    store = _store(folder, _stored(f"runs/{RUN}/run.json"))
-    protocol = get_protocol("tum-rgbd/v1")
-    at(store.root / "metrics" / protocol.digest(), f"{RUN}.json", data)
-    found = store.stored_metrics(RUN, protocol)
-    assert found is None or found.run_id == RUN
+        _read_index(None, Path(folder))
+        return (Path(folder) / "results" / INDEX_FILE).read_bytes()
 
 
 def _read_part(data: bytes | None, folder: Path) -> None:
@@ -170,25 +139,6 @@ def _renamed(packed: bytes, run: str) -> bytes:
     return buffer.getvalue()
 
 
-def _repacked(data: bytes, random: Random) -> bytes:
-    """A sound archive whose files, or their names, are damaged."""
-    buffer = io.BytesIO()
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
-            for name in old.namelist():
-                content = old.read(name)
-                if random.random() < 0.3:
-                    content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
-                if random.random() < 0.05:
-                    name = random.choice(
-                        ["../x.txt", "/etc/passwd", "runs/zz/run.json", f"runs/{'0' * 16}/run.json", name]
-                    )
-                new.writestr(name, content)
-    except Exception:  # a seed that is no archive any more is damaged as bytes
-        return mutate(data, [data], random)
-    return buffer.getvalue()
-
-
 def _read_study(data: bytes | None, folder: Path) -> None:
     """As it is stored, or as somebody wrote it; ``other`` is a study whose journal holds another one."""
     results = folder / "results"
@@ -235,7 +185,6 @@ def _summary(cls: type[Record], seed: str) -> dict[str, Any]:
     return {
         "read": lambda data, folder: cls.read(at(folder, "record.json", data)),
         "seeds": lambda: [_stored(seed)],
-        "covers": (Record.read, Record.parse, reading.read_text),
         "mutation": mutate_json,
     }
 
@@ -260,111 +209,47 @@ def _snapshot_seeds() -> list[bytes]:
     return found
 
 
-def rezipped(data: bytes, random: Random) -> bytes:
-    """A sound archive with one damaged array."""
-    buffer = io.BytesIO()
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
-            chosen = random.choice(old.namelist())
-            for name in old.namelist():
-                content = old.read(name) if old.getinfo(name).file_size < 1 << 16 else b""
-                new.writestr(name, mutate(content, [content], random) if name == chosen else content)
-    except Exception:  # a seed that is no archive any more is damaged as bytes
-        return mutate(data, [data], random)
-    return buffer.getvalue()
-
-
 def _state_seeds() -> list[bytes]:
     """What such a state is made of, without the package that makes it."""
     state = {"mean": np.zeros(3), "sigma": np.float64(1.5), "bounds": None}
     return [*(pickle.dumps(state, protocol) for protocol in (4, 5)), pickle.dumps(print), b"(lr\xff\xff\xff\x7f."]
 
 
-_LINE_FILE = (line_file.read_line_file, line_file._pieces, line_file._valid, line_file._line)
-
 TARGETS = [
     Target(
         "run record",
         _read_run,
         lambda: [_stored(f"runs/{RUN}/run.json"), _other(_stored(f"runs/{RUN}/run.json"))],
-        (RunStore.read_whole, RunStore.all, RunStore.read, Record.read, Record.parse, RunRecord.describe),
         mutate_json,
     ),
-    Target(
-        "list of runs",
-        _read_list,
-        lambda: [_index()],
-        (run_list._list_runs, run_index.read_index, run_index._is_line, run_index.run_row, *_LINE_FILE),
-        mutate_lines,
-    ),
-    Target(
-        "known rows of a report",
-        _read_known_rows,
-        lambda: [_known_rows()],
-        (known_rows.KnownRows.read, known_rows.KnownRows._holds, known_rows.KnownRow.of, *_LINE_FILE),
-        mutate_lines,
-    ),
-    Target(
-        "metric record",
-        _read_metrics,
-        lambda: [_stored(f"metrics/*/{RUN}.json")],
-        (RunStore.stored_metrics,),
-        mutate_json,
-    ),
+    Target("index of runs", _read_index, lambda: [_index()]),
     Target(
         "stamps and trajectories of a run",
         _read_part,
         lambda: [_stored("sequences/*/timestamps.txt"), _stored(f"runs/{RUN}/trajectory_online.txt")],
-        (RunStore.trajectory, RunStore.timestamps, RunStore.ground_truth, evaluate_run),
     ),
-    Target(
-        "frame log",
-        _read_log,
-        _log_seeds,
-        (rows.read_log, rows._from_json, rows._number, FrameLog.trajectory),
-        mutate_lines,
-    ),
+    Target("frame log", _read_log, _log_seeds, mutate_lines),
     Target(
         "frame table",
         lambda data, folder: load_frames(at(folder, rows.CSV_FILE, data)),
         lambda: [_stored(f"runs/{RUN}/frames.csv")],
-        (rows.read_csv, rows._parse, rows._state, load_frames),
     ),
-    Target(
-        "packed run",
-        lambda data, folder: packing.unpack(data or b"", RunStore(folder)),
-        _packed_seeds,
-        (packing.unpack, packing._take, packing._write_once),
-        _repacked,
-    ),
+    Target("packed run", lambda data, folder: packing.unpack(data or b"", RunStore(folder)), _packed_seeds, mutate_zip),
     Target("study's summary", **_summary(StudySummary, "studies/small/summary.json")),
-    Target("stored study", _read_study, _study_seeds, (Study.open, python_study._spec_of), mutate_json),
-    Target(
-        "journal of a study",
-        _read_journal,
-        lambda: [_stored("studies/small/journal.log")],
-        (Study.open, Study.frame, study_frame._line),
-        mutate_lines,
-    ),
+    Target("stored study", _read_study, _study_seeds, mutate_json),
+    Target("journal of a study", _read_journal, lambda: [_stored("studies/small/journal.log")], mutate_lines),
     Target(
         "receipt of a fetch",
         lambda data, folder: Receipt.read(at(folder, "fetched.json", data)),
         _receipt_seeds,
-        (Record.read, Record.parse),
         mutate_json,
     ),
     Target(
         "snapshots of a run",
         lambda data, folder: snapshots.read_snapshots(at(folder, snapshots.SNAPSHOTS_FILE, data).parent),
         _snapshot_seeds,
-        (snapshots.read_snapshots, array_files),
-        rezipped,
+        mutate_zip,
     ),
-    Target("stage cache entry", _read_entry, lambda: [_entry()], (StageCache.get, _unpack)),
-    Target(
-        "state of CMA-ES",
-        lambda data, folder: cmaes_state._OnlyStates.loads(data or b""),
-        _state_seeds,
-        (cmaes_state._OnlyStates.loads, cmaes_state._State.find_class),
-    ),
+    Target("stage cache entry", _read_entry, lambda: [_entry()]),
+    Target("state of CMA-ES", lambda data, folder: samplers.restore_cma(data or b""), _state_seeds),
 ]

@@ -1,4 +1,4 @@
-"""What is attacked: a reader, files that it reads, and the code that counts as its own."""
+"""What is attacked: a reader, and files that it reads."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Any
 
 from dynslam_bench.core.errors import DynslamError
 
@@ -21,20 +20,16 @@ class Target:
         name: Its name.
         read: Reads what the bytes are in an empty folder of its own; None stands for a file that is missing. It ends,
             or raises an error of `allowed`; anything else is a finding.
-        seeds: Makes files that it reads without an error, once.
-        covers: Functions, classes and modules whose lines count as the reader's.
+        seeds: Makes sound and unsound files, once.
         mutation: Damage that keeps checksums or syntax right, used every other time beside damage to plain bytes.
         allowed: The errors that its documentation names.
-        uncovered: Why lines of it are never reached by files alone, for the record.
     """
 
     name: str
     read: Callable[[bytes | None, Path], object]
     seeds: Callable[[], list[bytes]]
-    covers: tuple[Any, ...]
     mutation: Mutation | None = None
     allowed: tuple[type[BaseException], ...] = (DynslamError,)
-    uncovered: str = ""
 
 
 def at(folder: Path, name: str, data: bytes | None) -> Path:

@@ -10,23 +10,25 @@ import cv2
 import numpy as np
 
 from dynslam_bench.cli.output import _text  # how a cell of a table is written
-from dynslam_bench.core import address, harmless, reading, toml
+from dynslam_bench.core import download as address
+from dynslam_bench.core import sanitise as harmless
 from dynslam_bench.core import settings as core_settings
-from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.geometry import kitti_file, tum_file
+from dynslam_bench.core import toml
+from dynslam_bench.core.errors import DynslamError, TrackerError
+from dynslam_bench.geometry import trajectory_files as kitti_file
+from dynslam_bench.geometry import trajectory_files as tum_file
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.masks import recorded
-from dynslam_bench.segmentation.training import labelled_files as labels
-from dynslam_bench.sequences import catalogue, fetch
-from dynslam_bench.sequences.published import cameras
+from dynslam_bench.segmentation import recorded
+from dynslam_bench.segmentation.training import labelled_images as labels
+from dynslam_bench.sequences import cameras, catalogue, fetch
 from dynslam_bench.sequences.readers import lists, tum
 from dynslam_bench.sequences.readers import recorded as recorded_sequence
 from dynslam_bench.sequences.readers.recorded import Description
-from dynslam_bench.sequences.synthetic import ids as synthetic
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.slam.settings import TrackingSettings
-from dynslam_bench.suites import suite
-from dynslam_bench.trackers.adapters import answers, program
+from dynslam_bench.suites import load_suite
+from dynslam_bench.trackers.adapters import program
+from dynslam_bench.trackers.adapters import subprocess_tracker as answers
 from dynslam_bench.tuning import study_file
 
 from .mutate import mutate_json
@@ -162,7 +164,7 @@ def _ids(text: str) -> None:
     for read in (parse_synthetic_id, catalogue.parse_frames, catalogue.entry_of):
         try:
             read(text)
-        except harmless.DynslamError:
+        except DynslamError:
             continue
 
 
@@ -179,7 +181,6 @@ TARGETS = [
             b"# nothing\n",
             b"1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n",
         ],
-        (tum_file.load_tum, tum_file.read_table, tum_file.is_number, tum_file._hint, reading.read_lines),
     ),
     Target(
         "KITTI trajectory",
@@ -188,38 +189,19 @@ TARGETS = [
             *(b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3" + b"\n" * ends for ends in (1, 2)),
             *(b"# none\n\n", b"1 0 0 0 0 1 0 0 0 0 1 x\n", b"1 2 3\n", b"2 0 0 0 0 2 0 0 0 0 2 0\n"),
         ],
-        (tum_file.read_table, kitti_file.read_kitti),
     ),
-    Target(
-        "list of images",
-        lambda data, folder: lists.read_image_list(at(folder, "rgb.txt", data)),
-        lambda: [LIST],
-        (lists.read_image_list, lists.read_stamped_lines, lists.make_image_list, lists._number),
-    ),
-    Target(
-        "associations",
-        lambda data, folder: lists.read_associations(at(folder, "a.txt", data)),
-        lambda: [PAIRS],
-        (lists.read_associations, lists.read_stamped_lines),
-    ),
+    Target("list of images", lambda data, folder: lists.read_image_list(at(folder, "rgb.txt", data)), lambda: [LIST]),
+    Target("associations", lambda data, folder: lists.read_associations(at(folder, "a.txt", data)), lambda: [PAIRS]),
     Target(
         "folder in TUM layout",
         _read_folder,
         lambda: [LIST, LIST.replace(b"rgb/2", b"../2"), PAIRS, POSES, PAIRS.replace(b"rgb/2", b"../2")],
-        (tum, recorded_sequence._existing, harmless.inside, harmless.is_inside),
     ),
-    Target(
-        "manifest of a fetch",
-        _read_manifest,
-        lambda: [b"0" * 64 + b"  rgb/1.png\n" + b"1" * 64 + b"  gone.png\n"],
-        (fetch._compare, harmless.inside, harmless.is_inside),
-    ),
+    Target("manifest of a fetch", _read_manifest, lambda: [b"0" * 64 + b"  rgb/1.png\n" + b"1" * 64 + b"  gone.png\n"]),
     Target(
         "camera",
         lambda data, folder: cameras.read_camera(at(folder, "camera.toml", data)).camera(),
         lambda: [CAMERA, b'name = "tum-fr1"\n', b'name = "x"\n', b"width = 640\n", b"fps = " + b"[" * 5000],
-        (cameras.read_camera, cameras.CameraFile.camera, cameras.known_camera, toml.read_toml, toml.parse_toml),
-        uncovered="what follows a RecursionError: the tracing of lines ends with it",
     ),
     Target(
         "settings file",
@@ -229,7 +211,6 @@ TARGETS = [
             *(b"a.b = 1\n", b"settings = 3\n", b'tracking.radius_px = "' + b"a" * 300 + b'"\n'),
             *(b"tracking.radius_px = 0x" + b"f" * 5000 + b"\n",),
         ],
-        (toml.read_settings, toml._flatten, core_settings._explain, core_settings._shown),
     ),
     Target(
         "--set",
@@ -237,36 +218,19 @@ TARGETS = [
         lambda: [
             b"tracking.radius_px=15\ntracking.local_map=all",
             *(b"x=1", b"tracking=1", b"tracking.radius_px.x=1", b"a.b.c=1", b"tracking.x=1"),
-            *(
-                b"tracking.radius_px=[1]",
-                b"tracking.radius_px=" + b"9" * 4999,
-                b"tracking.radius_px",
-            ),
+            *(b"tracking.radius_px=[1]", b"tracking.radius_px=" + b"9" * 4999, b"tracking.radius_px"),
         ],
-        (
-            core_settings.apply_overrides,
-            core_settings.parse_assignments,
-            core_settings._walk,
-            core_settings._parse,
-            core_settings._explain,
-        ),
     ),
     Target(
         "suite",
-        lambda data, folder: suite.load_suite(at(folder, "s.toml", data)),
+        lambda data, folder: load_suite(at(folder, "s.toml", data)),
         lambda: [
             (ROOT / "dynslam_bench/suites/smoke.toml").read_bytes(),
             b'trackers = ["never-move"]\nsequences = ["a"]\nsedes = [1]\n',
             b"trackers = 3\n",
         ],
-        (suite.load_suite, suite._explain),
     ),
-    Target(
-        "study",
-        lambda data, folder: study_file.read_study(at(folder, "s.toml", data), len),
-        _study_texts,
-        (study_file.read_study, study_file.make_spec),
-    ),
+    Target("study", lambda data, folder: study_file.read_study(at(folder, "s.toml", data)), _study_texts),
     Target(
         "COCO annotations",
         _read_coco,
@@ -276,7 +240,7 @@ TARGETS = [
             *(
                 json.dumps(COCO | {"annotations": [{**COCO["annotations"][0], "segmentation": odd}]}).encode()
                 for odd in (
-                    [[1, 2, 1e9, 3, 4, 5]],
+                    [[1, 2, 1000000000.0, 3, 4, 5]],
                     {"counts": "a", "size": [8, 8]},
                     {"size": 3},
                     "x",
@@ -286,20 +250,17 @@ TARGETS = [
                 )
             ),
         ],
-        (labels.CocoImages, labels._coco_mask, labels._from_runs, labels.decode_runs, labels._check_polygon),
         mutate_json,
     ),
     Target(
         "YOLO labels",
         _read_yolo,
         lambda: [b"0 0.1 0.1 0.9 0.1 0.9 0.9\n56 0 0 1 0 1 1\n\n", b"-1 0 0\n", b"0 nan 0\n", b"0 0 0\n"],
-        (labels.YoloImages, labels._fill),
     ),
     Target(
         "classes of recorded masks",
         lambda data, folder: recorded.read_classes(at(folder, "classes.json", data)),
         lambda: [b'{"1": "person", "7": "chair"}'],
-        (recorded.read_classes, reading.parse_json),
         mutate_json,
     ),
     Target(
@@ -317,7 +278,6 @@ TARGETS = [
                 *({"trajectory": "x"}, {"T_world_cam": "x"}, {"stats": []}, {"state": 3}, {"dynamic_mask": "x"}),
             )
         ],
-        (answers, program.parse_answer),
         mutate_json,
     ),
     Target(
@@ -333,14 +293,8 @@ TARGETS = [
             b"ftp://host/x",
             b"https://[x/y",
         ],
-        (address.check_address, address._is_here),
     ),
-    Target(
-        "names and texts",
-        _of_text(_harmless),
-        lambda: [b"rgb/1.png", "Zoë \x1b[2J\u202e".encode()],
-        (harmless.printable, harmless.storable, harmless.is_inside),
-    ),
+    Target("names and texts", _of_text(_harmless), lambda: [b"rgb/1.png", "Zoë \x1b[2J\u202e".encode()]),
     Target(
         "ids of sequences",
         _of_text(_ids),
@@ -354,6 +308,5 @@ TARGETS = [
             b"synthetic/walking_xyz?frames=0",
             b"synthetic/x",
         ],
-        (catalogue.parse_frames, synthetic.parse_synthetic_id, synthetic._options, synthetic._integer),
     ),
 ]

@@ -12,9 +12,8 @@ from evo.tools import file_interface
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.geometry import stamps
 from dynslam_bench.geometry.association import associate
-from dynslam_bench.geometry.kitti_file import read_kitti, write_kitti
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import load_tum, read_tum, write_tum
+from dynslam_bench.geometry.trajectory_files import load_tum, read_kitti, read_tum, write_kitti, write_tum
 
 EUROC = 1403636579763555584
 """The first stamp of EuRoC's V1_01, in nanoseconds."""

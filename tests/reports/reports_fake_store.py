@@ -4,14 +4,14 @@ import hashlib
 
 import numpy as np
 
-from dynslam_bench.core.machine import Machine
+from dynslam_bench.core.fingerprint import Machine
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import from_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import format_tum
-from dynslam_bench.runs.storage.record import IDENTITY_SCHEME, RunRecord, SequenceInfo, StageTime, TrackerInfo
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.geometry.trajectory_files import format_tum
+from dynslam_bench.runs.record import IDENTITY_SCHEME, RunRecord, SequenceInfo, StageTime, TrackerInfo
+from dynslam_bench.runs.store import RunStore
 
 LABELS = {
     "orb-slam2": "ORB-SLAM2 (our back end)",

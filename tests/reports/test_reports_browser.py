@@ -10,14 +10,14 @@ import pytest
 from reports_browser import Browser, needs_browser
 from reports_fake_store import add_run, fill
 
-from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.envs.arguments import open_frames
 from dynslam_bench.envs.episode import FrameOutcome
-from dynslam_bench.envs.source import open_frames
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.reports import build_report
-from dynslam_bench.runs.frame_row import FrameRow, write_csv
-from dynslam_bench.runs.snapshots import SnapshotWriter
-from dynslam_bench.sequences.part import part_of
+from dynslam_bench.runs.artifacts import SnapshotWriter
+from dynslam_bench.runs.frames import FrameRow, write_csv
+from dynslam_bench.sequences.view import part_of
 
 sys.path.append(str(Path(__file__).parents[1] / "envs"))
 from envs_toys import write_folder

@@ -3,25 +3,20 @@
 import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
 from reports_fake_store import add_run, truth_of
-from reports_rows import rows_of
+from reports_rows import page_data, rows_of
 
-import dynslam_bench.reports
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, compare
-from dynslam_bench.reports.figures.sequence import broken
+from dynslam_bench.reports.figures import broken
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.row import RunRow
-from dynslam_bench.reports.model.rows import check_one_protocol, load_runs
-from dynslam_bench.reports.tables.leaderboard import leaderboard
-from dynslam_bench.reports.tables.sequences import per_sequence
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model.load import check_one_protocol, load_runs
+from dynslam_bench.runs.store import RunStore
 
 
 class Page(HTMLParser):
@@ -42,23 +37,6 @@ class Page(HTMLParser):
     def handle_endtag(self, tag):
         while self.stack and self.stack.pop() != tag:
             pass
-
-
-def test_all_files_are_there(made):
-    _, paths = made
-    assert paths.html.name == "index.html"
-    for path in [paths.html, paths.markdown, paths.latex, paths.data, *paths.csv.values()]:
-        assert path.stat().st_size > 0
-    assert {
-        "leaderboard",
-        "per_sequence",
-        "runs",
-        "failures",
-        "repeatability",
-        "common_frames",
-        "failure_rules",
-    } <= set(paths.csv)
-    assert {"rpe_1s_trans", "rpe_1s_rot", "rpe_1f_trans", "rpe_1f_rot", "mask_iou", "machines"} <= set(paths.csv)
 
 
 def test_the_page_is_complete_in_itself(made):
@@ -85,13 +63,8 @@ def test_every_run_has_its_side_file_and_a_cell_that_leads_to_it(made):
     assert {path.stem.removeprefix("run-") for path in folder.glob("run-*.js")} == ids
     linked = set(re.findall(r"run\.html#([0-9a-f]{16})", paths.html.read_text()))
     assert linked <= ids and len(linked) == 22  # 5 trackers on 4 sequences, an import, and the run that failed
-    explore = handed(folder / "explore.js")
+    explore = page_data(paths.html.parent, "explore")
     assert {run[0] for run in explore["runs"]} == ids and len(explore["runs"]) == len(ids)
-
-
-def handed(path):
-    """What a side file hands over."""
-    return json.loads(re.fullmatch(r'keep\("[\w-]+",(.*)\);\n', path.read_text(), re.DOTALL)[1])
 
 
 def test_the_leaderboard_orders_and_compares(made):
@@ -117,12 +90,11 @@ def test_the_leaderboard_orders_and_compares(made):
 
 def test_numbers_are_those_of_the_evaluation(made):
     store, paths = made
-    rows = rows_of(paths.csv["runs"])[::7]
-    assert rows
-    for row in rows:
-        trajectory = store.trajectory(row["run_id"])
-        truth = truth_of(row["sequence"])
-        assert float(row["ate_rmse_m"]) == pytest.approx(evaluate(trajectory, truth).metrics["ate_rmse_m"], rel=1e-6)
+    lines = rows_of(paths.csv["runs"])[::7]
+    assert lines
+    for line in lines:
+        metrics = evaluate(store.trajectory(line["run_id"]), truth_of(line["sequence"])).metrics
+        assert float(line["ate_rmse_m"]) == pytest.approx(metrics["ate_rmse_m"], rel=1e-6)
 
 
 def test_failures_are_rows_and_count_as_not_moving(made):
@@ -135,22 +107,12 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     assert float(row["score_m"]) == float(row["static_camera_ate_rmse_m"]) != float(row["ate_rmse_m"])
     text = paths.html.read_text()
     assert f'href="run.html#{failed["run"]}"' in text
-    page = handed(paths.html.parent / "data" / f"run-{failed['run']}.js")
+    page = page_data(paths.html.parent, f"run-{failed['run']}")
     assert page["log"] == (store.folder(failed["run"]) / "log.txt").read_text() == "a log\n"
     markdown = paths.markdown.read_text()
     assert "2/3 succeeded" in markdown
     assert "(3 unless n says otherwise)" in markdown
     assert "counts as a static camera, or worse (1 of 61 runs)" in markdown
-
-
-def test_captions_carry_the_protocol_and_the_power_note(made):
-    _, paths = made
-    for text in (paths.html.read_text(), paths.markdown.read_text()):
-        assert "1190f97bbd77" in text
-        assert "With 4 sequences no two trackers are called different" in text
-        assert "dynslam-bench bench dynamic" in text or text is not paths.html
-    assert "\\begin{tabular}" in paths.latex.read_text()
-    assert "&gt; Mixed" not in paths.html.read_text()
 
 
 def test_common_frames_beside_the_error(made):
@@ -178,20 +140,15 @@ def test_a_report_can_be_made_again_under_another_protocol(made, tmp_path):
         make_board(first.rows + second.rows)
 
 
-def test_the_same_runs_give_the_same_report(made, tmp_path):
+def test_the_same_runs_give_the_same_report_and_other_files_stay(made, tmp_path):
     store, paths = made
-    again = build_report(store, tmp_path / "again")
+    (tmp_path / "notes.txt").write_text("mine")
+    again = build_report(store, tmp_path)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
     for name, path in paths.csv.items():
         if name != "failures":  # its links are relative to the report
             assert again.csv[name].read_text() == path.read_text(), name
     assert again.data.read_text() == paths.data.read_text()
-
-
-def test_other_files_in_the_folder_stay(made, tmp_path):
-    store, _ = made
-    (tmp_path / "notes.txt").write_text("mine")
-    build_report(store, tmp_path)
-    assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp_path):
@@ -205,25 +162,12 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     assert float(board[0]["ATE ratio"]) < 0.2
 
 
-def test_an_unknown_reference_is_refused_before_anything_is_scored(tmp_path):
-    store, told = RunStore(tmp_path / "results"), []
+def test_an_unknown_reference_is_refused(tmp_path):
+    store = RunStore(tmp_path / "results")
     add_run(store, "orb-slam2", "s/a")
-    with pytest.raises(ReportError, match="no run of the reference 'orb-slam3'") as caught:
-        build_report(store, tmp_path / "r", reference="orb-slam3", on_progress=lambda *what: told.append(what))
-    assert caught.value.hint == "did you mean 'orb-slam2'?"
-    assert [what for *_, what in told] == ["looking for what has changed"] and not (store.root / "metrics").exists()
-    assert not (tmp_path / "r").exists() and not (store.root / "metrics").exists()
-
-
-def test_variants_of_a_tracker_are_rows_of_their_own(tmp_path):
-    store = RunStore(tmp_path / "r")
-    for seed in (0, 1):
-        add_run(store, "orb-slam2", "s/a", seed)
-        add_run(store, "orb-slam2", "s/a", seed, overrides={"features": 500})
-    loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
-    board = make_board([run.row for run in loaded.runs])
-    assert sorted(board.labels.values()) == ["orb-slam2", "orb-slam2 · features=500"]
-    assert board.reference_name == "orb-slam2"
+    with pytest.raises(ReportError) as caught:
+        build_report(store, tmp_path / "r", reference="orb-slam3")
+    assert caught.value.hint == "did you mean 'orb-slam2'?" and not (tmp_path / "r").exists()
 
 
 def test_only_the_newest_of_equal_runs_counts(tmp_path):
@@ -231,7 +175,7 @@ def test_only_the_newest_of_equal_runs_counts(tmp_path):
     add_run(store, "a", "s/a", error=0.3, started="2026-01-01T00:00:00+00:00")
     new = add_run(store, "a", "s/a", error=0.01, started="2026-02-01T00:00:00+00:00")
     loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
-    assert [run.row.run_id for run in loaded.runs] == [new]
+    assert [row.run_id for row in loaded.rows] == [new]
     assert loaded.superseded == 1
     paths = build_report(store, tmp_path / "report")
     assert "Left out: 1 older runs" in paths.markdown.read_text()
@@ -282,18 +226,6 @@ def test_what_cannot_be_reported_is_one_clear_line(tmp_path, case):
     assert not (tmp_path / "report").exists()
 
 
-def test_the_final_trajectory_has_its_own_table(tmp_path):
-    store = RunStore(tmp_path / "r")
-    run_id = add_run(store, "orb-slam2", "s/a", final_error=0.001)
-    add_run(store, "never-move", "s/a")
-    paths = build_report(store, tmp_path / "report")
-    (only,) = rows_of(paths.csv["final_trajectory"])
-    expected = evaluate(store.trajectory(run_id, "final"), truth_of("s/a")).metrics["ate_rmse_m"]
-    assert only["tracker"] == "orb-slam2"
-    assert float(only["s/a"]) == pytest.approx(expected, rel=1e-6)
-    assert expected < 0.5 * evaluate(store.trajectory(run_id), truth_of("s/a")).metrics["ate_rmse_m"]
-
-
 # -- reported rows
 
 
@@ -317,34 +249,6 @@ def test_published_numbers_stand_apart_and_never_compete(tmp_path):
 # -- pieces
 
 
-def row(**changes):
-    base = dict(run_id="r", kind="run here", tracker="a", label="A", sequence="s", protocol_id="p", protocol_digest="d",
-                metrics={"ate_rmse_m": 0.1}, static_camera_ate_rmse_m=0.5)  # fmt: skip
-    return RunRow(**(base | changes))
-
-
-def test_scores_impute_failures_only():
-    assert row().score_m == 0.1
-    assert row(failed=True).score_m == 0.5
-    assert row(failed=True, metrics={}).score_m == 0.5
-    assert row(metrics={}, static_camera_ate_rmse_m=None).score_m is None
-
-
-def test_trackers_that_lack_sequences_are_shown_but_not_ranked():
-    rows = [row(tracker="orb-slam2", label="O", sequence=s) for s in ("s", "t")] + [row(tracker="half", label="H")]
-    rows += [row(tracker="control", label="C", sequence=s, ranked=False) for s in ("s", "t")]
-    board = make_board(rows, on="all")
-    assert [board.labels[key] for key in board.ranked] == ["O"]
-    assert [board.labels[key] for key in board.incomplete] == ["H"]
-    protocol = get_protocol("tum-rgbd/v1")
-    table = leaderboard(board, protocol)
-    assert table.muted_rows == {1, 2}
-    texts = {cells[2].text: cells[3].small for cells in table.rows}
-    assert texts["H"].endswith("on 1 of 2")
-    matrix = per_sequence(board, protocol)
-    assert matrix.rows[[r[0].text for r in matrix.rows].index("H")][2].text == "–"
-
-
 def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     stamps = np.r_[0:0.95:0.1, 1.05:2:0.1, 2.6:3:0.1]
     values = stamps[:, None] * [1.0, 2.0]
@@ -359,14 +263,3 @@ def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     assert len(t) < 420
     assert {long[0], long[4999], long[5000], long[-1]} <= set(t.tolist())
     assert np.isnan(v[:, 0]).sum() == 1
-
-
-def test_every_template_is_used():
-    """A script that no page takes any more is deleted, not shipped."""
-    room = Path(dynslam_bench.reports.__file__).parent
-    named = " ".join(
-        path.read_text(encoding="utf-8") for pattern in ("**/*.py", "**/*.j2") for path in room.glob(pattern)
-    )
-    templates = [path.name for path in (room / "html" / "templates").iterdir() if path.is_file()]
-    assert len(templates) > 10
-    assert [name for name in templates if not re.search(rf'["\']{re.escape(name)}["\']', named)] == []

@@ -5,11 +5,10 @@ from reports_rows import PROTOCOL, row, rows_of
 
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.columns import name_columns, shortened
-from dynslam_bench.reports.model.labels import make_labels
+from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.missing import missing_commands, run_command
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.runs.store import RunStore
 
 
 def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):
@@ -26,23 +25,13 @@ def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):
     assert {cells[1].text for cells in found.table.rows} == {"chess/seq-01", "fire/seq-01", "all 2 sequences"}
 
 
-def test_the_camera_is_part_of_the_column_in_old_records_too(tmp_path):
-    """Records without a block: content and frames, and the camera that the identity names."""
+def test_columns_of_two_cameras_are_named_by_them(tmp_path):
     store = RunStore(tmp_path / "r")
     right = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
-    add_run(store, "a", "folder/s", camera=right)
-    add_run(store, "b", "folder/s", camera=right | {"fx": 400.0})
-    add_run(store, "elsewhere", "folder/s", kind="imported")
-    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
-    assert set(board.sequences) == {
-        "folder/s (camera 640x480, f 525 525)",
-        "folder/s (camera 640x480, f 400 525)",
-        "folder/s",
-    }
-    alone = RunStore(tmp_path / "q")
-    add_run(alone, "a", "folder/s", camera=right)
-    add_run(alone, "elsewhere", "folder/s", kind="imported")
-    assert len({run.row.column_id for run in load_runs([alone], PROTOCOL).runs}) == 1
+    add_run(store, "a", "folder/s", camera=right, block="right")
+    add_run(store, "b", "folder/s", camera=right | {"fx": 400.0}, block="wrong")
+    board = make_board(load_runs([store], PROTOCOL).rows)
+    assert board.sequences == ["folder/s (camera 640x480, f 400 525)", "folder/s (camera 640x480, f 525 525)"]
 
 
 def test_the_same_frames_are_one_column_in_every_spelling(tmp_path):
@@ -50,7 +39,7 @@ def test_the_same_frames_are_one_column_in_every_spelling(tmp_path):
     add_run(store, "a", "synthetic/walking_xyz?frames=60", block="b1")
     add_run(store, "b", "synthetic/walking_xyz", frames=(0, 60), block="b1")
     add_run(store, "b", "synthetic/walking_xyz?noise=3", frames=(0, 60), block="b1", noise=3)
-    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
+    board = make_board(load_runs([store], PROTOCOL).rows)
     assert board.sequences == ["synthetic/walking_xyz [0:60]"]
     assert [len(cells[board.sequences[0]].rows) for _, cells in sorted(board.cells.items())] == [1, 2]
 
@@ -61,7 +50,7 @@ def test_names_of_columns_are_never_alike():
     names = name_columns(rows)
     assert len(set(names.values())) == 3
     assert all(name.startswith("folder/x (") for name in names.values())
-    deep = [row(sequence="folder/x", block=str(i), place=p, frames="0:9") for i, p in enumerate(["/a/1/x", "/b/1/x"])]
+    deep = [row(sequence="folder/x", block=str(i), place=p, frames=(0, 9)) for i, p in enumerate(["/a/1/x", "/b/1/x"])]
     assert list(name_columns(deep).values()) == ["a/1/x [0:9]", "b/1/x [0:9]"]
 
 
@@ -101,9 +90,9 @@ def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tm
     add_run(store, "a", "s/a", overrides={"masks": "oracle"})
     add_run(store, "a", "s/c", overrides={"masks": "oracle"})
     add_run(store, "b", "s/a", overrides={"masks": "oracle"})
-    rows = [run.row for run in load_runs([store], PROTOCOL).runs]
+    rows = load_runs([store], PROTOCOL).rows
     assert sorted(make_board(rows).labels.values()) == ["a", "b", "mine · loop=true"]
-    (mine,) = (each for each in rows if (each.tracker, each.sequence) == ("mine", "s/a"))
+    (mine,) = (each for each in rows if (each.tracker.id, each.sequence.id) == ("mine", "s/a"))
     assert run_command(mine) == f"dynslam-bench run {given} s/a --set loop=true"
     assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
 
@@ -119,12 +108,3 @@ def test_labels_name_files_without_their_folders_unless_two_would_be_alike(tmp_p
     assert labels("onnx:/a/best.onnx", "onnx:/b/best.onnx") == [
         f"MASK-RCNN · segmentation.source=onnx:/{folder}/best.onnx" for folder in "ab"
     ]
-
-
-def test_the_board_names_masks_without_their_folders(tmp_path):
-    store = RunStore(tmp_path / "r")
-    add_run(store, "mask-rcnn", "s/a", masks="onnx:/home/me/nets/yolov8n-seg.onnx")
-    add_run(store, "orb-slam2", "s/a")
-    paths = build_report(store, tmp_path / "report")
-    assert "onnx:yolov8n-seg masks" in paths.markdown.read_text()
-    assert "/home/me" not in paths.markdown.read_text() + paths.csv["leaderboard"].read_text()

@@ -6,7 +6,7 @@ from reports_fake_store import add_run, fill
 
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.reports import compare
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.runs.store import RunStore
 
 
 def test_compare_finds_what_changed(made, tmp_path):

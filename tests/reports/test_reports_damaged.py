@@ -1,25 +1,18 @@
 """Damaged files of a store, and failures among repeats: the report is made, and says what it left out."""
 
-import json
-import shutil
-from pathlib import Path
-
 import pytest
 from reports_fake_store import add_run
-from reports_rows import PROTOCOL, crashed, row, rows_of
+from reports_rows import PROTOCOL, crashed, page_data, row
 from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.figures.leaderboard import mask_figure, repeat_figure
-from dynslam_bench.reports.figures.style import log_axis
-from dynslam_bench.reports.html.run_frames import exact_shares, read_tables
+from dynslam_bench.reports.figures import log_axis, mask_figure, repeat_figure
+from dynslam_bench.reports.html.run_page import exact_shares
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.reports.tables.runs import repeatability
-from dynslam_bench.runs.storage.scoring import score
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.reports.tables.leaderboard import repeatability
+from dynslam_bench.runs.store import RunStore
 
-BEFORE_REBUILD = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
 HEAD = b"index,timestamp,state,frame_error_trans_m,dynamic_share\n"
 DAMAGE = {
     "no text": b"\xff\xfe\x00\x01",
@@ -43,39 +36,17 @@ def store(tmp_path):
     return store
 
 
-def page_of(paths, run_id):
-    text = (paths.html.parent / "data" / f"run-{run_id}.js").read_text()
-    return json.loads(text.partition(",")[2].removesuffix(");\n"))
-
-
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_table_of_frames_costs_only_its_own_figures(store, tmp_path, damage):
     hurt, other = store.ids()[:2]
     path = store.folder(hurt) / "frames.csv"
     path.write_bytes(DAMAGE[damage])
     paths = build_report(store, tmp_path / "report", picture_seconds=0)
-    assert any("frames.csv" in note for note in page_of(paths, hurt)["notes"])
-    assert page_of(paths, hurt)["frames"] == {} and page_of(paths, other)["frames"]["count"] == 40
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_tables_read_together_are_what_each_of_them_is(tmp_path, damage):
-    rows = [f"{at},{1000 + at / 30:.6f},ok,{0.001 * at},0.25" for at in range(30)]
-    whole = HEAD + "\n".join(rows).encode() + b"\n"
-    shapes = {
-        "whole": whole, "hurt": DAMAGE[damage], "short": HEAD + b"7,1000.0,lost,,\n", "cut off": whole[:-20],
-        "blank line": whole.replace(b"\n9,", b"\n\n9,"), "quoted": whole.replace(b",ok,", b',"o,\nk",'),
-        "hurt alike": HEAD + DAMAGE[damage].removeprefix(HEAD), "empty": b"", "again": whole,
-    }  # fmt: skip
-    paths = [tmp_path / name for name in [*shapes, "missing"]]
-    for path in paths[:-1]:
-        path.write_bytes(shapes[path.name])
-    known = {"index", "timestamp", "state", "frame_error_trans_m", "dynamic_share"}.__contains__
-    for order in (paths, paths[::-1], paths[1:], [paths[0], paths[2], paths[-2]]):
-        together = list(read_tables(order, known))
-        alone = [next(read_tables([path], known)) for path in order]
-        assert [repr(found) for found in together] == [repr(found) for found in alone]
-    assert len(together[0]["index"]) == len(together[2]["index"]) == 30 and together[1]["state"].tolist() == ["lost"]
+    assert any("frames.csv" in note for note in page_data(paths.html.parent, f"run-{hurt}")["notes"])
+    assert (
+        page_data(paths.html.parent, f"run-{hurt}")["frames"] == {}
+        and page_data(paths.html.parent, f"run-{other}")["frames"]["count"] == 40
+    )
 
 
 def test_what_is_left_out_is_named(store, tmp_path):
@@ -85,16 +56,6 @@ def test_what_is_left_out_is_named(store, tmp_path):
     page = build_report(store, tmp_path / "report", picture_seconds=0).html.read_text()
     assert "2 folders without a valid record" in page
     assert all(f"runs/{name}" in page for name in ("d" * 16, "e" * 16))
-
-
-def test_old_runs_scored_under_another_protocol_and_new_unscored_ones_stand_in_one_report(store, tmp_path):
-    old = RunStore(shutil.copytree(BEFORE_REBUILD, tmp_path / "old"))
-    for record in old.all()[0]:
-        score(old, record, "evo-default")
-    paths = build_report([old.root, store.root], tmp_path / "report", picture_seconds=0)
-    rows = rows_of(paths.csv["runs"])
-    assert len(rows) == 6 and len({row["protocol_digest"] for row in rows}) == 1
-    assert {"old-slam", "never-move", "a", "b"} == {row["tracker"] for row in rows}
 
 
 def test_a_tracker_that_always_crashes_is_not_called_repeatable():
@@ -116,25 +77,12 @@ def test_figures_show_millimetres_and_enough_ticks():
         assert len(ticks) >= 3 and all(low * 0.7 < tick < high * 1.4 for tick in ticks), (low, high, ticks)
 
 
-def test_an_old_import_goes_to_no_other_camera_than_the_runs_of_its_frames(tmp_path):
-    store = RunStore(tmp_path / "r")
-    camera = {"width": 640, "height": 480, "fx": 300.0, "fy": 300.0}
-    add_run(store, "a", "s/a")
-    add_run(store, "a", "s/a", camera=camera)
-    add_run(store, "elsewhere", "s/a", kind="imported")
-    board = make_board([run.row for run in load_runs([store], PROTOCOL).runs])
-    (place,) = board.cells[next(key for key in board.trackers if key.startswith("elsewhere"))]
-    assert "camera" not in place and "s/a" in place
-    paths = build_report(store, tmp_path / "report", picture_seconds=0)
-    assert {each["tracker"] for each in rows_of(paths.csv["runs"])} == {"a", "elsewhere"}
-
-
 def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
     """What the masks show of a frame is known if any run saw the frame, not only the first one of the sequence."""
     store = RunStore(tmp_path / "r")
     for name, count in (("crashed", 30), ("whole", 60)):
         add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
-    runs = sorted(load_runs([store], PROTOCOL).runs, key=lambda run: run.row.tracker)
+    runs = sorted(load_runs([store], PROTOCOL).rows, key=lambda row: row.tracker.id)
     assert [*exact_shares(runs)] == [*range(60)]
 
 
@@ -144,20 +92,20 @@ def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
     for name, kept in (("whole", None), ("thin", [0, 1, 2, 3])):
         add_run(store, name, "s/a", error=0.01, final_error=0.005, final_frames=kept)
     protocol = PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
-    rows = {run.row.tracker: run.row for run in load_runs([store], protocol).runs}
+    rows = {row.tracker.id: row for row in load_runs([store], protocol).rows}
     assert (rows["whole"].coverage, rows["whole"].failed) == (1.0, False)
     thin = rows["thin"]
     assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
     assert "the final trajectory has poses of 4 of" in thin.reason and thin.ending.startswith("lost, 4/")
-    assert {run.row.tracker: run.row.failed for run in load_runs([store], PROTOCOL).runs} == dict.fromkeys(rows, False)
+    assert {row.tracker.id: row.failed for row in load_runs([store], PROTOCOL).rows} == dict.fromkeys(rows, False)
 
 
 def test_what_was_lost_as_it_came_and_found_in_the_end_is_a_success_of_the_final_trajectory(tmp_path):
     store, protocol = RunStore(tmp_path / "r"), PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
     add_run(store, "found", "s/a", error=0.01, status="lost", final_error=0.005, final_whole=True)
     add_run(store, "sparse", "s/a", error=0.01, kind="imported", lost=[at for at in range(120) if at % 5])
-    rows = {run.row.tracker: run.row for run in load_runs([store], protocol).runs}
+    rows = {row.tracker.id: row for row in load_runs([store], protocol).rows}
     assert (rows["found"].status, rows["found"].failed, rows["found"].coverage) == ("ok", False, 1.0)
-    rows = {run.row.tracker: run.row for run in load_runs([store], PROTOCOL).runs}
+    rows = {row.tracker.id: row for row in load_runs([store], PROTOCOL).rows}
     assert rows["found"].failed and rows["found"].status == "lost"
     assert not rows["sparse"].failed, "a file of keyframes says what it covers, and that no more was asked for"

@@ -7,7 +7,7 @@ from reports_fake_store import add_run, fill
 from test_reports_browser import add_frames, browser, open_page, report, run_of
 
 from dynslam_bench.reports import build_report
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.runs.store import RunStore
 
 __all__ = ["browser", "report"]  # fixtures
 

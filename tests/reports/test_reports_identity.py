@@ -10,9 +10,9 @@ from reports_fake_store import add_run
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import build_report, load_board
 from dynslam_bench.reports.model.board import Board
-from dynslam_bench.reports.model.rows import load_runs
-from dynslam_bench.runs.storage.record import IDENTITY_SCHEME
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.runs.record import IDENTITY_SCHEME
+from dynslam_bench.runs.store import RunStore
 
 SEQUENCES = ("synthetic/walking_xyz", "synthetic/walking_static")
 
@@ -23,7 +23,7 @@ def made_by(**parts: object) -> dict[str, object]:
 
 def rows_of(board: Board, tracker: str) -> dict[str, list[str]]:
     """The sequences that each row of a tracker has runs on, by the row's name."""
-    keys = [key for key in board.labels if board.first(key).tracker == tracker]
+    keys = [key for key in board.labels if board.first(key).tracker.id == tracker]
     return {board.labels[key]: sorted(board.cells[key]) for key in keys}
 
 
@@ -50,7 +50,7 @@ def test_runs_of_two_programs_are_two_rows_and_the_older_is_not_ranked(
     assert len(rows) == 2 and all(len(sequences) == 1 and f" {name} " in label for label, sequences in rows.items())
     current = {label: board.first(key).is_current for key, label in board.labels.items()}
     assert sorted(current[label] for label in rows) == [False, True]
-    assert not any(board.first(key).tracker == "mine" and not board.first(key).is_current for key in board.ranked)
+    assert not any(board.first(key).tracker.id == "mine" and not board.first(key).is_current for key in board.ranked)
 
 
 def test_a_program_that_ran_everything_again_supersedes_the_older_one(tmp_path: Path) -> None:
@@ -60,7 +60,7 @@ def test_a_program_that_ran_everything_again_supersedes_the_older_one(tmp_path: 
             started = f"2026-01-0{day}T00:00:00+00:00"
             add_run(store, "mine", sequence, identity=made_by(source=source), started=started)
     loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
-    assert loaded.superseded == 2 and {run.row.started[:10] for run in loaded.runs} == {"2026-01-02"}
+    assert loaded.superseded == 2 and {row.started[:10] for row in loaded.rows} == {"2026-01-02"}
     assert list(rows_of(load_board(store), "mine")) == ["mine"]
 
 
@@ -83,7 +83,7 @@ def test_a_verified_program_stays_ranked_beside_newer_runs_that_are_not_verified
     store = RunStore(tmp_path / "r")
     add_run(store, "mine", SEQUENCES[0], identity=made_by(source="1"), started="2026-01-01T00:00:00+00:00")
     add_run(store, "mine", SEQUENCES[1], identity={}, started="2026-01-02T00:00:00+00:00")
-    rows = [run.row for run in load_runs([store], get_protocol("tum-rgbd/v1")).runs]
+    rows = load_runs([store], get_protocol("tum-rgbd/v1")).rows
     assert {row.started[:10]: row.is_current for row in rows} == {"2026-01-01": True, "2026-01-02": False}
 
 

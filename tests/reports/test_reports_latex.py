@@ -9,9 +9,8 @@ import pytest
 from reports_fake_store import add_run
 
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.tables.latex import escape_latex, to_latex
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, to_csv, to_markdown
-from dynslam_bench.runs.storage.store import RunStore
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, escape_latex, to_csv, to_latex, to_markdown
+from dynslam_bench.runs.store import RunStore
 
 needs_tex = pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
 NAMES = (

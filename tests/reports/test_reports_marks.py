@@ -7,11 +7,10 @@ import pandas as pd
 import pytest
 from reports_fake_store import add_run
 
-from dynslam_bench.cli.run_rows import seen_note
 from dynslam_bench.reports import build_report, compare, load_board
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s
-from dynslam_bench.runs.storage.store import RunStore
-from dynslam_bench.segmentation.training_set import seen_in_training
+from dynslam_bench.runs.store import RunStore
+from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.trackers import TRACKERS
 
 OLD, NEW = "synthetic/walking_xyz?scene=3", "synthetic/walking_xyz?scene=103"
@@ -47,7 +46,7 @@ def test_what_the_embedded_network_was_trained_on(source, sequence, seen):
 
 def test_such_cells_do_not_rank_unless_asked_for(store):
     board = load_board(store)
-    names = {board.first(key).tracker: key for key in board.labels}
+    names = {board.first(key).tracker.id: key for key in board.labels}
     assert board.common == [NEW] and set(board.ranked) == set(names.values())
     everything = load_board(store, rank_seen=True)
     assert set(everything.common) == {OLD, NEW} and len(everything.ranked) == 4
@@ -58,8 +57,8 @@ def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ran
     for tracker, masks in (("orb-slam2", ""), ("ds-slam", "oracle"), ("mask-rcnn", "embedded")):
         add_run(store, tracker, OLD, masks=masks, error=0.001 if masks == "embedded" else 0.03)
     board = load_board(store)
-    assert {board.first(key).tracker for key in board.ranked} == {"orb-slam2", "ds-slam"}
-    assert {board.first(key).tracker for key in board.trackers} == {"orb-slam2", "ds-slam", "mask-rcnn"}, "but shown"
+    assert {board.first(key).tracker.id for key in board.ranked} == {"orb-slam2", "ds-slam"}
+    assert {board.first(key).tracker.id for key in board.trackers} == {"orb-slam2", "ds-slam", "mask-rcnn"}, "but shown"
     assert len(load_board(store, rank_seen=True).ranked) == 3
 
 
@@ -82,13 +81,6 @@ def test_every_format_carries_the_mark(store, tmp_path, rank_seen):
     assert set(zip(marked["tracker"], marked["sequence"], strict=True)) == {("mask-rcnn", OLD), ("dynaslam", OLD)}
     assert ("--rank-seen" in markdown + page) is rank_seen
     assert "§" in compare(store, store).to_markdown()
-
-
-def test_run_says_it_in_one_line(store):
-    records = [store.get(run) for run in store.ids()]
-    assert seen_note(records).startswith("2 of 8 runs have masks of a network that was trained on their scene")
-    assert seen_note(records).endswith("e.g. synthetic/walking_xyz?scene=100") and "\n" not in seen_note(records)
-    assert seen_note([record for record in records if record.sequence.id == NEW]) == ""
 
 
 def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_path):

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dynslam_bench.reports.tables.latex import to_latex
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_markdown
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, emphasise, to_csv, to_latex, to_markdown
 
 
 def test_best_and_second_share_their_marks():
@@ -33,16 +32,6 @@ def test_tables_in_every_format():
         Table("t", "t", "", table.columns, [[*table.rows[0][:2], TableCell("1")]])
     )
     assert r"a\textbar{}b\_* & \textbf{0.5} &  \\" in latex
-
-
-def test_a_table_is_two_frames():
-    cells = [[TableCell("a"), TableCell("0.5", "±0.1", 0.51234), TableCell("3", value=3)]]
-    cells.append([TableCell("b"), TableCell("–"), TableCell()])
-    table = Table("t", "T", "c", [Column("name", numeric=False), Column("x"), Column("y")], cells)
-    assert table.rows == cells
-    assert table.values.dtypes.astype(str).to_dict() == {"name": "string", "x": "Float64", "y": "Int64"}
-    assert table.values["x"].tolist()[0] == 0.51234 and table.values["x"].isna().tolist() == [False, True]
-    assert to_csv(table) == "name,x,y\na,0.51234,3\nb,–,\n"
 
 
 def test_a_column_in_which_nothing_is_written_is_in_the_csv_only():

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.contracts.result import TrackResult
-from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.contracts.tracker import TrackerSpec, TrackResult
 from dynslam_bench.core.settings import Settings
 
 DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(300)"

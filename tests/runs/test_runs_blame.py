@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from envs_toys import TARGET, write_folder
 
-from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.runs import RunSpec, RunStore, run_many, run_one
 
@@ -124,23 +122,3 @@ def test_one_bad_sequence_stops_no_other(store: RunStore, damaged, tmp_path: Pat
     assert [sequence for sequence, _ in told] == [missing, folder]
     with pytest.raises(DynslamError, match="missing"):  # nobody is told: raised at the end
         run_many(specs, results=store)
-
-
-def test_the_command_line_stores_the_good_ones_says_the_bad_one_and_exits_with_3(
-    damaged, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder, image = damaged
-    good = shutil.copytree(folder, tmp_path / "good")
-    image.write_text("no image")
-    suite = tmp_path / "mine.toml"
-    suite.write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = {json.dumps([folder, str(good)])}\n")
-    with pytest.raises(SystemExit) as ended:
-        start(["bench", str(suite), "--results", str(tmp_path / "results"), "--json"])
-    out, errors = capsys.readouterr()
-    assert ended.value.code == 3
-    assert [row["status"] for row in json.loads(out)] == ["ok", "ok"]
-    lines = [line for line in errors.splitlines() if image.name in line]
-    assert len(lines) == 2 and all("cannot be decoded" in line for line in lines)  # one a run that was begun
-    with pytest.raises(SystemExit) as ended:
-        start(["run", "never-move", folder, "--results", str(tmp_path / "results")])
-    assert ended.value.code == 1

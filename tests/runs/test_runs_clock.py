@@ -5,14 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from itertools import cycle
-from pathlib import Path
 
-import optuna
 import pytest
 from envs_toys import TARGET
 
 from dynslam_bench.runs import RunSpec, RunStore, resolve, run_many
-from dynslam_bench.tuning.journal_file import WholeLines
 
 
 @pytest.fixture(autouse=True)
@@ -38,12 +35,3 @@ def test_runs_are_made_waited_for_and_kept(store: RunStore, toy_folder: str) -> 
     thread.join(300)
     assert [record.status for record in made] == ["ok", "ok"]
     assert all(0 < record.wall_s < 900 and 0 < record.timings["total"].mean_s < 900 for record in made)
-
-
-def test_a_study_is_kept(tmp_path: Path) -> None:
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    for _ in range(2):
-        storage = optuna.storages.JournalStorage(WholeLines(tmp_path / "journal.log"))
-        study = optuna.create_study(storage=storage, study_name="s", load_if_exists=True)
-        study.optimize(lambda trial: trial.suggest_float("x", 0, 1), n_trials=3)
-    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 6

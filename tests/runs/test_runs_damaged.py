@@ -4,35 +4,22 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from dynslam_bench.core.errors import DynslamError, ReportError, RunError
-from dynslam_bench.core.records import Record
-from dynslam_bench.evaluation.evaluate import SCHEMA_VERSION as EVALUATION
+from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.model.report_data import SCHEMA_VERSION as REPORT
-from dynslam_bench.reports.model.report_data import ReportData
-from dynslam_bench.runs import RunRecord, RunStore, score
-from dynslam_bench.runs.frame_row import read_csv, read_log
-from dynslam_bench.runs.storage.frames import FrameLog
-from dynslam_bench.runs.storage.packing import pack, unpack
-from dynslam_bench.runs.storage.record import METRIC_SCHEMA, RUN_SCHEMA, MetricRecord
-from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore
-from dynslam_bench.sequences.fetch import Receipt
+from dynslam_bench.runs import RunStore, score
+from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
+from dynslam_bench.runs.many import pack, unpack
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
-VERSIONED: dict[str, tuple[type[Record], int]] = {
-    "run": (RunRecord, RUN_SCHEMA),
-    "metrics": (MetricRecord, METRIC_SCHEMA),
-    "report": (ReportData, REPORT),
-    "fetched": (Receipt, 1),
-    "segmenter": (SegmenterScore, 1),
-}
-"""Every record with a version of its own, and the newest."""
 GOOD, BAD = "e7f8d4df9db4bb16", "a7abe04996a79cc4"
 
 
@@ -101,23 +88,11 @@ def test_a_damaged_trajectory_is_the_reason_why_there_is_no_error(store: RunStor
     assert build_report(str(store.root), tmp_path / "report").html.is_file()
 
 
-@pytest.mark.parametrize("content", [b"\xff", b"{}", b"[]", None])
-def test_damaged_metrics_are_taken_again(store: RunStore, content: bytes | None) -> None:
-    record = store.read(BAD)
-    right = score(store, record).metrics
-    (path,) = [path for path in store.root.glob(f"metrics/*/{BAD}.json") if "tum-rgbd/v1" in path.read_text()]
-    swapped = path.read_bytes().replace(BAD.encode(), GOOD.encode())  # those of another run
-    path.write_bytes(swapped if content is None else content)
-    assert right["ate_rmse_m"] > 0
-    assert score(store, record).metrics == pytest.approx(right, rel=1e-9), "to the last bits but few"
-    assert json.loads(path.read_text())["run_id"] == BAD
-
-
 def test_a_store_that_can_only_be_read_is_scored(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise DynslamError("cannot write: Read-only file system")
+    def refuse(*_: object, **__: object) -> None:
+        raise sqlite3.OperationalError("attempt to write a readonly database")
 
-    monkeypatch.setattr("dynslam_bench.runs.storage.store.write_atomic", refuse)  # root may write anywhere
+    monkeypatch.setattr("sqlite3.connect", refuse)  # root may write anywhere
     assert score(store, store.read(BAD), "evo-default").metrics["ate_rmse_m"] > 0
     assert len(store.frame("evo-default")) == 2
 
@@ -126,7 +101,7 @@ def test_a_store_that_can_only_be_read_is_scored(store: RunStore, monkeypatch: p
     "line",
     ['{"index": 1}', "[]", "null", "\udcff", '{"index": 1, "timestamp": 1e400, "state": "ok"}', "[" * 9999,
      '{"index": 1, "timestamp": 2, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 0]}',
-     '{"index": 1, "timestamp": 2, "state": "ok", "stats": {"a": ' + "9" * 400 + "}}",
+     '{"index": 1, "timestamp": 2, "state": "ok", "stats": {"a": "x"}}',
      '{"index": 1, "timestamp": 2, "state": "flying"}', '{"index": 1, "timestamp": 0.5, "state": "ok"}',
      '{"index": 1, "timestamp": 2, "state": "ok", "extra": 1}', '{"index": -1, "timestamp": 2, "state": "ok"}',
      '{"index": 99999999999999999999, "timestamp": 2, "state": "ok"}'],
@@ -135,16 +110,17 @@ def test_a_damaged_log_of_frames_is_taken_up_to_the_damage(tmp_path: Path, line:
     good = '{"index": 0, "timestamp": 1.0, "state": "ok", "pose": [0, 0, 0, 0, 0, 0, 1], "stats": {"a": 1}}'
     path = tmp_path / "frames.jsonl"
     path.write_bytes(f"{good}\n{line}\n{good}\n".encode(errors="surrogateescape"))
-    rows, damage = read_log(path)
+    log = FrameLog.read(path)
+    rows, damage = log.rows, log.damage
     # a line that is no UTF-8 may take those before it in the same block with it
     assert len(rows) in ((0, 1) if "\udcff" in line else (1,)) and "is damaged" in damage and "\n" not in damage
-    FrameLog.read(path).write(tmp_path, "comment")
+    log.write(tmp_path, "comment")
     assert len(read_csv(tmp_path / "frames.csv")) == len(rows)
 
 
 def test_stats_named_with_half_characters_are_stored(tmp_path: Path) -> None:
     path = tmp_path / "frames.jsonl"
-    path.write_text('{"index": 0, "timestamp": 1.0, "state": "ok", "stats": {"a\\ud800": 1}}\n')
+    path.write_text(FrameRow.of(FrameOutcome(0, 1.0, "ok", np.eye(4), {"a\ud800": 1.0}, {}, None, 0.0)).to_json())
     FrameLog.read(path).write(tmp_path, "by \ud800")
     assert "stat_a\\ud800" in (tmp_path / "frames.csv").read_text()
 
@@ -192,16 +168,3 @@ def test_packed_runs_that_claim_or_hold_too_much_are_refused(store: RunStore, tm
     with pytest.raises(DynslamError):
         unpack(bytes(damaged), target)
     assert target.ids() == [] and list(target.runs.iterdir()) == []
-
-
-def test_every_version_of_a_stored_record_loads() -> None:
-    """A fixture for each version: whoever raises one adds the files of the version before."""
-    data = Path(__file__).parent / "data"
-    for kind, (cls, newest) in VERSIONED.items():
-        for version in range(1, newest + 1):
-            found = cls.read(data / f"{kind}_v{version}.json")
-            assert found.schema_version == version and cls.parse(found.to_json(), kind) == found  # type: ignore[attr-defined]
-        text = (data / f"{kind}_v{newest}.json").read_text().replace('schema_version": 1', 'schema_version": 99', 1)
-        with pytest.raises(DynslamError, match=r"schema_version.*a newer dynslam-bench wrote it"):
-            cls.parse(text, kind)
-    assert json.loads((data / "metrics_v1.json").read_text())["online"]["schema_version"] == EVALUATION == 1

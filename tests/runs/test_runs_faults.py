@@ -10,24 +10,21 @@ import numpy as np
 from faults import survey, tree
 
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.runs import MetricRecord, RunRecord, RunStore
-from dynslam_bench.runs.storage.store import RUN_FILE
+from dynslam_bench.runs import RunRecord, RunStore
+from dynslam_bench.runs.run_index import RUN_FILE
 
-DATA = Path(__file__).parent / "data"
-RECORD = RunRecord.read(DATA / "run_v1.json")
-METRICS = MetricRecord.read(DATA / "metrics_v1.json")
+RECORD = RunRecord.read(Path(__file__).parent / "data" / "run.json")
 FAILED = RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})
 TRUTH = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)))
 
 
 def make(root: Path, record: RunRecord) -> None:
-    """What a run writes into the store, from the first folder to the metrics."""
+    """What a run writes into the store."""
     store = RunStore(root)
     store.prepare()
     with store.claim(record.run_id), store.work_folder(record.run_id) as work:
         store.add_sequence(record.sequence.part, TRUTH.timestamps_ns, TRUTH)
         store.publish(work, record)
-    store.add_metrics(METRICS)
 
 
 def held(root: Path) -> dict[str, bytes | str]:
@@ -46,7 +43,7 @@ def test_a_new_run_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
         assert records in ([], [RECORD]) and unreadable == []
 
     found = survey(lambda: make(root, RECORD), root, halfway=whole_or_missing, result=lambda: held(root))
-    assert {name.split("/")[0] for name in tree(root)} == {"runs", "metrics", "sequences", "latest"}
+    assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
     assert found.operations > 20 and found.ends["kill", -9] == found.operations
     assert found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5 and found.faults == 4 * found.operations
 

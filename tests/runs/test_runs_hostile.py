@@ -11,7 +11,7 @@ import hostile
 import pytest
 
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_one
-from dynslam_bench.runs.process import memory as memory_module
+from dynslam_bench.runs.process import tree as memory_module
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
 
@@ -63,15 +63,6 @@ def test_every_bad_end_is_one_line(attack, mode: str, status: str, reason: str) 
     assert "\n" not in record.reason
 
 
-@pytest.mark.parametrize(
-    ("mode", "reason"), [("segfault", "SIGSEGV"), ("os._exit", "the process left with exit code 0"), ("thread", "")]
-)
-def test_a_fresh_interpreter_ends_likewise(attack, monkeypatch, mode: str, reason: str) -> None:
-    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")
-    record, _ = attack(mode)
-    assert record.reason.startswith(reason) and record.failed == bool(reason)
-
-
 @linux
 @pytest.mark.parametrize("start", ["fork", "fresh"])
 def test_nothing_survives_a_good_run(attack, monkeypatch, start: str) -> None:
@@ -95,7 +86,7 @@ def test_memory_that_forks_share_counts_once(attack) -> None:
     """300 MB and three forks: four times as much by resident memory, which is not what the machine lacks."""
     plain, _ = attack("ok")
     assert plain.peak_memory_mb is not None
-    record, pids = attack("shared", memory_mb=plain.peak_memory_mb + 700)
+    record, pids = attack("shared", memory_mb=plain.peak_memory_mb + 700, frame_s=60)
     assert record.status == "ok", record.reason
     assert 300 < record.peak_memory_mb - plain.peak_memory_mb < 700  # a fork that ends while it is counted counts twice
     assert len(pids) == 3 and alive(pids) == []

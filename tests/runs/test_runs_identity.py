@@ -101,7 +101,7 @@ def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
     write(folder / "params" / "net.bin", "1111")
     write(folder / "notes.md", "nothing reads this")
     write(folder / "results" / "runs" / "x" / "slam.yaml", "an output")
-    write(folder / "results" / "index" / "x", "an output")
+    write(folder / "results" / "index.sqlite", "an output")
     return RunSpec(tracker=f"{folder / 'mine.py'}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))), folder
 
 

@@ -16,12 +16,10 @@ import hostile
 import pytest
 
 from dynslam_bench.core.errors import InfrastructureError
-from dynslam_bench.core.temporary import SHARED_MEMORY
+from dynslam_bench.core.files import SHARED_MEMORY
 from dynslam_bench.runs import Limits, RunSpec, RunStore, run_many, run_one
-from dynslam_bench.runs.process.handle import Child, ForkedChild
-from dynslam_bench.runs.process.job import make_job
-from dynslam_bench.runs.process.server import SERVER
-from dynslam_bench.runs.process.supervise import supervise
+from dynslam_bench.runs.process.fork_server import SERVERS, Child, make_job
+from dynslam_bench.runs.process.supervisor import supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
 
@@ -107,8 +105,8 @@ def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store:
     seen = []
     for turn in (1, 2):
         seen = started(pids, 4 * turn)
-        time.sleep(0.3)
-        os.kill(SERVER._process.pid, signal.SIGKILL)  # nothing else knows its number
+        time.sleep(1.0)  # until the supervisor has seen them
+        os.kill(SERVERS["fork"]._process.pid, signal.SIGKILL)  # nothing else knows its number
         until(lambda: alive(seen) == [], 20)  # noqa: B023
     thread.join()
     assert len(errors) == 1 and isinstance(errors[0], InfrastructureError)
@@ -152,24 +150,30 @@ def test_a_full_disk_or_a_removed_folder_is_no_outcome(mode: str, words: str, tm
     assert store.ids() == []
 
 
-class _Slow(Child):
+class _Slow:
     """A child that is ready late, as when the fork server still loads; then it does nothing."""
 
+    pid, lost = 0, ""
+
     def __init__(self, ready_after_s: float) -> None:
-        ours, self.theirs = Pipe()
-        super().__init__(ours)
+        self.connection, self.theirs = Pipe()
+        self.status_fd, self._write_fd = os.pipe()
+        self.members: list = []
         self.ready_at = time.monotonic() + ready_after_s
-        self.told = False
-        self.over = False
+        self.is_ready = self.has_ended = False
 
     def poll(self) -> int | None:
-        if not self.told and time.monotonic() > self.ready_at:
-            self.told = True
+        if not self.is_ready and time.monotonic() > self.ready_at:
+            self.is_ready = True
             self.theirs.send_bytes(json.dumps({"type": "ready"}).encode())
-        return 0 if self.over else None
+        return 0 if self.has_ended else None
 
     def kill(self) -> None:
-        self.over = True
+        self.has_ended = True
+
+    def close(self) -> None:
+        os.close(self.status_fd)
+        os.close(self._write_fd)
 
 
 def test_the_time_limit_begins_when_the_run_does(tmp_path: Path) -> None:
@@ -205,5 +209,5 @@ def test_a_forked_run_finds_imported_what_every_run_needs(tmp_path: Path) -> Non
     text = "import sys\nfound = sorted(sys.modules)\ndef tell(*_):\n    return {'type': 'done', 'found': found}\n"
     (tmp_path / "asks.py").write_text(text)
     job = make_job(f"{tmp_path / 'asks.py'}:tell", tmp_path, spec={"threads": 1})
-    found = supervise(ForkedChild(), job, Limits()).final["found"]
+    found = supervise(Child(), job, Limits()).final["found"]
     assert {"torch", "dynslam_bench.runs.loop", "dynslam_bench.trackers.systems.yolo_slam"} <= set(found)

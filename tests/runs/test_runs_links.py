@@ -13,12 +13,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
 from reports_fake_store import add_run
 
 from dynslam_bench.core.errors import DynslamError, RunError, StudyError
-from dynslam_bench.core.locks import claimed
-from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.core.files import claimed
 from dynslam_bench.runs import RunStore
-from dynslam_bench.runs.storage.run_index import index_file
-from dynslam_bench.runs.storage.run_list import list_runs
-from dynslam_bench.tuning.journal_file import WholeLines
+from dynslam_bench.runs.store import list_runs
+from dynslam_bench.tuning.storage import JournalFile
 
 SECRET = "the user's own words"
 
@@ -65,15 +63,6 @@ def test_a_pipe_hangs_nothing(filled: tuple[RunStore, str]) -> None:
     assert found == [] and bad.reason.endswith("run.json is no plain file")
 
 
-def test_a_pipe_in_the_place_of_the_index_hangs_nothing(filled: tuple[RunStore, str]) -> None:
-    store, run = filled
-    index = index_file(store.root, get_protocol("tum-rgbd/v1"))
-    index.parent.mkdir()
-    os.mkfifo(index)
-    assert store.score(store.read_whole(run)).run_id == run  # which would add a line to it
-    assert [row["run_id"] for row in list_runs(store)[0]] == [run]
-
-
 @pytest.mark.parametrize("file", ["groundtruth.txt", "timestamps.txt"])
 def test_the_truth_of_a_part_is_no_link_to_elsewhere(filled: tuple[RunStore, str], outside: Path, file: str) -> None:
     store, run = filled
@@ -88,11 +77,6 @@ def test_the_truth_of_a_part_is_no_link_to_elsewhere(filled: tuple[RunStore, str
 
 def test_nothing_is_written_through_links(filled: tuple[RunStore, str], outside: Path, tmp_path: Path) -> None:
     store, run = filled
-    index = index_file(store.root, get_protocol("tum-rgbd/v1"))
-    index.parent.mkdir()
-    index.symlink_to(outside)
-    assert store.score(store.read_whole(run)).run_id == run and outside.read_text() == SECRET
-    assert len(list_runs(store)[0]) == 1 and outside.read_text() == SECRET
     claim = store.runs / f".{run}.claim"
     claim.symlink_to(tmp_path / "new")
     with pytest.raises(DynslamError, match="cannot write"), claimed(claim):
@@ -101,5 +85,5 @@ def test_nothing_is_written_through_links(filled: tuple[RunStore, str], outside:
     journal = tmp_path / "journal.log"
     journal.symlink_to(outside)
     with pytest.raises(StudyError, match="is a link"):
-        WholeLines(journal)
+        JournalFile(journal)
     assert outside.read_text() == SECRET

@@ -14,9 +14,9 @@ from envs_toys import TARGET, truth
 
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_tum, write_tum
+from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
 from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
-from dynslam_bench.runs.storage.packing import pack, unpack
+from dynslam_bench.runs.many import pack, unpack
 
 
 def specs(folder: str, seeds: range, **change) -> list[RunSpec]:
@@ -41,12 +41,6 @@ def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
     assert kinds(events) == {"finished": 2, "reused": 2, "started": 2}
     assert second[:2] == first and [record.seed for record in second] == [0, 1, 2, 3]
     assert all(score(store, record).metrics["ate_rmse_m"] > 0 for record in second)
-
-
-def test_equal_specs_are_made_once(store: RunStore, toy_folder: str) -> None:
-    events: list = []
-    records = run_many([*specs(toy_folder, range(1)), *specs(toy_folder, range(1))], results=store, **follow(events))
-    assert kinds(events) == {"finished": 1, "started": 1} and records[0] == records[1]
 
 
 def test_a_run_of_a_study_is_an_ordinary_one_once_it_is_asked_for_without(store: RunStore, toy_folder: str) -> None:
@@ -77,12 +71,6 @@ def test_a_wrong_name_is_refused_before_anything_runs(store: RunStore, toy_folde
     assert store.ids() == []
     with pytest.raises(RunError, match="jobs is 0"):
         run_many(specs(toy_folder, range(1)), results=store, jobs=0)
-
-
-def test_a_damaged_record_is_made_again(store: RunStore, toy_folder: str) -> None:
-    record = run_many(specs(toy_folder, range(1)), results=store)[0]
-    (store.folder(record.run_id) / "run.json").write_text("{")
-    assert run_many(specs(toy_folder, range(1)), results=store)[0].status == "ok"
 
 
 def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:

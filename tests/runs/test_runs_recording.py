@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,14 @@ import numpy as np
 import pytest
 from envs_toys import CAMERA, TARGET, write_folder
 
-from dynslam_bench.contracts.map_outputs import MapOutputs
+from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core.errors import RunError
-from dynslam_bench.geometry.tum_file import read_tum
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.runs import RunSpec, RunStore, export_run, run_one
-from dynslam_bench.runs.exchange.recording import RECORDING_FILE, RecordingWriter, check_rerun
-from dynslam_bench.runs.snapshots import read_snapshots
-from dynslam_bench.slam.outputs.map_files import write_ply
+from dynslam_bench.runs.artifacts import read_snapshots
+from dynslam_bench.runs.exchange.recording import RECORDING_FILE, check_rerun, write_recording
+from dynslam_bench.slam.map_files import write_ply
 
 try:
     from rerun import chunk
@@ -86,41 +86,11 @@ def test_a_recording_of_100_frames(store: RunStore, tmp_path: Path) -> None:
     assert not exported.notes
 
 
-ALONE = """
-import sys
-from pathlib import Path
-from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.runs.loop import run_loop
-from dynslam_bench.runs.spec import RunSpec
-spec = RunSpec(tracker="constant-velocity", sequence=sys.argv[1], rrd=True).model_dump(mode="json")
-protocol = get_protocol("tum-rgbd/v1").model_dump(mode="json")
-job = {"spec": spec, "folder": sys.argv[2], "protocol": protocol, "progress_every": 50}
-run_loop(job, lambda message: None, lambda: False)
-print(sorted({"rerun", "pandas", "pyarrow"} & set(sys.modules)))
-"""
-
-
 @needs_rerun
-def test_a_run_waits_for_none_of_the_libraries_that_write_its_recording(tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "toy", 5)
-    done = subprocess.run([sys.executable, "-c", ALONE, str(folder), str(tmp_path)], capture_output=True, text=True)
-    assert done.stdout.split() == ["[]"], done.stderr
-    assert list(Opened(tmp_path / RECORDING_FILE)("/world/camera", "Transform3D:translation")) == list(range(5))
-
-
-@needs_rerun
-@pytest.mark.parametrize("apart", [False, True])
-def test_a_recording_that_cannot_be_written_says_so(tmp_path: Path, apart: bool) -> None:
+def test_a_recording_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
     with pytest.raises(RunError, match=r"cannot write .*missing/recording.rrd: "):
-        RecordingWriter(tmp_path / "missing" / RECORDING_FILE, CAMERA, "toy", apart=apart)
-
-
-def test_a_writer_that_dies_is_an_error_and_no_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "rerun.py").write_text("raise SystemExit(7)")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    writer = RecordingWriter(tmp_path / RECORDING_FILE, CAMERA, "toy", apart=True)
-    with pytest.raises(RunError, match="its process ended with exit code 7"):
-        writer.close()
+        write_recording(tmp_path / "missing" / RECORDING_FILE, CAMERA, "toy", [], (nothing, None))
 
 
 @needs_rerun

@@ -7,15 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from envs_toys import ToySequence
 
-from dynslam_bench.core.errors import DynslamError, SegmentationError
+from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.runs import RunSpec, RunStore, run_many, run_one
-from dynslam_bench.segmentation.availability import segmentation_source
-from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
-from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
 from dynslam_bench.tuning import StudySpec, Tuner
 
 
@@ -35,7 +31,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple
         "no folder": (f"recorded:{tmp_path}/none", r"recorded masks .*none does not exist"),
         "too few masks": (f"recorded:{tmp_path}/masks", r"has none for 40 of 60 frames of '.*', the first is frame 20"),
         "oracle": ("oracle", r"has no exact masks"),
-        "auto": ("auto", r"no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH.*needs none"),
+        "auto": ("auto", r"no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH"),
         "plugin": ("plugin:mine", r"unknown segmenter 'mine'"),
     }
 
@@ -89,7 +85,7 @@ def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_fold
             run_one(spec, store)
         return caught.value.options[-1]
 
-    assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft-no-masks" in hint("mask-rcnn")
+    assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft?masks=none" in hint("mask-rcnn")
 
 
 def test_a_study_refuses_it_too(toy_folder: str, mistakes, tmp_path: Path) -> None:
@@ -136,39 +132,3 @@ def test_what_only_the_run_can_find_out_is_refused_likewise(store: RunStore, toy
     with pytest.raises(DynslamError, match=r"picky cannot run on .*: frame 0 of 60: the calibration file is missing"):
         run_one(RunSpec(tracker=f"{tmp_path}/picky.py:SPEC", sequence=toy_folder), store)
     assert store.ids() == []
-
-
-def test_frames_without_a_recorded_mask(tmp_path: Path) -> None:
-    image = np.zeros((4, 4), np.uint8)
-    for stamp in (1.0, 1.1, 1.31):
-        cv2.imwrite(str(tmp_path / f"{stamp:.6f}.png"), image)
-    masks = RecordedSegmenter(tmp_path)
-    assert masks.missing(np.array([0.985, 1.1, 1.2, 1.3, 5.0])) == [2, 4]
-    (tmp_path / "1.100000.png").unlink()
-    (tmp_path / "1.310000.png").unlink()
-    assert RecordedSegmenter(tmp_path).missing(np.array([1.0, 1.1])) == [1]
-
-
-def test_a_schedule_excuses_only_the_masks_that_it_never_asks_for(tmp_path: Path) -> None:
-    """Half of the masks are missing: found before the run, whatever the schedule, unless none of them is needed."""
-    for index in range(0, 12, 2):
-        cv2.imwrite(str(tmp_path / f"{index:06d}.png"), np.zeros((120, 160), np.uint8))
-    sequence = ToySequence(12)
-
-    def source(**how: object) -> str:
-        group = {"source": f"recorded:{tmp_path}", **how}
-        return segmentation_source(SemanticSystemSettings.model_validate({"segmentation": group}), sequence)
-
-    for n in (2, 4):
-        assert source(schedule="every_nth", n=n) == f"recorded:{tmp_path}"
-    for how, words in (
-        ({}, "6 of 12 frames of 'toy/walk', the first is frame 1 "),
-        ({"schedule": "keyframes"}, "6 of 12 frames of 'toy/walk', the first is frame 1 "),
-        ({"schedule": "every_nth", "n": 3}, "2 of 12 frames of 'toy/walk', the first is frame 3 "),
-        (
-            {"schedule": "every_nth", "n": 2, "crowded_share": 0.5},
-            "6 of 12 frames of 'toy/walk', the first is frame 1 ",
-        ),
-    ):
-        with pytest.raises(SegmentationError, match=words):
-            source(**how)

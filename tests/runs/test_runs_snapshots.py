@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.contracts.result import TrackResult
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
-from dynslam_bench.runs.frame_row import FIXED, FrameRow, read_csv, read_log, write_csv
-from dynslam_bench.runs.snapshots import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
+from dynslam_bench.runs.artifacts import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
+from dynslam_bench.runs.frames import FIXED, FrameLog, FrameRow, read_csv, write_csv
 
 SHAPE = (48, 65, 3)
 
@@ -79,4 +79,4 @@ def test_a_row_comes_back_whole_from_the_log_of_a_run(tmp_path: Path) -> None:
     row = FrameRow(3, 1.5, "ok", **numbers, timings={"read": 0.1}, stats={"culled": 7}, pose=[0.0] * 6 + [1.0])
     assert None not in [getattr(row, each.name) for each in fields(row)]
     (tmp_path / "log").write_text(row.to_json())
-    assert read_log(tmp_path / "log") == ([row], "")
+    assert FrameLog.read(tmp_path / "log") == FrameLog([row])

@@ -8,22 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dynslam_bench.contracts.map_outputs import KeyframeRecord, MapOutputs
+from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.errors import RunError, SettingsError, TrackerError
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.labels import make_labels
-from dynslam_bench.reports.model.make_row import make_row
 from dynslam_bench.reports.model.missing import run_command
-from dynslam_bench.reports.model.row_values import variant_of
+from dynslam_bench.reports.model.names import make_labels
+from dynslam_bench.reports.model.row import make_row
 from dynslam_bench.runs import RunSpec, RunStore, run_many
-from dynslam_bench.runs.identity import resolve
-from dynslam_bench.runs.kept_map import keep_map
-from dynslam_bench.runs.start_map import check_unchanged, start_map_of
-from dynslam_bench.runs.storage.run_index import run_row
-from dynslam_bench.runs.storage.run_table import runs_frame
-from dynslam_bench.slam.mapping.saved_map import MAP_FILE, SavedMap, read_map, write_map
+from dynslam_bench.runs.artifacts import keep_map
+from dynslam_bench.runs.identity import check_unchanged, resolve, start_map_of
+from dynslam_bench.runs.run_index import run_row, runs_frame
+from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 
 SEQUENCE = "synthetic/walking_xyz"
@@ -70,10 +67,11 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
     other.replace(file)
     again = resolve(begun(file))
     assert again.run_id != found.run_id and again.start_map is not None
-    assert variant_of(found) != variant_of(found.model_copy(update={"start_map": again.start_map}))
     with pytest.raises(RunError, match="has changed since the run was asked for"):
         check_unchanged(begun_in, again.settings)
     row = make_row(store, found, get_protocol("tum-rgbd/v1"))
+    other_map = found.model_copy(update={"start_map": again.start_map})
+    assert row.variant_key != make_row(store, other_map, get_protocol("tum-rgbd/v1")).variant_key
     assert not row.ranked, "it knows more than one that begins without"
     assert make_board([row]).reference is None
     name = f"map={begun_in.digest[:8]}"
@@ -103,16 +101,13 @@ def test_maps_that_never_met_are_said(tmp_path: Path) -> None:
     keyframes = tuple(KeyframeRecord(i, i, i / 30, np.eye(4), 9, 9, number) for i, number in enumerate(numbers))
     none = np.zeros(0, np.int64)
     outputs = MapOutputs(keyframes, none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none)
-    apart = keep_map(
-        SimpleNamespace(map_outputs=lambda: outputs, exact_stamps={}), tmp_path, RunSpec(tracker="a", sequence="b")
-    )
-    assert apart.counts["maps"] == 3
-    assert apart.notes[0].startswith("3 maps that never met: 4 of 6 keyframes lie in others than the first")
+    spec = RunSpec(tracker="a", sequence="b")
+    _, counts, notes = keep_map(SimpleNamespace(map_outputs=lambda: outputs, exact_stamps={}), tmp_path, spec)
+    assert counts["maps"] == 3
+    assert notes[0].startswith("3 maps that never met: 4 of 6 keyframes lie in others than the first")
     one = MapOutputs(keyframes[:2], none, outputs.positions, outputs.colours, none)
-    met = keep_map(
-        SimpleNamespace(map_outputs=lambda: one, exact_stamps={}), tmp_path, RunSpec(tracker="a", sequence="b")
-    )
-    assert met.counts["maps"] == 1 and met.notes == ()
+    _, counts, notes = keep_map(SimpleNamespace(map_outputs=lambda: one, exact_stamps={}), tmp_path, spec)
+    assert counts["maps"] == 1 and notes == []
 
 
 def test_features_of_another_kind_begin_in_no_map() -> None:

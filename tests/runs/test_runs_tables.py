@@ -6,18 +6,14 @@ import re
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 
 from dynslam_bench.core.errors import RunError
-from dynslam_bench.envs.episode import FrameOutcome
-from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.reports import load_frame
 from dynslam_bench.runs import RunStore, load_frames, score
-from dynslam_bench.runs.frame_row import FrameRow, read_csv, read_log, write_csv
-from dynslam_bench.runs.storage.frames import FrameLog
-from dynslam_bench.runs.storage.run_list import list_runs
+from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
+from dynslam_bench.runs.store import list_runs
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
@@ -37,8 +33,8 @@ def store(tmp_path: Path) -> RunStore:
 
 def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("".join(row.to_json() for row in ROWS) + ROWS[0].to_json()[:40])
-    assert read_log(tmp_path / "log") == (ROWS, "")
-    assert read_log(tmp_path / "none") == ([], "")
+    assert FrameLog.read(tmp_path / "log") == FrameLog(ROWS)
+    assert FrameLog.read(tmp_path / "none") == FrameLog()
 
 
 def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
@@ -50,26 +46,11 @@ def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
     assert [row.pose for row in found] == [None] * 3
 
 
-def test_a_table_without_frames(tmp_path: Path) -> None:
-    write_csv(tmp_path / "frames.csv", [])
-    assert read_csv(tmp_path / "frames.csv") == []
-    assert load_frames(tmp_path).columns[0] == "index" and len(load_frames(tmp_path)) == 0
-
-
 @pytest.mark.parametrize("text", ["run,tracker\n1,x\n", "index,timestamp,state,reward_m\n0,1.0,asleep,0\n"])
 def test_another_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "frames.csv").write_text(text)
     with pytest.raises(RunError, match="is no table of frames: row 1 is damaged"):
         read_csv(tmp_path / "frames.csv")
-
-
-def test_the_row_of_an_outcome() -> None:
-    pose = np.eye(4)
-    pose[:3, 3] = 1, 2, 3
-    error = OnlineSample(trans_m=0.5, rot_deg=5.0, frame_trans_m=0.1, frame_rot_deg=1.0)
-    row = FrameRow.of(FrameOutcome(7, 2.0, "ok", pose, {"a": 1.0}, {"total": 0.2}, error, -0.1), mask_iou=0.5)
-    assert row.pose == [1, 2, 3, 0, 0, 0, 1] and (row.pose_error_trans_m, row.frame_error_rot_deg) == (0.5, 1.0)
-    assert FrameLog([row]).trajectory().T_world_cam[0] == pytest.approx(pose)
 
 
 def test_frames_of_a_run_by_record_id_and_path(store: RunStore) -> None:
@@ -133,11 +114,6 @@ def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
     for line in store.frame().astype(object).to_dict("records"):
         row = by_id[line["run_id"]]
         assert all(row[name] == (None if line[name] is pd.NA else line[name]) or row[name] == "" for name in shared)
-
-
-def test_an_empty_store_has_the_same_columns(store: RunStore, tmp_path: Path) -> None:
-    empty = RunStore(tmp_path / "nothing").frame()
-    assert len(empty) == 0 and set(empty.columns) <= set(store.frame().columns) and "ate_rmse_m" in empty
 
 
 def test_from_results_to_a_plot_in_three_lines(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,17 +11,22 @@ import torch
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.networks import onnx_export as static
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig
+from dynslam_bench.segmentation.networks.boxes import box_iou, nms
 from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
-from dynslam_bench.segmentation.networks.mask_rcnn import static
-from dynslam_bench.segmentation.networks.mask_rcnn.box_ops import box_iou, nms
-from dynslam_bench.segmentation.networks.mask_rcnn.config import NetworkConfig
-from dynslam_bench.segmentation.networks.mask_rcnn.network import MaskRCNN
-from dynslam_bench.segmentation.networks.mask_rcnn.segmenter import MaskRCNNSegmenter
-from dynslam_bench.segmentation.networks.mask_rcnn.static import StaticMaskRCNN, overlap, unsuppressed
-from dynslam_bench.segmentation.networks.onnx.export import parse_size, weights_of, write_onnx
-from dynslam_bench.segmentation.networks.onnx.segmenter import OnnxSegmenter
-from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
+from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.networks.onnx_export import (
+    StaticMaskRCNN,
+    overlap,
+    parse_size,
+    unsuppressed,
+    weights_of,
+    write_onnx,
+)
+from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
+from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
 
 SETTINGS = SegmentationSettings(network_side=0)
 CLASSES = ("person", "chair", "dog")
@@ -65,7 +70,7 @@ def test_fixed_shapes_give_the_same_objects(exact: bool) -> None:
     image = noise(120, 160)
     expected = MaskRCNNSegmenter(network, settings).segment(Frame(0, 0.0, image, np.zeros((120, 160), np.float32)))
     with torch.no_grad():
-        found = StaticMaskRCNN(network, 120, 160, score=0.1, iou=settings.nms_iou)(
+        found = StaticMaskRCNN(network, 120, 160, score=0.1, iou=NMS_IOU)(
             torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
         )
     rows = objects(found, settings.mask_threshold)
@@ -94,21 +99,6 @@ def test_suppression_in_rounds_is_the_greedy_one() -> None:
     assert torch.nonzero(without)[:, 0].tolist() == [1 + i for i in nms(boxes[1:], scores[1:], 0.3).tolist()]
 
 
-def test_the_embedded_network_with_fixed_shapes() -> None:
-    weights = embedded_weights()
-    assert weights is not None
-    frame = open_sequence("synthetic/walking_static?scene=101&frames=40")[20]
-    segmenter = MaskRCNNSegmenter.from_file(weights, SETTINGS)
-    expected = segmenter.segment(frame)
-    network = StaticMaskRCNN(segmenter.network, *frame.rgb.shape[:2], score=0.1, iou=SETTINGS.nms_iou)
-    with torch.no_grad():
-        boxes, _, scores, masks = network(torch.from_numpy(frame.rgb).permute(2, 0, 1)[None].float() / 255)
-    count = len(expected.scores)
-    assert count >= 1 and int((scores > 0).sum()) == count
-    assert np.abs(boxes[:count].numpy() - expected.boxes).max() < 1e-2
-    assert np.logical_xor(masks[:count, 0].numpy() >= 0.5, expected.masks).sum() <= 0.01 * expected.masks.sum()
-
-
 def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The file of a small network in ONNX Runtime, and in OpenCV where that can load it."""
     runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
@@ -135,7 +125,7 @@ def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_what_cannot_be_exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with pytest.raises(SegmentationError, match=r"'yolo' is no network of ours \(export embedded, coco or"):
+    with pytest.raises(SegmentationError, match=r"'yolo' is no network of this project \(export embedded, coco or"):
         weights_of("yolo")
     with pytest.raises(SegmentationError, match=r"'640' is no size of an image \(for example 640x480"):
         parse_size("640")

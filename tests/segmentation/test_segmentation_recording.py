@@ -8,11 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dynslam_bench.cli.app import start
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
-from dynslam_bench.segmentation.masks.recording import LabelNumbers, record_masks
+from dynslam_bench.segmentation.recorded import LabelNumbers, RecordedSegmenter, record_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -69,11 +67,3 @@ def test_numbers_stand_for_classes_in_every_frame(tmp_path: Path) -> None:
     assert [table[int(v)] for v in first[0, :4]] == ["person", "person", "chair", "person"], "the surest is on top"
     assert [table[int(v)] for v in again[0, :3]] == ["chair", "chair", "person"]
     assert len(np.unique(first)) == 4
-
-
-def test_the_command_says_how_to_use_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        start(["segmenter", "record", "synthetic/walking_xyz?scene=0&frames=60", str(tmp_path / "m"),
-               "--source", "oracle", "--frames", "0:2"])  # fmt: skip
-    assert ended.value.code == 0
-    assert "2 of 2 frames segmented now; use them with --set segmentation.source=recorded:" in capsys.readouterr().out

@@ -1,6 +1,5 @@
 """Settings, classes, oracle and recorded masks, and the choice among the sources."""
 
-import contextlib
 import functools
 import hashlib
 import http.server
@@ -15,19 +14,20 @@ import pytest
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
-from dynslam_bench.core import download_progress
 from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.core.settings import apply_overrides, build, parameters
 from dynslam_bench.segmentation import build_segmenter as building
-from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
-from dynslam_bench.segmentation.classes import COCO_IDS, COCO_NAMES, VOC_NAMES, expand_classes
-from dynslam_bench.segmentation.masks.oracle import OracleSegmenter
-from dynslam_bench.segmentation.masks.recorded import RecordedSegmenter
+from dynslam_bench.segmentation.build_segmenter import (
+    SEGMENTERS,
+    SegmenterSpec,
+    build_segmenter,
+    resolve_source,
+    weights_digest,
+)
 from dynslam_bench.segmentation.networks import checkpoints
-from dynslam_bench.segmentation.networks.images import as_rgb
-from dynslam_bench.segmentation.registry import SEGMENTERS, SegmenterSpec
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.recorded import OracleSegmenter, RecordedSegmenter
+from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, VOC_NAMES, SegmentationSettings, expand_classes
 
 
 def frame(index=0, stamp=0.0, shape=(24, 32)):
@@ -51,7 +51,7 @@ class Masks:
 
 def test_settings_need_neither_torch_nor_opencv():
     code = (
-        "import sys; import dynslam_bench.segmentation.settings, dynslam_bench.segmentation.registry, "
+        "import sys; import dynslam_bench.segmentation.settings, dynslam_bench.segmentation.build_segmenter, "
         "dynslam_bench.segmentation.training.settings, dynslam_bench.segmentation.networks.checkpoints; "
         "print([m for m in ('torch', 'cv2') if m in sys.modules])"
     )
@@ -76,7 +76,7 @@ def test_unknown_sources(source, text):
 def test_classes_are_names_and_presets():
     assert SegmentationSettings().class_names() == {"person"}
     assert len(SegmentationSettings(classes="dynaslam19").class_names()) == 19
-    both = apply_overrides(SegmentationSettings(), {"classes": '["person", "chair"]'})
+    both = apply_overrides(SegmentationSettings(), {"classes": ["person", "chair"]})
     assert both.classes == "person,chair" and both.class_names() == {"person", "chair"}
     assert SegmentationSettings(classes="dynaslam19, chair").class_names() > {"person", "chair", "zebra"}
     with pytest.raises(SettingsError, match=r"unknown class 'persson' .did you mean 'person'"):
@@ -88,38 +88,15 @@ def test_classes_are_names_and_presets():
 
 
 def test_what_studies_tune_and_agents_steer():
-    found = {parameter.name: parameter for parameter in parameters(SegmentationSettings)}
-    assert {"confidence", "mask_threshold", "dilation_px", "classes", "schedule", "n", "repair"} <= set(found)
-    assert found["classes"].choices == ("person", "dynaslam19")
-    assert found["dilation_px"].default == 15 and found["dilation_px"].unit == "px"
-    online = {parameter.name for parameter in parameters(SegmentationSettings, online_only=True)}
-    assert {"confidence", "dilation_px", "n"} <= online and "mask_threshold" not in online
+    tunable = {parameter.name: parameter.online for parameter in parameters(SegmentationSettings)}
+    offline = dict.fromkeys(("mask_threshold", "schedule"), False)
+    assert tunable == dict.fromkeys(("confidence", "dilation_px", "compensate", "outside_share"), True) | offline
 
 
 def test_class_tables():
     assert len(COCO_NAMES) == len(set(COCO_NAMES)) == 80 and len(COCO_IDS) == 80
     assert (COCO_IDS[1], COCO_IDS[13], COCO_IDS[62], COCO_IDS[90]) == ("person", "stop sign", "chair", "toothbrush")
     assert VOC_NAMES[15] == "person" and set(VOC_NAMES[1:]) <= set(COCO_NAMES)
-
-
-# --- images ------------------------------------------------------------------------------------------------------
-
-
-def test_any_image_becomes_rgb():
-    grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    for image in (
-        grey,
-        grey[:, :, None],
-        grey[:, :, None].repeat(3, 2),
-        grey[:, :, None].repeat(4, 2),
-        grey.astype(np.uint16) * 257,
-        grey / 255.0,
-    ):
-        assert np.array_equal(as_rgb(image), grey[:, :, None].repeat(3, 2))
-    for bad in (np.zeros((3, 4, 2), np.uint8), np.zeros(5, np.uint8), np.zeros((0, 4, 3), np.uint8),
-                np.full((3, 4), 2.0), np.full((3, 4), np.nan), np.zeros((3, 4), np.int32)):  # fmt: skip
-        with pytest.raises(SegmentationError, match="image"):
-            as_rgb(bad)
 
 
 # --- oracle ------------------------------------------------------------------------------------------------------
@@ -222,9 +199,7 @@ def test_auto(monkeypatch, tmp_path):
     assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "embedded"
     monkeypatch.setattr(building, "embedded_weights", lambda: None)
     assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "oracle"
-    with pytest.raises(
-        SegmentationError, match=r"'bonn/crowd'.*segmentation.source=coco .*onnx:PATH.*without masks: a system"
-    ):
+    with pytest.raises(building.NetworkNotFetched, match="'bonn/crowd'"):
         resolve_source(auto, "bonn/crowd")
     (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")
     assert resolve_source(auto, "bonn/crowd") == "coco"
@@ -319,21 +294,6 @@ def test_a_checkpoint_is_fetched_once_and_verified(monkeypatch, tmp_path, publis
     (tmp_path / "published.pth").unlink()
     assert checkpoints.fetch_checkpoint(checkpoint) == path
     assert [entry.name for entry in (tmp_path / "cache").iterdir()] == ["test.pth"]
-
-
-def test_a_download_is_drawn_by_who_asked_for_it(monkeypatch, tmp_path, published):
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr(download_progress, "_shown", [])
-    drawn = []
-
-    @contextlib.contextmanager
-    def draw(name):
-        drawn.append(name)
-        yield drawn.append
-
-    download_progress.show_downloads(draw)
-    checkpoints.fetch_checkpoint(published(b"weights"))
-    assert drawn[0] == "test.pth" and [state.done for state in drawn[1:]] == [7, 7]
 
 
 def test_a_damaged_or_missing_download_leaves_nothing(monkeypatch, tmp_path, published):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dynslam_bench.segmentation.networks.mask_rcnn.loading import load_network
-from dynslam_bench.segmentation.networks.mask_rcnn.segmenter import paste
+from dynslam_bench.segmentation.networks.loading import load_network
+from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import paste
 
 
 @pytest.fixture(scope="module")

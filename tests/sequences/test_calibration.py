@@ -1,6 +1,5 @@
 """Readout time, delay of depth and depth factor, from exact points, a rendered sequence, and what cannot tell them."""
 
-import json
 from dataclasses import replace
 
 import cv2
@@ -9,14 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sequence_folders import make_folder
 
-from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.calibration import adjust, calibrate
+from dynslam_bench.sequences.cameras import read_camera, write_camera
 from dynslam_bench.sequences.continuous_time import Window
-from dynslam_bench.sequences.published.cameras import read_camera, write_camera
 from dynslam_bench.sequences.synthetic import open_synthetic
 
 CAMERA = Camera(320, 240, 260.0, 262.0, 160.0, 118.0)
@@ -150,16 +148,6 @@ def test_a_camera_at_rest_tells_nothing(still):
     assert [each.observable for each in found.quantities] == [False] * 3
     assert all(each.reason for each in found.quantities)
     assert found.camera == CAMERA
-
-
-def test_the_command_writes_nothing_where_nothing_is_told(still, tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        start(["sequences", "calibrate", str(still), "--output", str(tmp_path / "new.toml"), "--json"])
-    assert not ended.value.code
-    told = json.loads(capsys.readouterr().out)
-    assert told["file"] is None
-    assert not (tmp_path / "new.toml").exists()
-    assert [each["name"] for each in told["quantities"]] == ["readout_s", "depth_delay_s", "depth_factor"]
 
 
 @pytest.mark.parametrize("fault", ["frames", "black", "depth"])

@@ -10,10 +10,9 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences import DATASETS, open_sequence, sequence_ids
+from dynslam_bench.sequences.cameras import CAMERAS, read_camera, write_camera
 from dynslam_bench.sequences.catalogue import catalogue, entry_of
 from dynslam_bench.sequences.fetch import fetch
-from dynslam_bench.sequences.published.cameras import CAMERAS, read_camera, write_camera
-from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
 
 
 @pytest.fixture
@@ -71,12 +70,6 @@ def test_what_has_to_be_got_by_hand_says_so(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ids_of_all_data_sets_are_listed():
-    ids = sequence_ids()
-    assert "synthetic/walking_xyz" in ids and "bonn/crowd" in ids and len(ids) == len(set(ids))
-    assert [name for name in ids if name.startswith("synthetic/")] == list(SYNTHETIC_IDS)
-
-
 @pytest.mark.parametrize(
     "place",
     ["tum/rgbd_dataset_freiburg3_walking_xyz", "rgbd_dataset_freiburg3_walking_xyz", "tum/fr3/walking_xyz"],
@@ -95,13 +88,6 @@ def test_camera_of_a_published_folder_name(vga):
     (folder / "camera.toml").unlink()
     sequence = open_sequence(folder)
     assert (sequence.id, sequence.camera) == ("bonn/crowd2", CAMERAS["bonn"])
-
-
-def test_camera_of_a_catalogue_id_in_its_own_folder_name(vga, tmp_path):
-    """Under root/tum/fr3/walking_xyz the folder's name tells nothing, but the catalogue does."""
-    folder = vga("tum/fr3/walking_xyz")
-    (folder / "camera.toml").unlink()
-    assert open_sequence("tum/fr3/walking_xyz", data_root=tmp_path).camera == CAMERAS["tum-fr3"]
 
 
 def test_the_data_root(monkeypatch, tmp_path):
@@ -185,7 +171,7 @@ def test_a_data_set_plugs_in(tmp_path, monkeypatch, vga):
     folder = vga("mine/one")
     plugin = tmp_path / "my_dataset.py"
     plugin.write_text(
-        "from dynslam_bench.sequences.published.datasets import DatasetSpec\n"
+        "from dynslam_bench.contracts import DatasetSpec\n"
         "from dynslam_bench.sequences.catalogue import open_folder\n"
         f"SPEC = DatasetSpec('mine', r'{plugin}:load', ('mine/one',))\n"
         "def load(sequence_id, *, data_root):\n"
@@ -203,7 +189,3 @@ def test_a_data_set_plugs_in(tmp_path, monkeypatch, vga):
         monkeypatch.undo()
         DATASETS.refresh()
     assert folder.is_dir()
-
-
-def test_entries_by_alias():
-    assert entry_of("rgbd_bonn_crowd").id == "bonn/crowd" and entry_of("nothing") is None

@@ -48,16 +48,6 @@ def test_the_next_call_goes_on_where_this_one_stopped(get, server, packed, tmp_p
     assert server.requests == ["bytes=50000-"]
 
 
-def test_a_killed_download_is_resumed_too(get, server, packed, tmp_path):
-    """A dead process leaves a partial file and its notes, nothing else."""
-    part = tmp_path / "root" / ".downloads" / f"{FOLDER}.tgz.part"
-    part.parent.mkdir(parents=True)
-    part.write_bytes(packed[:777])
-    part.with_name(part.name + ".json").write_text(f'{{"url": "{server.url}", "etag": "\\"one\\"", "total": null}}')
-    get()
-    assert server.requests == ["bytes=777-"]
-
-
 def test_a_file_that_changed_on_the_server_begins_anew(get, server, packed):
     server.plan = [{"cut": 5000}, *[{"cut": 0}] * 2]
     with pytest.raises(SequenceError):
@@ -79,16 +69,6 @@ def test_announced_length_too_long(get, server, packed):
     server.plan = [{"lie": 1000}]
     get()
     assert server.requests == [None, f"bytes={len(packed)}-"]
-
-
-def test_announced_length_too_long_without_ranges(get, server, packed, tmp_path):
-    server.ranges = False
-    server.plan = [{"lie": 1000}] * 9
-    with pytest.raises(SequenceError, match=rf"stopped at {len(packed)} of {len(packed) + 1000} bytes"):
-        get(attempts=3)
-    assert not (tmp_path / "root" / "tum").exists()
-    server.plan = []
-    get()
 
 
 def test_announced_length_too_short(get, server, packed, tmp_path):
@@ -128,12 +108,6 @@ def test_without_a_known_checksum_the_first_one_counts(get, server, packed, tmp_
     assert list((tmp_path / "root" / ".downloads").iterdir()) == [kept]
     assert Receipt.read(get(checksum=False) / "fetched.json").sha256 == first
     assert kept.read_text().startswith(first)
-
-
-def test_the_checksum_can_be_waived(get, monkeypatch):
-    entry = status(NAME).entry
-    monkeypatch.setattr(fetching, "entry_of", lambda name: entry.model_copy(update={"sha256": "0" * 64}))
-    assert not Receipt.read(get(checksum=False) / "fetched.json").checked
 
 
 def test_refusals(get, server):
@@ -222,7 +196,7 @@ def test_full_disk_while_extracting(get, server, monkeypatch, tmp_path):
 
 def test_an_unwritable_root(get, tmp_path):
     (tmp_path / "root").write_text("a file")
-    with pytest.raises(DynslamError, match="cannot write into"):
+    with pytest.raises(DynslamError, match="cannot write"):
         get()
 
 
@@ -261,10 +235,3 @@ def test_verify_of_folders_and_of_nothing(folder, tmp_path):
         fetch("tum/fr3/siting_static", data_root=tmp_path)
     with pytest.raises(SequenceError, match="needs no fetching"):
         fetch("synthetic/walking_xyz", data_root=tmp_path)
-
-
-def test_status(get, tmp_path):
-    before = status(FOLDER, data_root=tmp_path / "root")
-    assert before.folder is None and before.entry.id == NAME
-    place = get()
-    assert status(NAME, data_root=tmp_path / "root").folder == place == before.place

@@ -12,9 +12,9 @@ from published_folders import random_poses, write_eth3d
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.sequences import fetch as fetching
 from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.archives import extract
 from dynslam_bench.sequences.catalogue import entry_of
 from dynslam_bench.sequences.fetch import fetch, verify
-from dynslam_bench.sequences.published.archives import extract
 
 
 def member(name, kind=tarfile.REGTYPE, link=""):

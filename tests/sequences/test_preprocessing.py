@@ -3,12 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-from sequence_folders import make_folder
 
-from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import build, parameters
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, Sequence, open_sequence
+from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, Sequence
 from dynslam_bench.sequences.preprocessing import Preprocessed, intensity, normalise
 
 CAMERA = Camera(160, 120, 130.0, 131.0, 80.5, 58.0, (0.26, -0.95, -0.005, 0.003, 1.16))
@@ -48,11 +45,6 @@ def centroid(image, near, radius=5):
     v, u = np.mgrid[: image.shape[0], : image.shape[1]]
     weight = image[..., 0] * (np.hypot(u - near[0], v - near[1]) <= radius)
     return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
-
-
-def test_nothing_to_do_is_the_sequence_itself(tmp_path):
-    folder, *_ = make_folder(tmp_path / "s")
-    assert not isinstance(open_sequence(folder, preprocessing=PreprocessingSettings()), Preprocessed)
 
 
 def test_undistortion_moves_points_where_the_camera_model_says():
@@ -121,31 +113,3 @@ def test_equalisation_spreads_a_dark_image_and_keeps_the_hue():
     balanced = normalise(gray, PreprocessingSettings(normalisation="equalise"))
     assert (np.ptp(balanced.astype(int), axis=2) <= 1).all()
     assert (balanced[..., 0] == cv2.equalizeHist(gray[..., 0])).mean() > 0.99
-
-
-def test_intensity_lies_between_0_and_1():
-    image = np.array([[[0, 0, 0], [255, 255, 255]]], np.uint8)
-    assert intensity(image).tolist() == [[0.0, 1.0]] and intensity(image).dtype == np.float32
-    assert intensity(image[..., 0]).tolist() == [[0.0, 1.0]]
-
-
-def test_settings_are_validated_and_describe_their_search_space():
-    with pytest.raises(SettingsError, match="width is 320 but height is None"):
-        build(PreprocessingSettings, {"width": 320})
-    with pytest.raises(SettingsError, match="did you mean 'normalisation'"):
-        build(PreprocessingSettings, {"normalization": "clahe"})
-    found = {parameter.name: parameter for parameter in parameters(PreprocessingSettings)}
-    assert found["normalisation"].choices == ("none", "equalise", "clahe", "mean-std")
-    assert found["clahe_clip"].when == (("normalisation", ("clahe",)),)
-
-
-def test_wider_pairing(tmp_path):
-    folder, *_ = make_folder(tmp_path / "s", frames=3)
-    lines = [f"{100.015 + i / 30:.3f} depth/{i}.png" for i in range(3)]
-    (folder / "depth.txt").write_text("\n".join(lines))
-    tight = PreprocessingSettings(max_time_difference_s=0.01)
-    assert len(open_sequence(folder)) == 3
-    from dynslam_bench.core.errors import SequenceError
-
-    with pytest.raises(SequenceError, match=r"within 0.01 s \(closest: 0.015 s\)"):
-        open_sequence(folder, preprocessing=tight)

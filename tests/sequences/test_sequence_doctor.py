@@ -14,10 +14,9 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.doctor import Diagnosis, diagnose, examine, stretches
-from dynslam_bench.sequences.finding import Finding
-from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
+from dynslam_bench.sequences.rgbd_motion import READINGS, read_as, rgbd_pairs
+from dynslam_bench.sequences.stream_checks import Finding
 from dynslam_bench.sequences.truth_checks import truth_findings
-from dynslam_bench.sequences.truth_motion import READINGS, read_as
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 FRAMES = 80
@@ -238,11 +237,6 @@ def test_without_truth_depth_or_motion_it_is_a_note(sound):
     assert ("note", "no-depth") in ids(colour) and all(severity == "note" for severity, _ in ids(colour))
     apart = Altered(sound, truth=lambda truth: Trajectory(truth.timestamps + 900, truth.T_world_cam))
     assert ids(apart) == [("fault", "truth-other-sequence")]
-
-
-def test_no_pairs_are_no_fault(sound):
-    (finding,) = truth_findings(sound.timestamps, sound.ground_truth, CAMERA, [])
-    assert (finding.severity, finding.id) == ("note", "motion-unmeasured")
 
 
 def test_damaged_folders_never_raise(tmp_path):

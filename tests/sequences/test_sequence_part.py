@@ -1,4 +1,4 @@
-"""What part of which sequence is seen: one identity for every spelling, and for repeats of one block."""
+"""What part of which sequence is seen: one identity for every spelling, and for repeats of one problem instance."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from sequence_folders import make_folder
 
 from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.part import Part, part_of
 from dynslam_bench.sequences.synthetic import open_synthetic
+from dynslam_bench.sequences.view import Part, part_of
 
 WALK = "synthetic/walking_xyz"
 
@@ -35,7 +35,7 @@ def test_all_spellings_of_the_same_frames_are_one_part() -> None:
     assert part(WALK) == part(f"{WALK}?frames=600")
 
 
-def test_other_frames_instances_strides_and_cameras_are_other_blocks() -> None:
+def test_other_frames_scenes_strides_and_cameras_are_other_problem_instances() -> None:
     others = [
         part(WALK),
         part(WALK, frames="0:60"),
@@ -47,7 +47,7 @@ def test_other_frames_instances_strides_and_cameras_are_other_blocks() -> None:
     assert len({each.block for each in others}) == len(others)
 
 
-def test_offset_and_noise_are_repeats_of_one_block() -> None:
+def test_offset_and_noise_are_repeats_of_one_problem_instance() -> None:
     plain = part(WALK, frames="0:60")
     late = part(WALK, frames="3:60", offset=3)
     noisy = part(f"{WALK}?noise=7", frames="0:60")
@@ -79,7 +79,7 @@ def frame_hash(frame) -> str:
 def test_a_noise_seed_changes_the_noise_and_nothing_else(tmp_path: Path) -> None:
     ids = [f"{WALK}?scene=3&frames=2{noise}" for noise in ("", "&noise=1", "&noise=2")]
     plain, one, two = (open_synthetic(name, tmp_path) for name in ids)
-    assert frame_hash(plain[1])[:16] == "8ed2db9ef4f896d1", "instances keep their bytes"
+    assert frame_hash(plain[1])[:16] == "8ed2db9ef4f896d1", "scenes keep their bytes"
     assert len({frame_hash(each[1]) for each in (plain, one, two)}) == 3
     assert frame_hash(one[1]) == frame_hash(open_synthetic(f"{WALK}?scene=3&frames=2&noise=1", None)[1])
     assert frame_hash(one[1]) == frame_hash(one[1]), "read back from a folder of its own"

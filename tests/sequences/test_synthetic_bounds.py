@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dynslam_bench.sequences.synthetic.bounds import bounds_of
+from dynslam_bench.sequences.synthetic.renderer import bounds_of
 from dynslam_bench.sequences.synthetic.settings import CAMERA
 
 

@@ -5,9 +5,9 @@ import pytest
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
-from dynslam_bench.sequences.synthetic import CAMERA, TWIN_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic import CAMERA, REPLICA_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic.renderer import view_of
 from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
-from dynslam_bench.sequences.synthetic.views import view_of
 
 CLEAN = RenderSettings(
     depth=DepthSensor(noise=False), color=ColorSensor(noise=False, shutter=0, exposure_drift=0, flicker=0)
@@ -45,24 +45,6 @@ def test_moving_instances_do_not_follow_the_camera(walking) -> None:
         pixels = masks.instances == person
         if pixels.sum() > 500:
             assert np.median(error[pixels]) > 0.5
-
-
-def test_flow_and_back_returns(walking) -> None:
-    """Follow the flow to the next frame and back; where the point stays visible it returns to where it was."""
-    index = 90
-    forth, back = walking.flow(index), walking.flow(index + 1, index)
-    ids, then = walking.masks[index].instances, walking.masks[index + 1].instances
-    u, v = np.rint(U + forth[..., 0]).astype(int), np.rint(V + forth[..., 1]).astype(int)
-    inside = (u >= 0) & (u < 640) & (v >= 0) & (v < 480)
-    u, v = u.clip(0, 639), v.clip(0, 479)
-    off = np.stack([U + forth[..., 0] - u, V + forth[..., 1] - v], -1)
-    error = np.linalg.norm(forth + back[v, u] + 0 * off, axis=-1)
-    for instance in (0, 1, 2):
-        here = inside & (ids == instance)
-        if here.sum() < 500:
-            continue
-        assert (then[v, u] == instance)[here].mean() > 0.9
-        assert np.median(error[here & (then[v, u] == instance)]) < 0.3
 
 
 def test_colours_follow_the_flow() -> None:
@@ -136,8 +118,8 @@ def test_measured_depth_has_the_sensors_faults(walking) -> None:
     assert np.abs(disparity * 8 - np.rint(disparity * 8)).max() < 0.02
 
 
-@pytest.mark.parametrize("name", TWIN_IDS)
-def test_every_twin_is_a_sequence_with_plausible_motion(name: str) -> None:
+@pytest.mark.parametrize("name", REPLICA_IDS)
+def test_every_replica_moves_like_its_original(name: str) -> None:
     sequence = open_synthetic(name, None)
     assert isinstance(sequence, Sequence)
     truth = sequence.ground_truth
@@ -155,16 +137,6 @@ def test_every_twin_is_a_sequence_with_plausible_motion(name: str) -> None:
     assert (extent >= expected[0]).all() and (extent <= expected[1]).all(), extent
     if motion in ("rpy", "halfsphere"):
         assert turn.mean() > 10
-
-
-def test_people_move_and_chairs_only_when_touched() -> None:
-    sequence = open_synthetic("synthetic/walking_static?scene=4", None)
-    moving = [sequence.scene.moving(i) for i in range(0, 600, 5)]
-    assert moving[0] == frozenset()
-    share = {k: np.mean([k in ids for ids in moving]) for k in (1, 2, 3, 4)}
-    assert share[1] > 0.9 and share[2] > 0.9
-    assert 0 < share[3] < 0.4
-    assert share[4] < 0.4
 
 
 @pytest.mark.parametrize(("people", "persons"), [("frozen", True), ("none", False)])
@@ -186,17 +158,3 @@ def test_lighting_options_change_colours_only(option: str, walking) -> None:
     assert np.abs(changed.rgb.astype(int) - plain.rgb).mean() > 3
     assert np.array_equal(sequence.exact_depth(45), walking.exact_depth(45))
     assert np.array_equal(sequence.masks[45].instances, walking.masks[45].instances)
-
-
-@pytest.mark.parametrize("instance", [0, 55, 100, 199])
-def test_people_fill_enough_of_walking_and_leave_enough_free(instance: int) -> None:
-    sequence = open_synthetic(f"synthetic/walking_xyz?scene={instance}", None, threads=1)
-    people, moving = [], []
-    for index in range(5, 600, 54):
-        masks = sequence.masks[index]
-        people.append(np.isin(masks.instances, (1, 2)).mean())
-        moving.append(np.isin(masks.instances, list(masks.moving)).mean())
-    assert 0.15 < np.mean(people) < 0.45
-    assert np.mean(moving) > 0.1
-    assert max(people) < 0.62
-    assert min(people) < 0.1, "both are out of view, or nearly, at some time"

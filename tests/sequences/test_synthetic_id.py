@@ -4,12 +4,12 @@ import sys
 import pytest
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.sequences.synthetic import TWIN_IDS, SyntheticId, parse_synthetic_id
+from dynslam_bench.sequences.synthetic import REPLICA_IDS, SyntheticId, parse_synthetic_id
 
 
-def test_the_eight_twins_exist() -> None:
-    assert len(TWIN_IDS) == 8
-    for name in TWIN_IDS:
+def test_the_eight_replicas_exist() -> None:
+    assert len(REPLICA_IDS) == 8
+    for name in REPLICA_IDS:
         parsed = parse_synthetic_id(name)
         assert (parsed.scene, parsed.frames) == (0, 600)
         assert parse_synthetic_id(str(parsed)) == parsed

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from sequence_folders import SHARED, make_folder, needs_shared, rewrite
 
-from dynslam_bench.core.errors import SequenceError, TrajectoryError
+from dynslam_bench.core.errors import DynslamError, SequenceError
 from dynslam_bench.sequences import Sequence, SequenceView, open_sequence
 
 
@@ -29,7 +30,6 @@ def test_reads_what_was_written(tmp_path):
     assert sequence.fps == 30 and sequence.masks is None
     assert sequence.dropped.describe().startswith("4 frames of 4 colour and 4 depth images (|dt| < 0.02 s)")
     assert not sequence.dropped.any
-    assert sequence.verify() == []
 
 
 def test_fps_follows_from_the_stamps_where_nothing_states_it(tmp_path):
@@ -44,11 +44,6 @@ def test_stamps_in_another_unit_are_refused_with_the_unit(tmp_path, per_s, unit,
     with pytest.raises(SequenceError, match=f"look like {unit}") as caught:
         open_sequence(folder)
     assert f"{round(per_s / 30):g} s apart" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_one_frame_a_second_is_a_video(tmp_path):
-    folder, *_ = make_folder(tmp_path / "seq", frames=3, rate=1, fps=None)
-    assert open_sequence(folder).fps == pytest.approx(1)
 
 
 def test_digest_tells_contents_apart_and_survives_moving(tmp_path):
@@ -90,14 +85,6 @@ def test_one_frame_opens(tmp_path):
     assert len(sequence) == 1 and sequence.fps == 30
 
 
-def test_no_ground_truth(tmp_path):
-    folder, *_ = make_folder(tmp_path / "seq")
-    (folder / "groundtruth.txt").unlink()
-    sequence = open_sequence(folder)
-    assert sequence.ground_truth is None
-    assert "no ground truth" in sequence.dropped.describe()
-
-
 def test_ground_truth_hole_and_bad_lines_are_counted(tmp_path):
     folder, *_ = make_folder(tmp_path / "seq", frames=30)
     rewrite(folder / "groundtruth.txt", lambda lines: [*lines[:11], "100.4 nan 0 0 0 0 0 1", *lines[21:]])
@@ -106,13 +93,6 @@ def test_ground_truth_hole_and_bad_lines_are_counted(tmp_path):
     assert dropped.largest_hole_s == pytest.approx(11 / 30)
     assert "1 of 21 lines skipped: not finite" in dropped.describe()
     assert "10 frames without ground truth within 0.02 s (largest hole 0.37 s)" in dropped.describe()
-
-
-def test_empty_ground_truth_is_an_error(tmp_path):
-    folder, *_ = make_folder(tmp_path / "seq")
-    (folder / "groundtruth.txt").write_text("# nothing\n")
-    with pytest.raises(TrajectoryError, match="holds no poses"):
-        open_sequence(folder)
 
 
 def test_pairing_is_strict_one_to_one_and_counted(tmp_path):
@@ -152,9 +132,27 @@ def test_other_separators(tmp_path):
     assert len(open_sequence(folder)) == 3
 
 
+def swap_lists(folder):
+    (folder / "rgb.txt").rename(folder / "other.txt")
+    (folder / "depth.txt").rename(folder / "rgb.txt")
+    (folder / "other.txt").rename(folder / "depth.txt")
+
+
+def cut(path, end):
+    path.write_bytes(path.read_bytes()[:end])
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
+        (lambda f: rewrite(f / "groundtruth.txt", lambda _: ["# nothing"]), "holds no poses"),
+        (swap_lists, "has 16 bits a channel, expected 8"),
+        (lambda f: (f / "rgb" / "0.png").write_bytes(b"<html>404</html>"), "cannot be decoded"),
+        (lambda f: cut(f / "rgb" / "2.png", -20), r"2\.png is truncated \(\d+ bytes\)"),
+        (
+            lambda f: cv2.imwrite(str(f / "depth" / "0.png"), np.full((24, 32), 77, np.uint8)),
+            r"1 channel\(s\) of 8 bits \(values 77 to 77\), expected 1 of 16 bits",
+        ),
         (lambda f: rewrite(f / "rgb.txt", lambda _: []), "lists no image"),
         (lambda f: rewrite(f / "rgb.txt", lambda _: ["abc rgb/0.png"]), "line 1: 'abc' is not a timestamp"),
         (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), "not a text file"),
@@ -163,52 +161,15 @@ def test_other_separators(tmp_path):
         (lambda f: (f / "depth" / "1.png").write_bytes(b""), r"1 of 4 depth images .* are empty \(0 bytes\)"),
     ],
 )
-def test_damaged_lists(tmp_path, damage, words):
+def test_damaged_folders_give_one_clear_line(tmp_path, damage, words):
     folder, *_ = make_folder(tmp_path / "seq", frames=4)
     damage(folder)
-    with pytest.raises(SequenceError, match=words) as caught:
-        open_sequence(folder)
+    with pytest.raises(DynslamError, match=words) as caught:
+        list(map(open_sequence(folder).__getitem__, range(4)))
     assert "\n" not in str(caught.value)
 
 
-def test_truncated_image_is_found_by_verify_and_on_reading(tmp_path):
-    folder, *_ = make_folder(tmp_path / "seq", frames=4)
-    image = folder / "rgb" / "2.png"
-    image.write_bytes(image.read_bytes()[:-20])
-    sequence = open_sequence(folder)
-    with pytest.raises(SequenceError, match=r"2\.png is truncated \(\d+ bytes\)"):
-        sequence[2]
-    assert len(sequence.verify()) == 1 and sequence.verify()[0].startswith("frame 2: image")
-
-
-def test_garbage_instead_of_an_image(tmp_path, capfd):
-    folder, *_ = make_folder(tmp_path / "seq")
-    (folder / "rgb" / "0.png").write_bytes(b"<html>404</html>")
-    with pytest.raises(SequenceError, match="cannot be decoded"):
-        open_sequence(folder)
-
-
-def test_eight_bit_depth(tmp_path):
-    import cv2
-
-    folder, *_ = make_folder(tmp_path / "seq")
-    cv2.imwrite(str(folder / "depth" / "0.png"), np.full((24, 32), 77, np.uint8))
-    with pytest.raises(SequenceError, match=r"1 channel\(s\) of 8 bits \(values 77 to 77\), expected 1 of 16 bits"):
-        open_sequence(folder)
-
-
-def test_swapped_lists(tmp_path):
-    folder, *_ = make_folder(tmp_path / "seq")
-    rgb, depth = (folder / "rgb.txt").read_text(), (folder / "depth.txt").read_text()
-    (folder / "rgb.txt").write_text(depth)
-    (folder / "depth.txt").write_text(rgb)
-    with pytest.raises(SequenceError, match="has 16 bits a channel, expected 8"):
-        open_sequence(folder)
-
-
 def test_wrong_sizes(tmp_path):
-    import cv2
-
     from dynslam_bench.sequences import PreprocessingSettings
 
     folder, *_ = make_folder(tmp_path / "seq")
@@ -258,31 +219,12 @@ def test_folders_without_lists(tmp_path):
 
 
 def test_grey_and_alpha_images_become_rgb(tmp_path):
-    import cv2
-
     folder, *_ = make_folder(tmp_path / "seq", frames=2)
     cv2.imwrite(str(folder / "rgb" / "0.png"), np.full((24, 32), 90, np.uint8))
     cv2.imwrite(str(folder / "rgb" / "1.png"), np.dstack([np.full((24, 32), v, np.uint8) for v in (1, 2, 3, 200)]))
     sequence = open_sequence(folder)
     assert sequence[0].rgb.shape == (24, 32, 3) and (sequence[0].rgb == 90).all()
     assert sequence[1].rgb[0, 0].tolist() == [3, 2, 1]
-
-
-@needs_shared
-@pytest.mark.parametrize(
-    ("name", "frames", "camera"),
-    [("bonn/crowd", 200, "bonn"), ("tum/fr1/xyz", 95, "tum-fr1"), ("tum/fr1/rpy", 40, "tum-fr1")],
-)
-def test_real_excerpts(name, frames, camera):
-    from dynslam_bench.sequences.published.cameras import CAMERAS
-
-    sequence = open_sequence(name, data_root=SHARED / "data")
-    assert len(sequence) == frames == sequence.dropped.pairs
-    assert sequence.camera == CAMERAS[camera] and sequence.fps == 30
-    assert sequence.ground_truth is not None and sequence.id == name
-    frame = sequence[0]
-    assert frame.rgb.shape == (480, 640, 3) and 0.3 < np.median(frame.depth[frame.depth > 0]) < 5
-    assert open_sequence(sequence.folder).digest() == sequence.digest()
 
 
 @needs_shared
@@ -320,7 +262,7 @@ def test_few_missing_files_are_tolerated_and_counted(tmp_path):
 @needs_shared
 def test_bonn_poses_are_the_camera_s_and_positions_stay_those_of_the_file():
     from dynslam_bench.geometry import se3
-    from dynslam_bench.geometry.tum_file import read_tum
+    from dynslam_bench.geometry.trajectory_files import read_tum
     from dynslam_bench.sequences.catalogue import open_sequence
 
     folder = SHARED / "data" / "bonn" / "rgbd_bonn_crowd"

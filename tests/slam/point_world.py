@@ -1,11 +1,17 @@
-"""A simulated world of points with known descriptors, seen by a camera with a depth sensor."""
+"""A simulated world of points with known descriptors, seen by a camera with a depth sensor; back ends that track it."""
+
+from dataclasses import replace
 
 import numpy as np
 
 from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
+from dynslam_bench.slam.observation import observe
+from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 
 
 class PointWorld:
@@ -21,7 +27,6 @@ class PointWorld:
         self.points = points
         self.descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
         self.camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-        self.rng = rng
 
     def see(
         self, T_world_cam, index, *, stamp=None, noise_px=0.4, depth_noise=0.002, depthless=0.1, limit=700, wrong=0
@@ -32,8 +37,8 @@ class PointWorld:
         local = se3.transform(se3.inverse(T_world_cam), self.points)
         with np.errstate(divide="ignore", invalid="ignore"):
             uv = camera.project(local)
-        seen = (local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476)
-        rows = np.flatnonzero(seen)
+        visible = (local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476)
+        rows = np.flatnonzero(visible)
         if len(rows) > limit:
             rows = np.sort(rng.permutation(rows)[:limit])
         n = len(rows)
@@ -60,9 +65,7 @@ class PointWorld:
 
     def blind(self, index, *, stamp=None):
         """A frame without any feature."""
-        frame = self.see(np.eye(4), index, stamp=stamp, limit=0)
-        assert len(frame) == 0
-        return frame
+        return self.see(np.eye(4), index, stamp=stamp, limit=0)
 
     def path(self, count):
         """Camera-to-world poses of a smooth hand-held movement, 30 Hz."""
@@ -74,6 +77,24 @@ class PointWorld:
         return se3.exp(xi)
 
 
+def without_depth(frame):
+    return replace(frame, z=np.zeros_like(frame.z))
+
+
+def observed(frame, camera, levels=8, keep=None):
+    """All features of a frame, or those of a mask, as the back end uses them."""
+    keep = np.ones(len(frame), bool) if keep is None else keep
+    return observe(frame, keep, np.ones(len(frame), np.float32), camera, 1.2 ** np.arange(levels))
+
+
+def make_backend(world, *, monocular=False, seed=0, **overrides):
+    """A back end that is ready for a world; settings as ``group__name=value``."""
+    kind, settings = (MonocularBackend, MonocularBackendSettings) if monocular else (RgbdBackend, BackendSettings)
+    backend = kind(apply_overrides(settings(), {name.replace("__", "."): value for name, value in overrides.items()}))
+    backend.reset(world.camera, seed)
+    return backend
+
+
 def track_all(backend, frames, keeps=None):
     """Track frames in order; all features are kept unless told otherwise."""
     results = []
@@ -81,3 +102,14 @@ def track_all(backend, frames, keeps=None):
         keep = np.ones(len(frame), bool) if keeps is None else keeps[i]
         results.append(backend.track(frame, keep, np.ones(len(frame), np.float32)))
     return results
+
+
+def states(results):
+    return [result.state for result in results]
+
+
+def errors(results, truth):
+    """Translation errors in metres of the tracked frames, in the frame of the first pose."""
+    tracked = [i for i, r in enumerate(results) if r.state == "ok"]
+    start = results[tracked[0]].T_world_cam @ se3.inverse(truth[tracked[0]])
+    return np.array([np.linalg.norm((se3.inverse(start @ truth[i]) @ results[i].T_world_cam)[:3, 3]) for i in tracked])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import dynslam_bench.culling.blocks
+import dynslam_bench.culling
 from dynslam_bench.contracts.filter import DynamicFilter
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
@@ -29,8 +29,8 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 def filters():
     """Every filter class of the culling room, found by looking."""
     found = {}
-    for module in pkgutil.iter_modules(dynslam_bench.culling.blocks.__path__):
-        loaded = importlib.import_module(f"dynslam_bench.culling.blocks.{module.name}")
+    for module in pkgutil.iter_modules(dynslam_bench.culling.__path__):
+        loaded = importlib.import_module(f"dynslam_bench.culling.{module.name}")
         for name, value in vars(loaded).items():
             if inspect.isclass(value) and value.__module__ == loaded.__name__ and DynamicFilter in value.__mro__[1:]:
                 found[name] = value
@@ -41,7 +41,9 @@ def construct(filter_class):
     """A filter with default settings, by the types of its parameters."""
     hints = typing.get_type_hints(filter_class.__init__)
     parameters = list(inspect.signature(filter_class).parameters.values())
+    bound = typing.get_args(getattr(filter_class, "__orig_bases__", [None])[0])  # the settings of a `Rule[...]`
     needed = [hints[p.name] for p in parameters if p.default is p.empty]
+    needed = [bound[0] if isinstance(kind, typing.TypeVar) else kind for kind in needed]
     assert all(issubclass(kind, Settings) for kind in needed), needed
     return filter_class(*[kind() for kind in needed])
 

@@ -14,8 +14,8 @@ import pytest
 
 from dynslam_bench.contracts import FlowResult, Keypoints
 from dynslam_bench.core.errors import PluginError
-from dynslam_bench.features.build_extractor import build_extractor
-from dynslam_bench.flow.build_flow import build_flow
+from dynslam_bench.features.registry import build_extractor
+from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.testing import ConformanceError, check_features, check_flow, features_report, flow_report
 from dynslam_bench.testing.pytest_plugin import report_on

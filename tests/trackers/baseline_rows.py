@@ -18,7 +18,7 @@ ORDER = ("own", "faithful-code", "faithful-paper", "inspired", "assumed", "exter
 
 def table() -> str:
     """Header and one row a tracker, by provenance and id."""
-    from dynslam_bench.trackers.specs import all_specs
+    from dynslam_bench.trackers.registry import all_specs
 
     rows = []
     for spec in sorted(all_specs(), key=lambda spec: (ORDER.index(spec.provenance), spec.id)):

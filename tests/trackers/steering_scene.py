@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from quick_dense import quick
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.settings import Settings, parameters
-from dynslam_bench.segmentation.masks.oracle import instances_of
-from dynslam_bench.segmentation.registry import SegmenterContext, SegmenterSpec
+from dynslam_bench.segmentation.build_segmenter import SegmenterContext, SegmenterSpec
+from dynslam_bench.segmentation.recorded import instances_of
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.registry import resolve_settings

@@ -7,10 +7,9 @@ import pytest
 from steering_scene import SmallScene, construct, difference, play
 
 from dynslam_bench.contracts.checks import check_sensors
-from dynslam_bench.core.errors import EvaluationError, TrackerError
-from dynslam_bench.evaluation.protocol import MONOCULAR, PROTOCOLS
+from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SystemSettings
 
 OURS = [spec.id for spec in all_specs() if spec.sensors == "rgb" and issubclass(spec.settings, SystemSettings)]
@@ -27,11 +26,6 @@ def with_depth(scene, depth_of):
     other.__dict__ |= scene.__dict__
     other.frames = [replace(frame, depth=depth_of(frame)) for frame in scene.frames]
     return other
-
-
-def test_there_are_monocular_systems():
-    assert {"orb-slam2-mono", "emfoa-oft-mono", "chen-slam-mono"} <= set(OURS)
-    assert TRACKERS.get("orbslam3-mono").sensors == "rgb" and TRACKERS.get("emfoa-oft").sensors == "rgbd"
 
 
 @pytest.mark.parametrize("tracker", OURS)
@@ -57,15 +51,3 @@ def test_sequences_without_depth_are_for_monocular_trackers_alone(scene):
     finally:
         del scene.has_depth
     check_sensors(TRACKERS.get("emfoa-oft"), scene)
-
-
-def test_no_protocol_without_scale_scores_a_monocular_tracker():
-    for protocol in PROTOCOLS.values():
-        protocol.check_scale("orb-slam2", "rgbd")
-        if protocol.alignment == "sim3":
-            protocol.check_scale("orb-slam2-mono", "rgb")
-        else:
-            with pytest.raises(EvaluationError, match=rf"'orb-slam2-mono' is monocular.*--protocol {MONOCULAR}"):
-                protocol.check_scale("orb-slam2-mono", "rgb")
-    tum, scaled = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS[MONOCULAR]
-    assert scaled == tum.model_copy(update={"id": MONOCULAR, "alignment": "sim3"})

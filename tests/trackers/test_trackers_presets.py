@@ -11,10 +11,6 @@ from dynslam_bench.trackers.registry import resolve_settings
 SHIPPED = [(found.spec.id, name) for found in TRACKERS.all() for name in found.spec.presets]
 
 
-def test_two_systems_have_a_fast_one():
-    assert {("mask-rcnn", "fast"), ("emfoa-oft", "fast")} <= set(SHIPPED)
-
-
 @pytest.mark.parametrize(("tracker", "name"), SHIPPED)
 def test_each_sets_something_else_than_the_default(tracker, name):
     spec = TRACKERS.get(tracker)

@@ -53,8 +53,7 @@ def test_cached_runs_have_the_same_bits_and_load_no_network(
 
 EXTRACTOR = """
 import numpy as np
-from dynslam_bench.features.keypoints import Keypoints
-from dynslam_bench.features.registry import FeatureSpec
+from dynslam_bench.contracts import FeatureSpec, Keypoints
 
 class Mine:
     def extract(self, gray):
@@ -72,7 +71,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.features.build_extractor import build_extractor
+from dynslam_bench.features.registry import build_extractor
 from dynslam_bench.features.cached import CachedExtractor
 from dynslam_bench.features.settings import FeatureSettings
 

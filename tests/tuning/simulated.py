@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -15,9 +16,10 @@ import toy_tracker
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.tuning import StudySpec, Tuner
-from dynslam_bench.tuning.blocks import Block
-from dynslam_bench.tuning.design import Design, design_of
 from dynslam_bench.tuning.evaluate import Outcome
+from dynslam_bench.tuning.instances import ProblemInstance
+from dynslam_bench.tuning.splits import Design, design_of
+from dynslam_bench.tuning.storage import open_storage
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 TUNE, HELD_OUT = (
@@ -28,6 +30,9 @@ STARTS_SD = 0.28
 """Standard deviation of the log ratio of two runs in one scene: measured 0.24 to 0.31 for real trackers."""
 SCENES_SD = 0.15
 """How far a setting's effect differs from scene to scene."""
+
+_PATCHING = threading.Lock()
+"""Workers in threads must not restore each other's patches."""
 
 Effect = Callable[[Mapping[str, Any]], float]
 
@@ -65,26 +70,35 @@ class SimulatedTuner(Tuner):
         self, spec: StudySpec, results: Path, *, effect: Effect = nothing, seed: int = 0, in_memory: bool = True
     ) -> None:
         self.effect, self.noise_seed, self.runs = effect, seed, 0
-        with patch(
-            "dynslam_bench.tuning.study.design_of", lambda spec, accept: simulated_design(spec.tune, spec.held_out)
+        with (
+            _PATCHING,
+            patch.multiple(
+                "dynslam_bench.tuning.tuner",
+                open_storage=(lambda *_: optuna.storages.InMemoryStorage()) if in_memory else open_storage,
+                design_of=lambda spec, accept: simulated_design(spec.tune, spec.held_out),
+            ),
         ):
-            if not in_memory:
-                super().__init__(spec, results)
-                return
-            with patch("dynslam_bench.tuning.study.open_storage", lambda *_: optuna.storages.InMemoryStorage()):
-                super().__init__(spec, results)
+            super().__init__(spec, results)
 
     def evaluate(
-        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
-    ) -> dict[Block, Outcome]:
-        self.runs += len(blocks)
-        return {block: Outcome(block, "", self._error(settings, block), 1.0, 0.03, 0.03, 1.0) for block in blocks}
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        jobs: int = 1,
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
+        self.runs += len(instances)
+        return {
+            instance: Outcome(instance, "", self._error(settings, instance), 1.0, 0.03, 0.03, 1.0)
+            for instance in instances
+        }
 
-    def _error(self, settings: Mapping[str, Any], block: Block) -> float:
+    def _error(self, settings: Mapping[str, Any], instance: ProblemInstance) -> float:
         who = digest(dict(settings))
-        scene = stream(self.noise_seed, "scene", block.scene).normal(0, 0.5)
-        own = stream(self.noise_seed, "own", who, block.scene).normal(0, SCENES_SD / math.sqrt(2))
-        start = stream(self.noise_seed, "start", who, str(block)).normal(0, STARTS_SD / math.sqrt(2))
+        scene = stream(self.noise_seed, "scene", instance.scene).normal(0, 0.5)
+        own = stream(self.noise_seed, "own", who, instance.scene).normal(0, SCENES_SD / math.sqrt(2))
+        start = stream(self.noise_seed, "start", who, str(instance)).normal(0, STARTS_SD / math.sqrt(2))
         return math.exp(math.log(0.03) + scene + self.effect(settings) + own + start)
 
 

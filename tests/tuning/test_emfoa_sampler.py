@@ -9,10 +9,9 @@ import numpy as np
 import optuna
 import pytest
 from optuna.samplers import BaseSampler
+from optuna.testing import pytest_samplers as suites
 
-from dynslam_bench.tuning.emfoa_sampler import EmfoaSampler
-
-suites = pytest.importorskip("optuna.testing.pytest_samplers", reason="Optuna < 5 ships no sampler suite")
+from dynslam_bench.tuning.samplers import EmfoaSampler
 
 
 class TestEmfoaSampler(suites.BasicSamplerTestCase, suites.RelativeSamplerTestCase):
@@ -33,26 +32,21 @@ def mixed(trial: optuna.Trial) -> float:
     return float((np.log10(rate) + 2) ** 2 + abs(count - 13) / 4 + {"a": 1.0, "b": 0.0, "c": 2.0}[kind])
 
 
+def values(sampler: BaseSampler, objective: Callable[[optuna.Trial], float], trials: int) -> list[Any]:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(sampler=sampler)
+    study.optimize(objective, n_trials=trials)
+    return [trial.value for trial in study.trials]
+
+
 @pytest.mark.parametrize("objective", [sphere, mixed])
 def test_it_beats_random_search_at_equal_trials(objective: Callable[[optuna.Trial], float]) -> None:
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-
-    def best(make: Callable[[int], Any]) -> float:
-        found = []
-        for seed in range(8):
-            study = optuna.create_study(sampler=make(seed))
-            study.optimize(objective, n_trials=80)
-            found.append(study.best_value)
-        return float(np.median(found))
-
-    emfoa = best(lambda seed: EmfoaSampler(seed=seed, n_trials=80))
-    assert emfoa < best(lambda seed: optuna.samplers.RandomSampler(seed=seed))
+    emfoa = [min(values(EmfoaSampler(seed=seed, n_trials=80), objective, 80)) for seed in range(8)]
+    random = [min(values(optuna.samplers.RandomSampler(seed=seed), objective, 80)) for seed in range(8)]
+    assert np.median(emfoa) < np.median(random)
 
 
 def test_the_same_seed_gives_the_same_study() -> None:
-    def run() -> list[float]:
-        study = optuna.create_study(sampler=EmfoaSampler(seed=3, n_trials=40))
-        study.optimize(sphere, n_trials=40)
-        return [trial.value for trial in study.trials]
-
-    assert run() == run()
+    assert values(EmfoaSampler(seed=3, n_trials=40), sphere, 40) == values(
+        EmfoaSampler(seed=3, n_trials=40), sphere, 40
+    )

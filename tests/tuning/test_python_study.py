@@ -1,4 +1,4 @@
-"""Studies from Python: own objective, sampler, callbacks, a preset to start from; old files; mistakes in one line."""
+"""Studies from Python: own objective, sampler, callbacks, a preset to start from; mistakes in one line."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ import pytest
 from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, simulated_design, valley
 
 from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.tuning import Block, Outcome, Study, StudySpec, Tuner, read_study
-from dynslam_bench.tuning.old_form import converted
+from dynslam_bench.tuning import Outcome, ProblemInstance, Study, StudySpec, Tuner
 from dynslam_bench.tuning.storage import open_storage
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "tune_in_python.py"
@@ -31,13 +30,13 @@ class DrawnTuner(SimulatedTuner):
 
     def __init__(self, spec: StudySpec, results: Path, **given: Any) -> None:
         self.effect, self.noise_seed, self.runs = valley, 0, 0
-        with patch("dynslam_bench.tuning.study.design_of", lambda spec, accept: simulated_design((TUNE,), (HELD_OUT,))):
+        with patch("dynslam_bench.tuning.tuner.design_of", lambda spec, accept: simulated_design((TUNE,), (HELD_OUT,))):
             Tuner.__init__(self, spec, results, **given)
 
 
 @pytest.fixture(autouse=True)
 def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dynslam_bench.tuning.python_study.Tuner", DrawnTuner)
+    monkeypatch.setattr("dynslam_bench.tuning.study.Tuner", DrawnTuner)
 
 
 def steady(run: Outcome) -> float:
@@ -69,59 +68,28 @@ def test_own_objective_sampler_callbacks_and_start(tmp_path: Path) -> None:
         looked.run()
 
 
-def test_blocks_may_be_given_as_blocks(tmp_path: Path) -> None:
-    block = Block("synthetic/walking_xyz?scene=3&frames=20", offset=2)
-    study = Study(**{**FIELDS, "tune": [block, TUNE]}, results=tmp_path)
+def test_instances_may_be_objects(tmp_path: Path) -> None:
+    instance = ProblemInstance("synthetic/walking_xyz?scene=3&frames=20", offset=2)
+    study = Study(**{**FIELDS, "tune": [instance, TUNE]}, results=tmp_path)
     assert study.spec.tune == ("synthetic/walking_xyz?scene=3&frames=20&offsets=2", TUNE)
-    assert study.spec.blocks(study.spec.tune[0]) == [block]
+    assert study.spec.instances(study.spec.tune[0]) == [instance]
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("fields", "named"),
     [
-        ({"start": [{"gian": 1.0}]}, "sets 'gian', which there is not.*'gain'"),
-        ({"start": [{"mode": "crash"}]}, "sets mode = 'crash', but the study holds it at 'fine'"),
-        ({"start": [{"gain": 99.0}]}, "sets gain = 99.0, outside the range"),
+        ({"start": [{"gian": 1.0}]}, "'gian'.*'gain'"),
+        ({"start": [{"mode": "crash"}]}, "'crash'.*'fine'"),
+        ({"start": [{"gain": 99.0}]}, "gain = 99.0"),
         ({"objective": "sped"}, "unknown objective 'sped'.*'speed'"),
         ({"trails": 3}, "the study: unknown key 'trails'.*'trials'"),
         ({"start": ["nowhere.toml"]}, "nowhere.toml"),
     ],
 )
-def test_mistakes_are_one_clear_line(given: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(DynslamError, match=message) as caught:
-        Study(**{**FIELDS, **given}, results=tmp_path)
+def test_mistakes_are_one_clear_line(fields: dict[str, Any], named: str, tmp_path: Path) -> None:
+    with pytest.raises(DynslamError, match=named) as caught:
+        Study(**{**FIELDS, **fields}, results=tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_a_study_file_of_the_old_form_is_converted_with_a_note(tmp_path: Path) -> None:
-    path = tmp_path / "old.toml"
-    path.write_text(f'tune = ["{TUNE}"]\npruner = "median"\nobjectives = ["accuracy", "speed"]\nseeds = [0, 1]\n')
-    notes: list[str] = []
-    spec = read_study(path, notes.append)
-    assert spec.race == "halving" and spec.seeds == (0, 1) and spec.objectives == ("accuracy", "speed")
-    assert len(notes) == 2 and 'pruner = "median" became race = "halving"' in notes[0] and "processor time" in notes[1]
-    assert read_study(path) == spec, "without anybody to tell"
-    path.write_text(f'tune = ["{TUNE}"]\npruner = "best"\n')
-    with pytest.raises(StudyError, match="race: Input should be 'halving'"):
-        read_study(path)
-    assert converted({"tune": ["a"], "race": "none"}) == ({"tune": ["a"], "race": "none"}, []), "today's stays"
-
-
-def test_a_stored_study_of_the_old_form_can_be_looked_at(tmp_path: Path) -> None:
-    Study(**FIELDS, results=tmp_path).run()
-    stored = tmp_path / "studies" / "py" / "study.json"
-    values = json.loads(stored.read_text())
-    for key in ("race", "confirm", "recorded", "ate_margin", "pilot"):
-        del values[key]
-    stored.write_text(json.dumps({**values, "pruner": "wilcoxon"}))
-    assert Study.open(stored.parent).spec.race == "wilcoxon"
-
-
-def test_all_trials_infeasible_keeps_the_default_and_says_so(tmp_path: Path) -> None:
-    study = Study(**{**FIELDS, "min_fps": 1e6}, results=tmp_path).run()
-    summary = study.finish()
-    assert summary.chosen is None and not summary.improves
-    assert "violates a constraint when run again, as do all" in summary.conclusion
 
 
 def test_the_example_goes_as_it_stands_but_for_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

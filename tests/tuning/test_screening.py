@@ -15,11 +15,10 @@ from toy_tracker import ToySettings
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.settings import flatten, parameters
-from dynslam_bench.tuning import Block, Outcome, screen_study
-from dynslam_bench.tuning.evaluate import BlockFailedError
-from dynslam_bench.tuning.screening import KEPT, size_of
-from dynslam_bench.tuning.screening_plan import live, plan, stepped
-from dynslam_bench.tuning.starting import SCREENING_FILE
+from dynslam_bench.tuning import Outcome, ProblemInstance, screen_study
+from dynslam_bench.tuning.evaluate import InstanceFailedError
+from dynslam_bench.tuning.screening import KEPT, live, plan, size_of, stepped
+from dynslam_bench.tuning.study import SCREENING_FILE
 
 SPACE = parameters(ToySettings)
 BASE = flatten(ToySettings())
@@ -34,20 +33,27 @@ class ScreenedTuner(SimulatedTuner):
     """The error depends on the gain alone, the time on the wobble; everything but the mode stirs the chaos."""
 
     def evaluate(
-        self, settings: Mapping[str, Any], blocks: Sequence[Block], *, jobs: int = 1, cache: bool | None = None
-    ) -> dict[Block, Outcome]:
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        jobs: int = 1,
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
         if settings.get("mode") == "crash":
-            raise BlockFailedError("the toy broke")
+            raise InstanceFailedError("the toy broke")
         stirring = {key: value for key, value in settings.items() if key != "mode"}
-        found = super().evaluate(stirring, blocks, jobs=jobs, cache=cache)
-        return {block: replace(each, processor_s=0.02 + 0.01 * settings["wobble"]) for block, each in found.items()}
+        found = super().evaluate(stirring, instances, jobs=jobs, cache=cache)
+        return {
+            instance: replace(each, processor_s=0.02 + 0.01 * settings["wobble"]) for instance, each in found.items()
+        }
 
 
 def test_what_matters_is_kept_and_said_in_what(tmp_path: Path) -> None:
     spec = make_spec(space={"include": ["gain", "wobble"]}, objectives=["accuracy", "speed"])
     tuner = ScreenedTuner(spec, tmp_path, effect=steep)
     done: list[tuple[int, int]] = []
-    found = screen_study(tuner, blocks=8, on_done=lambda number, total: done.append((number, total)))
+    found = screen_study(tuner, instances=8, on_done=lambda number, total: done.append((number, total)))
     assert found.kept == ["wobble", "gain"] or found.kept == ["gain", "wobble"]
     assert {effect.name: effect.objective for effect in found.effects} == {"gain": "ATE", "wobble": "processor time"}
     assert all(effect.low <= effect.size <= effect.high for effect in found.effects)
@@ -57,11 +63,11 @@ def test_what_matters_is_kept_and_said_in_what(tmp_path: Path) -> None:
 
 def test_a_setting_that_breaks_runs_is_named_and_the_rest_goes_on(tmp_path: Path) -> None:
     tuner = ScreenedTuner(make_spec(space={"include": ["gain", "wobble", "mode"]}), tmp_path, effect=steep)
-    found = screen_study(tuner, blocks=8)
+    found = screen_study(tuner, instances=8)
     assert found.failed == {"mode": "the toy broke"} and "gain" in found.kept
     assert "mode" not in {effect.name for effect in found.effects}
-    with pytest.raises(StudyError, match="screening on 1 block cannot tell an effect from chance"):
-        screen_study(tuner, blocks=1)
+    with pytest.raises(StudyError, match="screening on 1 instance cannot tell an effect from chance"):
+        screen_study(tuner, instances=1)
 
 
 def test_chaos_alone_is_hardly_ever_kept_and_a_dead_setting_never() -> None:

@@ -8,8 +8,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.trackers import TrackerSpec

@@ -1,32 +1,32 @@
-"""Stored runs as files of other tools."""
+"""Stored runs as files of other tools, with ``provenance.json`` beside them, which an import reads."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
-from dynslam_bench.core.errors import RunError, did_you_mean
+import dynslam_bench
+from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
+from dynslam_bench.core.records import Digest, Record
+from dynslam_bench.envs.arguments import open_frames
 from dynslam_bench.geometry.association import associate
-from dynslam_bench.geometry.kitti_file import write_kitti
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
-from dynslam_bench.slam.outputs.map_files import read_ply
-
-from ..storage.record import RunRecord
-from ..storage.store import RunStore
-from .colmap import write_colmap
-from .pose_tables import write_euroc, write_vslam_lab
-from .provenance import PROVENANCE_FILE, provenance_of
-from .recording import RECORDING_FILE
-from .ros_bag import write_bag
-from .stored_recording import write_stored
-from .stored_sequence import image_names, open_stored
+from dynslam_bench.geometry.trajectory_files import write_kitti, write_tum
+from dynslam_bench.runs.exchange.formats import write_bag, write_colmap, write_euroc, write_vslam_lab
+from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
+from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.store import RunStore
+from dynslam_bench.sequences.view import part_of
+from dynslam_bench.slam.map_files import read_ply
 
 Which = Literal["online", "final"]
 _STAMP_TOLERANCE_S = 1e-5
@@ -115,10 +115,10 @@ def _check_target(target: Path) -> None:
 
 def _trajectory(store: RunStore, record: RunRecord, which: Which | None) -> tuple[Which, Trajectory]:
     wanted: tuple[Which, ...] = ("final", "online") if which is None else (which,)
-    for each in wanted:
-        found = store.trajectory(record.run_id, each)
-        if found is not None:
-            return each, found
+    for kind in wanted:
+        trajectory = store.trajectory(record.run_id, kind)
+        if trajectory is not None:
+            return kind, trajectory
     raise RunError(f"run {record.run_id} has no {' and no '.join(wanted)} trajectory", record.describe())
 
 
@@ -189,3 +189,131 @@ FORMATS: dict[str, Callable[[_Job, Path], list[str]]] = {
     "rrd": _rrd,
 }
 """Formats by name; each writes its files into a folder and gives notes."""
+
+
+PROVENANCE_FILE = "provenance.json"
+PROVENANCE_SCHEMA = 1
+
+
+class Provenance(Record):
+    """What an export was made of.
+
+    Attributes:
+        schema_version: Of this record.
+        format: Name of the format.
+        files: SHA-256 of every file by its name.
+        run_id: The run.
+        tracker: Its tracker's id.
+        tracker_version: And version.
+        tracker_provenance: ``own``, ``faithful-code``, ... or ``external`` for a trajectory that had been imported.
+        sequence: Id of the sequence.
+        frames: Part of it; None for all.
+        offset: So many leading frames of that part were left out.
+        stride: Every so many frames.
+        seed: Seed.
+        which: Which trajectory: ``online`` or ``final``.
+        overrides: The settings that were asked for.
+        origin: For a run that was imported: where its trajectory had come from.
+        written_by: Version of this package.
+    """
+
+    schema_version: int = PROVENANCE_SCHEMA
+    format: str
+    files: dict[str, str]
+    run_id: Digest
+    tracker: str
+    tracker_version: str = ""
+    tracker_provenance: str = ""
+    sequence: str
+    frames: tuple[int, int | None] | None = None
+    offset: int = 0
+    stride: int = 1
+    seed: int = 0
+    which: Literal["online", "final"]
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    origin: str = ""
+    written_by: str = ""
+
+    def describe(self) -> str:
+        """One line, for the record of an import."""
+        origin = f", which came from {self.origin}" if self.origin else ""
+        return (
+            f"{self.which} trajectory of run {self.run_id} of {self.tracker} {self.tracker_version} on {self.sequence}"
+            f"{origin}, exported as {self.format} by dynslam-bench {self.written_by}"
+        )
+
+
+def provenance_of(record: RunRecord, form: str, which: Literal["online", "final"], folder: Path) -> Provenance:
+    """The provenance of the files of an export that lie in a folder."""
+    files = sorted(path for path in folder.iterdir() if path.is_file())
+    same = ("run_id", "frames", "offset", "stride", "seed", "overrides")
+    return Provenance(
+        format=form,
+        files={path.name: digest_of(path) for path in files},
+        tracker=record.tracker.id,
+        tracker_version=record.tracker.version,
+        tracker_provenance=record.tracker.provenance,
+        sequence=record.sequence.id,
+        which=which,
+        origin=record.provenance,
+        written_by=dynslam_bench.__version__,
+        **{name: getattr(record, name) for name in same},
+    )
+
+
+def stated_provenance(file: Path) -> str:
+    """What ``provenance.json`` beside a trajectory says of it; empty where there is none, or the file has changed.
+
+    Args:
+        file: The trajectory, or the folder that holds it.
+    """
+    beside = (file if file.is_dir() else file.parent) / PROVENANCE_FILE
+    if not beside.is_file():
+        return ""
+    try:
+        provenance = Provenance.read(beside)
+        files = [file] if file.is_file() else [file / name for name in provenance.files if Path(name).name == name]
+        intact = bool(files) and all(provenance.files.get(path.name) == digest_of(path) for path in files)
+    except (DynslamError, OSError, ValueError):  # ValueError: a name with a null byte
+        return ""
+    return provenance.describe() if intact else ""
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file, or of all files directly in a folder, in order of their names.
+
+    Raises:
+        OSError: One cannot be read.
+    """
+    files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+    whole = sha256()
+    for file in files:
+        whole.update(file.read_bytes())
+    return whole.hexdigest()
+
+
+def open_stored(record: RunRecord, data_root: str | Path | None = None, camera: str | Path | None = None) -> Sequence:
+    """The frames of a run as its tracker saw them, before any preprocessing.
+
+    Args:
+        record: The run's.
+        data_root: Folder of the recorded sequences; None for the default one.
+        camera: Camera of a folder that does not say its own.
+
+    Raises:
+        DynslamError: It is not here, or not the one that was run on.
+    """
+    if not record.sequence.content:  # else a record could name any folder of images, and a page or a file show them
+        raise RunError(f"the record does not say what {record.sequence.id} held")
+    start, stop = record.frames or (0, None)
+    place = record.place or record.sequence.id
+    sequence = open_frames(place, data_root, camera, (start + record.offset, stop), record.stride)
+    if part_of(sequence, record.offset).content != record.sequence.content:
+        raise RunError(f"the content of {record.sequence.id} has changed since the run")
+    return sequence
+
+
+def image_names(sequence: Sequence) -> list[str]:
+    """The colour image of every frame, relative to the sequence's folder; TUM's way of naming where it has no files."""
+    colour_files: dict[float, str] = getattr(sequence, "colour_files", {})
+    return [colour_files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]

@@ -1,8 +1,7 @@
-"""A run as a recording for rerun's viewer: images, masks, kept and culled features, map, trajectory against truth.
+"""A run as a recording for rerun's viewer: images, masks, static and dynamic features, map, trajectory against truth.
 
-Images are JPEG at half size, for which everything in their plane is scaled. Rows are collected and handed over
-`BLOCK` frames at a time, which costs a third of logging one by one. On the timelines ``frame`` (index) and ``time``
-(seconds since the first frame):
+Images are JPEG at half size, and everything in their plane is scaled with them. On the timelines ``frame`` (index) and
+``time`` (seconds since the first frame):
 
 - ``world/camera``: the causal pose; ``world/camera/image`` with ``mask``, ``kept`` and ``culled`` below it
 - ``error/trans_m``, ``features/kept``, ``features/culled``: numbers a frame; ``state``: where it changes
@@ -12,229 +11,278 @@ and without time, from the end of the run: ``world/map``, ``world/estimate``, ``
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import subprocess
-import sys
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.rendering import CULLED, ESTIMATE, KEPT, MASK, TRUTH
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from ..process.server import child_environment
-from ..snapshots import Snapshot
-from .rerun_file import CLEARED, IMAGE, LAYERS, Block, RerunFile, packed
+from dynslam_bench.runs.artifacts import Snapshot, aligned_truth, read_snapshots
+from dynslam_bench.runs.frames import CSV_FILE, read_csv
+from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.store import RunStore
+from dynslam_bench.slam.map_files import read_ply
 
 RECORDING_FILE = "recording.rrd"
-BLOCK = 25
+IMAGE = "world/camera/image"
+LAYERS = {"mask": f"{IMAGE}/mask", "kept": f"{IMAGE}/kept", "culled": f"{IMAGE}/culled"}
+_BLOCK = 25
+"""Frames that are logged at once, which costs a third of logging one by one."""
 _QUALITY = 80
+_TOLERANCE_S = 1e-5
 
 
-@dataclass
-class _Rows:
-    """Values of one entity with the frames they belong to."""
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """A frame of a recording.
 
-    frames: list[int] = field(default_factory=list)
-    times: list[float] = field(default_factory=list)
-    values: list[Any] = field(default_factory=list)
-
-    def arrays(self, entity: str) -> Block:
-        """The rows in a block: side by side where all have one shape, else one behind the other with their lengths."""
-        block: Block = {
-            f"{entity}|frames": np.array(self.frames, np.int64),
-            f"{entity}|times": np.array(self.times, np.float64),
-        }
-        if entity in (IMAGE, LAYERS["kept"], LAYERS["culled"]):
-            lengths = np.array([len(value) for value in self.values], np.int64)
-            return block | {f"{entity}|values": np.concatenate(self.values), f"{entity}|lengths": lengths}
-        return block | {f"{entity}|values": np.array(self.values)}
-
-
-class _File(Protocol):
-    """What takes the blocks."""
-
-    def write(self, block: Block) -> None: ...
-    def close(self) -> None: ...
-
-
-class _Apart:
-    """The file in a process of its own, `rerun_file`: rerun takes a while to load, and its work is not the run's."""
-
-    def __init__(self, start: Block) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", RerunFile.__module__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=child_environment(),
-        )
-        self.write(start)
-
-    def write(self, block: Block) -> None:
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # `close` says why
-            self._process.stdin.write(packed(block))
-            self._process.stdin.flush()
-
-    def close(self) -> None:
-        said, _ = self._process.communicate()
-        if self._process.returncode:
-            reason = said.decode(errors="replace") or f"its process ended with exit code {self._process.returncode}"
-            raise RunError(f"the recording cannot be written: {reason}", "check the free space; the log may say more")
-
-
-class RecordingWriter:
-    """Writes one run as an ``.rrd`` file; what a run that ends early has handed over stays readable.
-
-    Args:
-        path: The file.
-        camera: Of the images that will be added.
-        name: Recording's name in the viewer.
-        apart: Whether a process of its own writes the file, so that a run need not wait for it.
-
-    Raises:
-        RunError: `rerun-sdk` is not installed, or the file cannot be written.
+    Attributes:
+        index: Of the frame in the run's part of the sequence.
+        stamp: Seconds.
+        jpeg: The image at half size, see `encode`; None to show none.
+        pose: Camera to world ``[4, 4]``; None where the tracker has none: the camera stays where it was.
+        shot: Features in pixels of the image, and the mask; None if they are not known, which shows none.
+        state: ``ok``, ``lost``, ...
+        error_m: Causal translational error in metres.
     """
 
-    def __init__(self, path: Path, camera: Camera, name: str, *, apart: bool = False) -> None:
-        check_rerun()
-        self._size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
-        self._scale = np.array([self._size[0] / camera.width, self._size[1] / camera.height])
-        self._rows: dict[str, _Rows] = {}
-        self._shown: set[str] = set()
-        self._first: float | None = None
-        self._state = ""
-        start = {"path": str(path), "name": name, "matrix": self._matrix(camera), "size": self._size}
-        start |= {"kept": KEPT, "culled": CULLED, "mask": MASK}
-        try:
-            path.touch()
-            block = {name: np.array(value) for name, value in start.items()}
-            self._file: _File = _Apart(block) if apart else RerunFile(block)
-        except OSError as error:
-            raise RunError(f"cannot write {path}: {error}", "check the permissions and the free space") from error
+    index: int
+    stamp: float
+    jpeg: bytes | None
+    pose: NDArray[np.float64] | None
+    shot: Snapshot | None = None
+    state: str = ""
+    error_m: float | None = None
 
-    def add(
-        self,
-        index: int,
-        stamp: float,
-        rgb: NDArray[np.uint8] | None,
-        pose: NDArray[np.float64] | None,
-        shot: Snapshot | None = None,
-        *,
-        state: str = "",
-        error_m: float | None = None,
-    ) -> None:
-        """Add a frame.
 
-        Args:
-            index: Of the frame in the run's part of the sequence.
-            stamp: Seconds.
-            rgb: uint8 ``[H, W, 3]``, red first; None to show none.
-            pose: Camera to world ``[4, 4]``; None where the tracker has none: the camera stays where it was.
-            shot: Features in pixels of the image, and the mask; None if they are not known, which shows none.
-            state: ``ok``, ``lost``, ...
-            error_m: Causal translational error in metres.
-        """
-        self._first = stamp if self._first is None else self._first
-        at = (index, stamp - self._first)
-        if pose is not None:
-            self._put("world/camera", at, np.concatenate(se3.to_quaternion(pose)))
-        if rgb is not None:
-            self._put(IMAGE, at, self._jpeg(rgb))
-        if error_m is not None:
-            self._put("error/trans_m", at, error_m)
-        self._clear(shot, at)
-        if shot is not None:
-            self._put_seen(shot, at)
-        if state != self._state:
-            self._put("state", at, state)
-            self._state = state
-        if len(self._rows.get(IMAGE, _Rows()).frames) >= BLOCK:
-            self._hand_over()
-
-    def finish(
-        self,
-        estimate: Trajectory,
-        truth: Trajectory | None,
-        positions: NDArray[np.floating] | None,
-        colours: NDArray[np.uint8] | None,
-    ) -> None:
-        """Add what is known at the end: the trajectory, the truth in its frame, and the map ``[M, 3]`` in metres."""
-        block: Block = {}
-        for name, track, colour in (("estimate", estimate, ESTIMATE), ("truth", truth, TRUTH)):
-            if track is not None and len(track):
-                block |= {f"world/{name}|line": track.positions, f"world/{name}|colour": np.array(colour)}
-        if positions is not None and len(positions):
-            block["world/map|points"] = positions
-            if colours is not None:
-                block["world/map|colours"] = colours
-        if block:
-            self._file.write(block)
-
-    def close(self) -> None:
-        """Hand over what is left and end the file.
-
-        Raises:
-            RunError: It could not be written.
-        """
-        self._hand_over()
-        self._file.close()
-
-    def _matrix(self, camera: Camera) -> NDArray[np.float64]:
-        matrix: NDArray[np.float64] = camera.matrix * np.array([*self._scale, 1.0])[:, None]
-        matrix[:2, 2] += 0.5 * self._scale  # rerun puts the corner of the top-left pixel at 0, we its centre
-        return matrix
-
-    def _put(self, entity: str, at: tuple[int, float], value: Any) -> None:
-        rows = self._rows.setdefault(entity, _Rows())
-        rows.frames.append(at[0])
-        rows.times.append(at[1])
-        rows.values.append(value)
-
-    def _put_seen(self, shot: Snapshot, at: tuple[int, float]) -> None:
-        points = ((shot.points + 0.5) * self._scale).astype(np.float32)
-        for name, chosen in (("kept", points[shot.kept]), ("culled", points[~shot.kept])):
-            self._put(LAYERS[name], at, chosen)
-            self._put(f"features/{name}", at, float(len(chosen)))
-        if shot.mask is not None:
-            small = cv2.resize(shot.mask.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST)
-            self._put(LAYERS["mask"], at, small)
-
-    def _clear(self, shot: Snapshot | None, at: tuple[int, float]) -> None:
-        """What an earlier frame showed and this one does not know must not stand on in the viewer."""
-        shown = set() if shot is None else {"kept", "culled"} | ({"mask"} if shot.mask is not None else set())
-        for name in self._shown - shown:
-            self._put(f"{CLEARED}{LAYERS[name]}", at, False)
-        self._shown = shown
-
-    def _jpeg(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        small = cv2.cvtColor(cv2.resize(rgb, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
-        encoded: NDArray[np.uint8] = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-        return encoded
-
-    def _hand_over(self) -> None:
-        block: Block = {}
-        for entity, rows in self._rows.items():
-            block |= rows.arrays(entity)
-        self._rows.clear()
-        if block:
-            self._file.write(block)
+def encode(rgb: NDArray[np.uint8]) -> bytes:
+    """An image, uint8 ``[H, W, 3]``, red first, as a JPEG file of half its size."""
+    size = (max(rgb.shape[1] // 2, 1), max(rgb.shape[0] // 2, 1))
+    small = cv2.cvtColor(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
 
 
 def check_rerun() -> None:
-    """See that the library is there, without loading it.
+    """Check that the library is there, without loading it.
 
     Raises:
         RunError: It is not installed.
     """
     if importlib.util.find_spec("rerun") is None:
         raise RunError("recordings are written with rerun-sdk, which is not installed", install_hint("rerun"))
+
+
+def write_recording(
+    path: Path,
+    camera: Camera,
+    name: str,
+    frames: Iterable[RecordedFrame],
+    tracks: tuple[Trajectory, Trajectory | None],
+    cloud: Any = None,
+) -> None:
+    """Write an ``.rrd`` file.
+
+    Args:
+        path: The file.
+        camera: Of the images.
+        name: Recording's name in the viewer.
+        frames: In order.
+        tracks: The estimate, and the truth in its frame.
+        cloud: Map points with ``positions`` ``[M, 3]`` in metres and ``colours``; None without.
+
+    Raises:
+        RunError: `rerun-sdk` is not installed, or the file cannot be written.
+    """
+    check_rerun()
+    import rerun as rr
+
+    stream = rr.RecordingStream("dynslam-bench")
+    try:
+        path.touch()
+        stream.save(str(path), default_blueprint=_blueprint())
+    except (OSError, RuntimeError) as error:
+        raise RunError(f"cannot write {path}: {error}", "check the permissions and the free space") from error
+    stream.send_recording_name(name)
+    _Stream(rr, stream, camera).write(frames)
+    for track_name, track, colour in zip(("estimate", "truth"), tracks, (ESTIMATE, TRUTH), strict=True):
+        if track is not None and len(track):
+            stream.log(f"world/{track_name}", rr.LineStrips3D([track.positions], colors=[colour]), static=True)
+    if cloud is not None and len(cloud.positions):
+        stream.log("world/map", rr.Points3D(cloud.positions, colors=cloud.colours, radii=0.005), static=True)
+    stream.disconnect()
+
+
+class _Stream:
+    """Logs frames in blocks.
+
+    Args:
+        rr: The library.
+        stream: Where to.
+        camera: Of the images.
+    """
+
+    def __init__(self, rr: Any, stream: Any, camera: Camera) -> None:
+        self.rr, self.stream = rr, stream
+        self.size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
+        self.scale = np.array([self.size[0] / camera.width, self.size[1] / camera.height])
+        matrix = camera.matrix * np.array([*self.scale, 1.0])[:, None]
+        matrix[:2, 2] += 0.5 * self.scale  # rerun puts the corner of the top-left pixel at 0, we its centre
+        pinhole = rr.Pinhole(
+            image_from_camera=matrix, width=self.size[0], height=self.size[1], camera_xyz=rr.ViewCoordinates.RDF
+        )
+        classes = rr.AnnotationContext([(0, "static", (0, 0, 0, 0)), (1, "dynamic", (*MASK, 110))])
+        stream.log("world", rr.ViewCoordinates.RDF, static=True)
+        stream.log(IMAGE, pinhole, classes, static=True)
+        for layer, colour in (("kept", KEPT), ("culled", CULLED)):
+            stream.log(LAYERS[layer], rr.Points2D.from_fields(colors=[colour], radii=[1.0]), static=True)
+        self.first: float | None = None
+        self.state = ""
+        self.shown: set[str] = set()
+
+    def write(self, frames: Iterable[RecordedFrame]) -> None:
+        """Log all frames."""
+        rr, remaining = self.rr, iter(frames)
+        while block := list(islice(remaining, _BLOCK)):
+            self.first = block[0].stamp if self.first is None else self.first
+            poses = [(f, np.concatenate(se3.to_quaternion(f.pose))) for f in block if f.pose is not None]
+            self._send("world/camera", poses, self._transforms)
+            self._send(IMAGE, [(f, f.jpeg) for f in block if f.jpeg is not None], self._images)
+            errors = [(f, f.error_m) for f in block if f.error_m is not None]
+            self._send("error/trans_m", errors, lambda values: rr.Scalars.columns(scalars=values))
+            self._send("state", self._changes(block), lambda values: rr.TextLog.columns(text=values))
+            for layer, cleared in self._cleared(block).items():
+                self._send(LAYERS[layer], cleared, lambda values: rr.Clear.columns(is_recursive=values))
+            shots = [(f, f.shot) for f in block if f.shot is not None]
+            for layer in ("kept", "culled"):
+                points = [(f, self._points(shot, kept=layer == "kept")) for f, shot in shots]
+                self._send(LAYERS[layer], points, self._point_columns)
+                counts = [(f, float(len(chosen))) for f, chosen in points]
+                self._send(f"features/{layer}", counts, lambda values: rr.Scalars.columns(scalars=values))
+            masks = [(f, shot.mask) for f, shot in shots if shot.mask is not None]
+            self._send(LAYERS["mask"], masks, self._masks)
+
+    def _send(self, entity: str, rows: list[tuple[RecordedFrame, Any]], columns: Callable[[list[Any]], Any]) -> None:
+        if not rows:
+            return
+        seconds = np.array([frame.stamp for frame, _ in rows]) - (self.first or 0.0)
+        numbers = np.array([frame.index for frame, _ in rows])
+        index = [self.rr.TimeColumn("frame", sequence=numbers), self.rr.TimeColumn("time", duration=seconds)]
+        self.stream.send_columns(entity, indexes=index, columns=columns([value for _, value in rows]))
+
+    def _transforms(self, values: list[Any]) -> Any:
+        rows = np.array(values)
+        return self.rr.Transform3D.columns(translation=rows[:, :3], quaternion=rows[:, 3:])
+
+    def _images(self, values: list[bytes]) -> Any:
+        return self.rr.EncodedImage.columns(blob=values, media_type=["image/jpeg"] * len(values))
+
+    def _points(self, shot: Snapshot, *, kept: bool) -> NDArray[np.float32]:
+        points: NDArray[np.float32] = ((shot.points + 0.5) * self.scale).astype(np.float32)
+        return points[shot.kept if kept else ~shot.kept]
+
+    def _point_columns(self, values: list[NDArray[np.float32]]) -> Any:
+        columns = self.rr.Points2D.columns(positions=np.concatenate(values))
+        return columns.partition([len(points) for points in values])
+
+    def _masks(self, values: list[NDArray[np.bool_]]) -> Any:
+        shape = self.rr.components.ImageFormat(
+            width=self.size[0], height=self.size[1], channel_datatype=self.rr.ChannelDatatype.U8
+        )
+        resized = [cv2.resize(mask.astype(np.uint8), self.size, interpolation=cv2.INTER_NEAREST) for mask in values]
+        buffers = [mask.tobytes() for mask in resized]
+        return self.rr.SegmentationImage.columns(buffer=buffers, format=[shape] * len(buffers))
+
+    def _changes(self, block: list[RecordedFrame]) -> list[tuple[RecordedFrame, str]]:
+        """The frames on which the state is another one than before."""
+        before = [self.state, *(frame.state for frame in block)]
+        self.state = before[-1]
+        return [(frame, frame.state) for frame, state in zip(block, before, strict=False) if frame.state != state]
+
+    def _cleared(self, block: list[RecordedFrame]) -> dict[str, list[tuple[RecordedFrame, bool]]]:
+        """Layers that a frame showed and the next one does not know: the viewer would show them on."""
+        cleared: dict[str, list[tuple[RecordedFrame, bool]]] = {layer: [] for layer in LAYERS}
+        for frame in block:
+            shown = set() if frame.shot is None else {"kept", "culled", *(["mask"] * (frame.shot.packed is not None))}
+            for layer in self.shown - shown:
+                cleared[layer].append((frame, False))
+            self.shown = shown
+        return cleared
+
+
+def _blueprint() -> Any:
+    """What the viewer shows at first: the scene on the left, the image and the numbers on the right."""
+    import rerun.blueprint as rrb
+
+    numbers = rrb.Horizontal(rrb.TimeSeriesView(origin="error"), rrb.TimeSeriesView(origin="features"))
+    right = rrb.Vertical(rrb.Spatial2DView(origin=IMAGE), numbers, row_shares=[2, 1])
+    return rrb.Blueprint(rrb.Horizontal(rrb.Spatial3DView(origin="world"), right))
+
+
+def write_stored(
+    path: Path, store: RunStore, record: RunRecord, sequence: Sequence, trajectory: Trajectory
+) -> list[str]:
+    """Write the recording of a stored run.
+
+    Args:
+        path: The file.
+        store: The run's.
+        record: The run.
+        sequence: The frames that it was made on.
+        trajectory: What is drawn as its estimate, and where the camera goes if the run has no online poses.
+
+    Returns:
+        What a user should know, one line each.
+
+    Raises:
+        RunError: `rerun-sdk` is not installed, or a file of the run is damaged.
+        SequenceError: An image cannot be read.
+    """
+    folder = store.folder(record.run_id)
+    (height, width), snapshots = read_snapshots(folder)
+    scale = np.array([sequence.camera.width / max(width, 1), sequence.camera.height / max(height, 1)])
+    shots = {shot.index: _scaled(shot, scale) for shot in snapshots}
+    online = store.trajectory(record.run_id, "online") or trajectory
+    rows = {row.index: row for row in read_csv(folder / CSV_FILE)} if (folder / CSV_FILE).is_file() else {}
+
+    def frames() -> Iterator[RecordedFrame]:
+        for index in range(len(sequence)):
+            frame, row = sequence[index], rows.get(index)
+            state = ("", None) if row is None else (str(row.state), row.pose_error_trans_m)
+            pose = _pose_at(online, frame.timestamp)
+            yield RecordedFrame(index, frame.timestamp, encode(frame.rgb), pose, shots.get(index), *state)
+
+    cloud = read_ply(folder / "map.ply") if (folder / "map.ply").is_file() else None
+    truth = aligned_truth(sequence.ground_truth, trajectory)[0]
+    name = f"{record.tracker.label} on {record.sequence.id}"
+    write_recording(path, sequence.camera, name, frames(), (trajectory, truth), cloud)
+    if len(shots) == len(sequence):
+        return []
+    return [f"features and masks are known of {len(shots)} of {len(sequence)} frames; `run --rrd` records all"]
+
+
+def _scaled(shot: Snapshot, scale: NDArray[np.float64]) -> Snapshot:
+    """A snapshot of an image that the tracker's preprocessing had resized, in pixels of the sequence's."""
+    if (scale == 1).all():
+        return shot
+    points = ((shot.points + 0.5) * scale - 0.5).round().astype(np.int16)
+    return replace(shot, points=points)
+
+
+def _pose_at(trajectory: Trajectory, stamp: float) -> NDArray[np.float64] | None:
+    near = int(np.searchsorted(trajectory.timestamps, stamp - _TOLERANCE_S))
+    if near < len(trajectory) and abs(trajectory.timestamps[near] - stamp) <= _TOLERANCE_S:
+        pose: NDArray[np.float64] = trajectory.T_world_cam[near]
+        return pose
+    return None

@@ -1,38 +1,55 @@
-"""The process that makes a run: it steps an environment and tells the parent how it goes.
+"""The process that makes a run: it steps an environment and reports to the parent.
 
-Messages are JSON bytes over the connection, never pickles. The parent sends the job (`make_job`), which names what is
-to be done, then perhaps ``stop``. The child sends ``ready`` before anything else (its time counts from then on),
-``started``, ``frame`` (one each, the sign of life), ``progress`` every so many frames, and ends with ``done``,
-``stopped`` or ``failed``. What it found lies in files in the job's folder: `frames.jsonl`, written frame by frame so
-that a crash loses nothing, and at the end the final trajectory and the map. Its temporary files lie in a private
-folder that goes with it.
+Messages are JSON bytes over the connection, never pickles. The parent sends the job (`make_job`) and may send ``stop``
+later. The child sends ``ready`` first (its time counts from then on), ``started``, ``frame`` (once a frame, the sign of
+life) and ``progress`` every so many frames; it ends with ``done``, ``stopped`` or ``failed``. Its results are files in
+the job's folder: ``frames.jsonl``, written frame by frame so that a crash loses nothing, and at the end the final
+trajectory and the map. Its temporary files lie in a private folder that is removed with it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import faulthandler
 import json
 import logging
 import os
+import re
 import resource
 import signal
 import sys
+import sysconfig
 import tempfile
 import threading
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.plugin_probe import ISOLATED_VARIABLE
-from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.temporary import TemporaryFolder
-
-from .failures import describe_failure
-from .family import adopt_orphans, die_with_parent
+from dynslam_bench.core.errors import (
+    DynslamError,
+    InfrastructureError,
+    PluginError,
+    SegmentationError,
+    SequenceError,
+    SettingsError,
+    TrajectoryError,
+)
+from dynslam_bench.core.files import TemporaryFolder
+from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
+from dynslam_bench.runs.process.tree import adopt_orphans, die_with_parent
 
 LOG_FILE = "log.txt"
+_LONGEST = 400
+_REFUSALS = (SettingsError, PluginError, TrajectoryError)
+"""Raised before the first frame is tracked, these say that what was asked for cannot be."""
+_DATA_FAULTS = (SequenceError, SegmentationError)
+"""These say, whenever they are raised, that an image, a mask or a network's weights are at fault."""
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE)
+"""Errors of a disk that is full, read-only, damaged or gone: no tracker is at fault."""
 
 
 def main(connection: Connection) -> int:
@@ -47,7 +64,7 @@ def main(connection: Connection) -> int:
     with contextlib.suppress(OSError):
         os.setsid()  # so that the parent can end this process together with what a tracker starts
     die_with_parent()
-    adopt_orphans()  # so that what a tracker starts and forgets is still seen below this process
+    adopt_orphans()  # so that what a tracker starts and forgets stays below this process
     try:
         job = json.loads(connection.recv_bytes())
     except EOFError:
@@ -80,7 +97,7 @@ def peak_memory_mb() -> float:
 
 
 def _listen(connection: Connection, stop: threading.Event) -> None:
-    """Wait for ``stop``; a connection that closes means that nobody wants the result any more."""
+    """Wait for ``stop``; when the parent closes the connection, this process ends with its group."""
     while True:
         try:
             message = connection.recv_bytes()
@@ -99,16 +116,14 @@ def _send(connection: Connection, message: dict[str, Any]) -> None:
 
 
 def _redirect(log: Path) -> None:
-    """Everything that is printed, by whatever library, goes to the log; so does the stack of a fatal signal."""
+    """Send everything that is printed, by whatever library, to the log, and the stack of a fatal signal."""
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.dup2(handle, 1)
-    os.dup2(handle, 2)
-    os.close(handle)
-    for stream in (sys.stdout, sys.stderr):
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        stream.flush()
+        os.dup2(handle, number)
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(line_buffering=True)
+    os.close(handle)
     faulthandler.enable(file=2, all_threads=False)
     programs = logging.getLogger("dynslam_bench.trackers.adapters.program")
     programs.setLevel(logging.INFO)
@@ -116,6 +131,7 @@ def _redirect(log: Path) -> None:
 
 
 def _prepare(job: dict[str, Any]) -> None:
+    """Take over the parent's environment, working folder and import path, and limit the threads."""
     wanted = {name: text for name, text in job["environment"].items() if name != "TMPDIR"}
     os.environ.update(wanted | {ISOLATED_VARIABLE: "1"})
     with contextlib.suppress(OSError):
@@ -125,17 +141,94 @@ def _prepare(job: dict[str, Any]) -> None:
 
 
 def limit_threads(threads: int) -> None:
-    """Give OpenCV, torch and numba that many threads; BLAS has one (see `server.THREAD_VARIABLES`)."""
+    """Give OpenCV, torch and numba that many threads; BLAS has one (see `fork_server.THREAD_VARIABLES`)."""
     import cv2
 
     cv2.setNumThreads(threads)
-    torch = sys.modules.get("torch")
+    torch, numba = sys.modules.get("torch"), sys.modules.get("numba")
     if torch is None:
         os.environ["OMP_NUM_THREADS"] = str(threads)
     else:
         torch.set_num_threads(threads)
-    numba = sys.modules.get("numba")
     if numba is None:
         os.environ["NUMBA_NUM_THREADS"] = str(threads)
     else:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+
+
+class FailedAt(Exception):
+    """Where a run was when its cause was raised."""
+
+
+@contextmanager
+def at(where: object) -> Iterator[None]:
+    """Note where the run was for what is raised inside; `where` is formatted only then."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        raise FailedAt(str(where)) from error
+
+
+def describe_failure(error: BaseException) -> dict[str, Any]:
+    """The last message of a run that an exception ended: ``status``, ``reason`` and ``refused``.
+
+    The key ``infrastructure`` says what broke beside the run. The key ``data`` says that something other than the
+    tracker's own code raised, or that its input cannot be read: the run says nothing about the tracker.
+
+    The reason reads ``frame 20 of 60: ValueError: too few points (my_tracker.py:31)``.
+    """
+    from dynslam_bench.contracts.checks import TrackerContractError, raised_by_tracker
+
+    where, cause = "", error
+    if isinstance(error, FailedAt) and error.__cause__ is not None:
+        where, cause = str(error), error.__cause__
+    text, kind = _one_line(cause), type(cause).__name__
+
+    def message(status: str, what: str, *, line: bool = False, **more: Any) -> dict[str, Any]:
+        before = "" if not where or re.search(r"\bframe \d+", what) else f"{where}: "
+        after = f" ({source})" if line and (source := source_line(cause)) else ""
+        return {"type": "failed", "status": status, "reason": before + what + after, **more}
+
+    broken = _broken_infrastructure(error)
+    if broken:
+        return message("crashed", broken, infrastructure=broken)
+    if isinstance(cause, TrackerContractError):
+        return message("invalid", text)
+    exited = f"sys.exit({cause.code!r}) was called" if isinstance(cause, SystemExit) else ""
+    named = exited or f"{kind}: {text}".rstrip(": ")
+    if isinstance(cause, MemoryError) or "out of memory" in text.lower() or kind == "OutOfMemoryError":
+        return message("out-of-memory", named, line=True)
+    data = {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
+    if isinstance(cause, DynslamError):
+        return message("crashed", text, refused=isinstance(cause, _REFUSALS), **data)
+    return message("crashed", named, line=True, **data)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:_LONGEST]
+
+
+def _broken_infrastructure(error: BaseException | None) -> str:
+    """What of the infrastructure broke, by an exception or one of its causes; empty if nothing did."""
+    while error is not None:
+        if isinstance(error, InfrastructureError) or (isinstance(error, OSError) and error.errno in _DISK_ERRORS):
+            return _one_line(error)
+        error = error.__cause__ or error.__context__
+    return ""
+
+
+def source_line(error: BaseException) -> str:
+    """``file.py:31``: the innermost line of an exception's traceback outside of libraries, else the innermost."""
+    lines = traceback.extract_tb(error.__traceback__)
+    if not lines:
+        return ""
+    libraries = (*map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")), "<", sys.base_prefix)
+    outside = [
+        line for line in lines if "site-packages" not in line.filename and not line.filename.startswith(libraries)
+    ]
+    line = (outside or lines)[-1]
+    return f"{Path(line.filename).name}:{line.lineno}"
+
+
+if __name__ == "__main__":
+    os._exit(main(Connection(int(sys.argv[1]))))  # threads that a tracker left running must not hold it up

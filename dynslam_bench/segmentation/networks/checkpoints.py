@@ -1,4 +1,4 @@
-"""Where network weights lie: in the package, in the user's cache, or at a published address. No torch in here."""
+"""Network weights: in the package, in the user's cache, or at a published address. Imports no torch."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dynslam_bench.core.download import Report, download
-from dynslam_bench.core.errors import DownloadError, SegmentationError
+from dynslam_bench.core.errors import DownloadError, SegmentationError, SequenceError
 from dynslam_bench.core.folders import weights_folder
+from dynslam_bench.sequences.synthetic import TUNE_SCENES, parse_synthetic_id
 
-EMBEDDED_NAME = "embedded.pt"
 ATTEMPTS = 3
-"""Connections in a row that may fail: whoever waits for a run wants to know soon."""
+"""Connections in a row that may fail before a run is refused."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,20 @@ COCO = Checkpoint(
 
 def embedded_weights() -> Path | None:
     """The file of the network that comes with this package; None if this installation has none."""
-    path = Path(__file__).parent / "weights" / EMBEDDED_NAME
+    path = Path(__file__).parent / "weights" / "embedded.pt"
     return path if path.is_file() else None
+
+
+def require_embedded_weights() -> Path:
+    """The file of the network that comes with this package.
+
+    Raises:
+        SegmentationError: This installation lacks it.
+    """
+    path = embedded_weights()
+    if path is None:
+        raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
+    return path
 
 
 def cached_checkpoint(checkpoint: Checkpoint) -> Path | None:
@@ -63,11 +75,11 @@ def cached_checkpoint(checkpoint: Checkpoint) -> Path | None:
 def fetch_checkpoint(checkpoint: Checkpoint, progress: Report | None = None) -> Path:
     """The checkpoint's file, downloaded and verified if it is not in the cache yet.
 
-    A broken or foreign download never gets the final name; one that was cut short goes on where it stopped.
+    A download gets its final name when its checksum is right; an interrupted one is resumed.
 
     Args:
         checkpoint: What to fetch.
-        progress: Told how far the download is; see `core.download.download`.
+        progress: Called with the progress of the download; see `core.download.download`.
 
     Raises:
         SegmentationError: No network, no space, or the content's SHA-256 does not begin as published; names the
@@ -79,9 +91,26 @@ def fetch_checkpoint(checkpoint: Checkpoint, progress: Report | None = None) -> 
     try:
         download(checkpoint.url, path, sha256=checkpoint.sha256_prefix, progress=progress, attempts=ATTEMPTS)
     except DownloadError as error:
-        by_hand = (
+        raise SegmentationError(
+            f"cannot fetch the checkpoint '{checkpoint.id}': {error.args[0]}",
             f"put the file of {checkpoint.url} ({checkpoint.megabytes} MB, its SHA-256 begins with "
-            f"{checkpoint.sha256_prefix}) at {path}"
-        )
-        raise SegmentationError(f"cannot fetch the checkpoint '{checkpoint.id}': {error.args[0]}", by_hand) from error
+            f"{checkpoint.sha256_prefix}) at {path}",
+        ) from error
     return path
+
+
+def seen_in_training(source: str, sequence_id: str) -> bool:
+    """Whether masks come from a network that was trained on frames of that scene.
+
+    This is known of the embedded network only: it was trained on every rendered sequence of the scenes 0-99.
+
+    Args:
+        source: Source of the masks, resolved (``embedded``, never ``auto``).
+        sequence_id: For example ``synthetic/walking_xyz?scene=3``.
+    """
+    if source != "embedded" or not sequence_id.startswith("synthetic/"):
+        return False
+    try:
+        return parse_synthetic_id(sequence_id).scene in TUNE_SCENES
+    except SequenceError:  # an imported trajectory may name any sequence
+        return False

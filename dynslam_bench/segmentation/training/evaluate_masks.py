@@ -1,32 +1,216 @@
-"""``segmenter evaluate``: how good a segmenter's masks are on labelled images."""
+"""``segmenter evaluate``: average precision, intersection over union and recall of masks on labelled images."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Collection
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from dynslam_bench.contracts.segmenter import Segmenter
+from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
+from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.training.labelled_images import LabelledImage, LabelledImages, open_labelled
 
-from ..build_segmenter import build_segmenter, resolve_source, weights_digest
-from ..settings import SegmentationSettings
-from .labelled import LabelledImages
-from .mask_metrics import MaskQuality, MaskTally
-from .open_labelled import open_labelled
+THRESHOLDS: tuple[float, ...] = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
+RECALL_POINTS = np.linspace(0, 1, 101)
 
-Progress = Callable[[int, int], None]
+
+@dataclass
+class _ClassTally:
+    counts: MaskCounts = field(default_factory=MaskCounts)
+    truths: int = 0
+    scores: list[float] = field(default_factory=list)
+    hits: list[NDArray[np.bool_]] = field(default_factory=list)
+    ignored: list[NDArray[np.bool_]] = field(default_factory=list)
+    best: list[float] = field(default_factory=list)
+    frames: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class ClassQuality:
+    """Mask quality of one class over a set of images.
+
+    Attributes:
+        truths: Objects that are there.
+        detections: Objects that were found.
+        ap: Mean over IoU thresholds 0.50, 0.55 ... 0.95 of the average precision (COCO's 101 recall points).
+        ap50: Average precision at IoU 0.5.
+        iou: Intersection over union of the class's pixels, added up over all images.
+        frame_iou: Mean over the images in which the class is there or was found of their IoU.
+        instance_iou: Mean over the objects of the IoU of the detection that fits best (0 if there is none).
+        recall: Share of the objects that a detection covers with IoU >= 0.5.
+    """
+
+    truths: int
+    detections: int
+    ap: float
+    ap50: float
+    iou: float
+    frame_iou: float
+    instance_iou: float
+    recall: float
+
+
+@dataclass(frozen=True)
+class MaskQuality:
+    """Mask quality over a set of images, and by class."""
+
+    images: int
+    classes: dict[str, ClassQuality]
+
+    @property
+    def mean_ap(self) -> float:
+        """Mean over the classes that occur."""
+        return self._mean("ap")
+
+    @property
+    def mean_iou(self) -> float:
+        """Mean over the classes that occur."""
+        return self._mean("iou")
+
+    def _mean(self, name: str) -> float:
+        values = [getattr(quality, name) for quality in self.classes.values() if quality.truths]
+        return float(np.mean(values)) if values else float("nan")
+
+
+class MaskTally:
+    """Mask quality, gathered image by image.
+
+    Args:
+        classes: The classes to measure.
+        confidence: Least score of detections that count for IoU and recall; AP takes them all.
+        min_area: Objects with fewer pixels are ignored, and detections of them are no errors.
+    """
+
+    def __init__(self, classes: Collection[str], *, confidence: float = 0.5, min_area: int = 0) -> None:
+        self.confidence = confidence
+        self.min_area = min_area
+        self._tallies = {name: _ClassTally() for name in sorted(classes)}
+        self._images = 0
+
+    def add(self, truth: LabelledImage, detections: Instances) -> None:
+        """Compare the detections in an image with its labels.
+
+        Raises:
+            SegmentationError: The masks differ in size.
+        """
+        if truth.masks.shape[1:] != detections.masks.shape[1:]:
+            raise SegmentationError(
+                f"masks of {detections.masks.shape[1:]} cannot be compared with {truth.masks.shape[1:]}"
+            )
+        self._images += 1
+        for name, tally in self._tallies.items():
+            true = truth.masks[[kind == name for kind in truth.class_names]]
+            guess = detections.of_classes([name])
+            self._add_class(tally, true, guess.masks, guess.scores)
+
+    def _add_class(
+        self, tally: _ClassTally, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]
+    ) -> None:
+        order = np.argsort(-scores, kind="stable")
+        guess, scores = guess[order], scores[order]
+        overlap = mask_iou(guess, true)
+        large = np.count_nonzero(true, axis=(1, 2)) >= max(self.min_area, 1) if len(true) else np.zeros(0, bool)
+        sure = scores >= self.confidence
+        if len(true) or sure.any():
+            counts = compare_masks(np.asarray(guess[sure].any(axis=0)), np.asarray(true.any(axis=0)))
+            tally.counts = tally.counts + counts
+            if counts.iou is not None:
+                tally.frames.append(counts.iou)
+        tally.truths += int(large.sum())
+        tally.best.extend(overlap[sure][:, large].max(axis=0, initial=0.0).tolist())
+        hit, ignored = assign(overlap, large, np.count_nonzero(guess, axis=(1, 2)) < self.min_area)
+        tally.scores.extend(scores.tolist())
+        tally.hits.extend(hit)
+        tally.ignored.extend(ignored)
+
+    def quality(self) -> MaskQuality:
+        """The quality over the images so far."""
+        return MaskQuality(self._images, {name: _summary(tally) for name, tally in self._tallies.items()})
+
+
+def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Intersection over union ``[N, M]`` of masks ``[N, H, W]`` and ``[M, H, W]``."""
+    if not len(a) or not len(b):
+        return np.zeros((len(a), len(b)))
+    x, y = a.reshape(len(a), -1).astype(np.float32), b.reshape(len(b), -1).astype(np.float32)
+    inter = (x @ y.T).astype(np.float64)
+    union = x.sum(axis=1, dtype=np.float64)[:, None] + y.sum(axis=1, dtype=np.float64)[None] - inter
+    return np.asarray(inter / np.maximum(union, 1))
+
+
+def assign(
+    overlap: NDArray[np.float64], counted: NDArray[np.bool_], small: NDArray[np.bool_]
+) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
+    """COCO's assignment: each detection, best first, takes the free object that it overlaps most.
+
+    Args:
+        overlap: ``[N, M]``, detections by falling score.
+        counted: ``[M]``, objects that are asked for; the others absorb detections without effect.
+        small: ``[N]``, detections that do not count if they hit nothing.
+
+    Returns:
+        For each detection, bool ``[10]`` at each of `THRESHOLDS`: whether it hits, and whether it is ignored.
+    """
+    count, objects = overlap.shape
+    hits, ignored = np.zeros((2, count, len(THRESHOLDS)), bool)
+    for level, threshold in enumerate(THRESHOLDS):
+        free = np.ones(objects, bool)
+        for row in range(count):
+            for group in (counted, ~counted):
+                candidates = np.flatnonzero(free & group & (overlap[row] >= threshold))
+                if candidates.size:
+                    best = candidates[np.argmax(overlap[row, candidates])]
+                    free[best] = not counted[best]
+                    hits[row, level] = counted[best]
+                    ignored[row, level] = not counted[best]
+                    break
+            else:
+                ignored[row, level] = small[row]
+    return list(hits), list(ignored)
+
+
+def average_precision(scores: NDArray[np.float64], hits: NDArray[np.bool_], truths: int) -> float:
+    """Area under the precision-recall curve at COCO's 101 recall points; NaN without objects."""
+    if not truths:
+        return float("nan")
+    order = np.argsort(-scores, kind="stable")
+    positives = np.cumsum(hits[order])
+    recall = positives / truths
+    precision = positives / np.arange(1, len(order) + 1)
+    precision = np.maximum.accumulate(precision[::-1])[::-1]
+    at = np.searchsorted(recall, RECALL_POINTS, side="left")
+    return float(np.append(precision, 0.0)[np.minimum(at, len(precision))].mean())
+
+
+def _summary(tally: _ClassTally) -> ClassQuality:
+    scores = np.array(tally.scores)
+    hits = np.array(tally.hits, dtype=bool).reshape(-1, len(THRESHOLDS))
+    ignored = np.array(tally.ignored, dtype=bool).reshape(-1, len(THRESHOLDS))
+    precisions = [
+        average_precision(scores[~ignored[:, k]], hits[~ignored[:, k], k], tally.truths) for k in range(len(THRESHOLDS))
+    ]
+    best = np.array(tally.best)
+    iou = tally.counts.iou
+    return ClassQuality(
+        tally.truths, len(scores), float(np.mean(precisions)), precisions[0],
+        float("nan") if iou is None else iou, float(np.mean(tally.frames)) if tally.frames else float("nan"),
+        float(best.mean()) if best.size else float("nan"), float((best >= 0.5).mean()) if best.size else float("nan"),
+    )  # fmt: skip
 
 
 class SegmenterScore(Record):
-    """What `evaluate_segmenter` measured.
+    """The result of `evaluate_segmenter`.
 
     Attributes:
         segmenter: The resolved source.
@@ -67,12 +251,12 @@ def evaluate_segmenter(
     threads: int = 1,
     min_area: int = 0,
     limit: int | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> SegmenterScore:
     """Run a segmenter over labelled images and measure its masks.
 
     Args:
-        settings: The segmenter and its thresholds; no dilation, no repair: the network's own masks are judged.
+        settings: The segmenter and its thresholds; the network's own masks are measured, without dilation and repair.
         data: A set or the text that names one (`open_labelled`).
         output: A JSON file for the result.
         device: ``cpu`` or ``cuda:N``.
@@ -85,37 +269,10 @@ def evaluate_segmenter(
         SegmentationError: The segmenter or the data are not available.
     """
     images = open_labelled(data) if isinstance(data, str) else data
-    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP wants weak detections too
+    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP takes weak detections as well
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
-    quality, seconds = measure(segmenter, images, settings, min_area=min_area, limit=limit, progress=progress)
-    classes = {
-        name: {key: _finite(value) for key, value in asdict(one).items()}
-        for name, one in quality.classes.items()
-        if one.truths or one.detections
-    }
-    score = SegmenterScore(
-        segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
-        data=images.name, images=quality.images, confidence=settings.confidence, min_area=min_area,
-        mean_ap=_finite(quality.mean_ap), mean_iou=_finite(quality.mean_iou), classes=classes,
-        median_ms=1000 * seconds, threads=threads,
-    )  # fmt: skip
-    if output is not None:
-        write_atomic(output, score.to_json())
-    return score
-
-
-def measure(
-    segmenter: Segmenter,
-    images: LabelledImages,
-    settings: SegmentationSettings,
-    *,
-    min_area: int = 0,
-    limit: int | None = None,
-    progress: Progress | None = None,
-) -> tuple[MaskQuality, float]:
-    """Mask quality and the median seconds an image."""
     count = len(images) if limit is None else min(limit, len(images))
     chosen = np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))
     tally = MaskTally(settings.class_names(), confidence=settings.confidence, min_area=min_area)
@@ -124,12 +281,26 @@ def measure(
         image = images[index]
         frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
         start = time.perf_counter()
-        found = segmenter.segment(frame)
+        detections = segmenter.segment(frame)
         times.append(time.perf_counter() - start)
-        tally.add(image, found)
+        tally.add(image, detections)
         if progress is not None:
             progress(done, len(chosen))
-    return tally.quality(), float(np.median(times)) if times else float("nan")
+    quality = tally.quality()
+    classes = {
+        name: {key: _finite(value) for key, value in asdict(scores).items()}
+        for name, scores in quality.classes.items()
+        if scores.truths or scores.detections
+    }
+    score = SegmenterScore(
+        segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
+        data=images.name, images=quality.images, confidence=settings.confidence, min_area=min_area,
+        mean_ap=_finite(quality.mean_ap), mean_iou=_finite(quality.mean_iou), classes=classes,
+        median_ms=1000 * float(np.median(times)) if times else float("nan"), threads=threads,
+    )  # fmt: skip
+    if output is not None:
+        write_atomic(output, score.to_json())
+    return score
 
 
 def _finite(value: float) -> float | None:

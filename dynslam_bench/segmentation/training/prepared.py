@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -15,12 +16,13 @@ from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import atomic_folder
 from dynslam_bench.core.reading import TABLE_BYTES, read_json
 from dynslam_bench.core.records import digest
-
-from ..networks.images import boxes_of
-from .labelled import LabelledImage, LabelledImages
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.segmentation.postprocess import boxes_of
+from dynslam_bench.segmentation.training.labelled_images import LabelledImage, LabelledImages
+from dynslam_bench.segmentation.training.settings import TrainSettings
 
 MIN_VISIBLE_PX = 16
-"""Objects with fewer pixels at the network's input size are not taught."""
+"""Objects with fewer pixels at the network's input size are not learned."""
 
 _AGAIN = "delete the folder, they are prepared again"
 Progress = Callable[[int, int], None]
@@ -60,7 +62,7 @@ class PreparedImages:
         try:
             self.images: NDArray[np.uint8] = np.load(folder / "images.npy", mmap_mode="r", allow_pickle=False)
             self.labels: NDArray[np.uint8] = np.load(folder / "labels.npy", mmap_mode="r", allow_pickle=False)
-        except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
+        except Exception as error:  # numpy raises many types for a damaged header
             raise SegmentationError(f"the prepared images in {folder} are damaged: {error}", _AGAIN) from error
         self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
         if not len(self.images) == len(self.labels) == len(self.names):
@@ -81,14 +83,13 @@ class PreparedImages:
     def _example(self, rgb: NDArray[np.uint8], labels: NDArray[np.uint8], names: list[str]) -> Example:
         numbers = [k + 1 for k, name in enumerate(names) if name in self.classes]
         masks = labels[None] == np.array(numbers, np.uint8).reshape(-1, 1, 1)
-        seen = np.count_nonzero(masks, axis=(1, 2)) >= MIN_VISIBLE_PX
-        kept = [number for number, there in zip(numbers, seen.tolist(), strict=True) if there]
-        classes = np.array([self.classes.index(names[number - 1]) + 1 for number in kept], np.int64)
-        return Example(rgb, masks[seen], boxes_of(masks[seen]), classes)
+        visible = np.count_nonzero(masks, axis=(1, 2)) >= MIN_VISIBLE_PX
+        classes = np.array([self.classes.index(names[number - 1]) + 1 for number in numbers], np.int64)
+        return Example(rgb, masks[visible], boxes_of(masks[visible]), classes[visible])
 
 
 def prepare(source: LabelledImages, folder: Path, height: int, width: int, progress: Progress | None = None) -> Path:
-    """Write a set at one size; a set that is already there is not written again.
+    """Write a set at one size; an existing set is not written again.
 
     Args:
         source: The images.
@@ -188,3 +189,22 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
     if rng.random() < 0.4:
         value = value + rng.standard_normal(value.shape, np.float32) * np.float32(rng.uniform(0, 0.05))
     return np.asarray(np.rint(np.clip(value, 0, 1) * 255), np.uint8)
+
+
+def batch_of(sets: list[PreparedImages], settings: TrainSettings, step: int) -> list[Example]:
+    """The step's images: sets in proportion to their size, every image once an epoch, in random order."""
+    ends = np.cumsum([len(images) for images in sets])
+    total = int(ends[-1])
+    examples = []
+    for position in range(step * settings.batch, (step + 1) * settings.batch):
+        epoch, place = divmod(position, total)
+        number = int(_permutation(total, settings.seed, epoch)[place])
+        chosen = int(np.searchsorted(ends, number, side="right"))
+        number -= int(ends[chosen]) - len(sets[chosen])
+        examples.append(sets[chosen].varied(number, stream(settings.seed, "vary", position)))
+    return examples
+
+
+@lru_cache(maxsize=1)
+def _permutation(total: int, seed: int, epoch: int) -> NDArray[np.int64]:
+    return np.asarray(stream(seed, "order", epoch).permutation(total))

@@ -1,7 +1,9 @@
-"""Settings of ``segmenter train``; light."""
+"""Settings, progress and result of ``segmenter train``; imports no torch."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -18,10 +20,10 @@ class TrainSettings(Settings):
     classes: str = Field("person", description="classes to learn: comma-separated COCO names or presets")
     cfpn: bool = Field(True, description="cross-layer feature pyramid in the mask branch; false is plain Mask R-CNN")
     data: tuple[str, ...] = Field(
-        ("synthetic:instances=0-89,frames=2,options=0.3,seed=1",), description="sets of labelled images to learn from"
+        ("synthetic:scenes=0-89,frames=2,options=0.3,seed=1",), description="sets of labelled images to learn from"
     )
     validation: str = Field(
-        "synthetic:instances=90-99,frames=1,seed=2", description="set that chooses the best checkpoint"
+        "synthetic:scenes=90-99,frames=1,seed=2", description="set that chooses the best checkpoint"
     )
     init: str = Field("", description="checkpoint to start from: of the same shape, or a file of torchvision's")
     iterations: int = Field(4000, ge=1, description="training steps")
@@ -36,3 +38,37 @@ class TrainSettings(Settings):
     patience: int = Field(0, ge=0, description="stop after so many evaluations without gain; 0 = never")
     checkpoint_every: int = Field(100, ge=1, description="steps between resumable checkpoints")
     seed: int = Field(0, ge=0, description="of weights, order and augmentation")
+
+
+@dataclass(frozen=True)
+class TrainProgress:
+    """Progress of a training run.
+
+    Attributes:
+        stage: ``data`` (images being prepared), ``train`` or ``validation``.
+        done: Images or steps done.
+        total: Images or steps in all.
+        values: Latest losses or scores.
+    """
+
+    stage: str
+    done: int
+    total: int
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """Result of a training run.
+
+    Attributes:
+        best: The averaged weights with the best validation score, in this project's checkpoint format.
+        step: Step at which they were reached.
+        iou: Their mean IoU over the objects of the validation set.
+        stopped: Why the run ended: ``finished`` or ``no gain``.
+    """
+
+    best: Path
+    step: int
+    iou: float
+    stopped: str

@@ -1,25 +1,44 @@
-"""``segmenter train``: teach a Mask R-CNN, resumably."""
+"""``segmenter train``: train a Mask R-CNN, resumably."""
 
 from __future__ import annotations
 
+import copy
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import nn
 
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.files import replacing, write_atomic
 from dynslam_bench.core.reading import read_json
-
-from ..classes import COCO_NAMES, PRESETS
-from ..networks.mask_rcnn.config import NetworkConfig, embedded_config, resnet18_config
-from ..networks.mask_rcnn.segmenter import torch_threads
-from .open_labelled import open_labelled
-from .prepared import PreparedImages, prepare
-from .progress import TrainProgress, TrainResult
-from .settings import TrainSettings
-from .training_run import TrainingRun
+from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig, embedded_config, resnet18_config
+from dynslam_bench.segmentation.networks.loading import (
+    canonical_names,
+    load_strictly,
+    read_checkpoint,
+    save_network,
+    split,
+)
+from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import paste, torch_threads
+from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.settings import COCO_NAMES, PRESETS
+from dynslam_bench.segmentation.training.labelled_images import open_labelled
+from dynslam_bench.segmentation.training.prepared import Example, PreparedImages, batch_of, prepare
+from dynslam_bench.segmentation.training.settings import TrainProgress, TrainResult, TrainSettings
 
 __all__ = ["TrainProgress", "TrainResult", "input_size", "network_config", "train"]
+
+LOSSES = ("objectness", "anchor", "class", "box", "mask")
+SCORES = ("iou", "pixel_iou", "recall")
+CONFIDENCE = 0.5
+"""Least score of a detection in the validation."""
 
 
 def train(
@@ -34,9 +53,9 @@ def train(
 ) -> TrainResult:
     """Train a network.
 
-    `output` receives ``best.pt`` (weights), ``best-half.pt`` (the same in float16, for packaging), ``last.pt``
-    (everything needed to go on), ``curve.csv``, ``curve.png`` and ``settings.json``. A run that is started again with
-    the same settings goes on where it stopped.
+    `output` receives ``best.pt`` (weights), ``best-half.pt`` (the same in float16, for packaging), ``last.pt`` (the
+    whole state of the run), ``curve.csv``, ``curve.html`` and ``settings.json``. A run that is started again with the
+    same settings continues from ``last.pt``.
 
     Args:
         settings: Network, data and schedule.
@@ -44,22 +63,24 @@ def train(
         data_cache: Folder of images at the network's size; None means ``output / "data"``.
         device: ``cpu`` or ``cuda:N``.
         threads: Threads torch may use.
-        resume: False starts anew.
-        progress: Told after each prepared image, step and evaluation.
+        resume: False starts a new run.
+        progress: Called after each prepared image, step and evaluation.
 
     Raises:
         SegmentationError: The data or the initial weights do not fit, or `output` holds a run with other settings.
     """
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     config = network_config(settings)
     output.mkdir(parents=True, exist_ok=True)
-    fresh = _check_settings(settings, output, resume)
-    sets, validation = _open_data(settings, config, data_cache or output / "data", tell)
+    if resume:
+        _check_settings(settings, output / "settings.json")
+    write_atomic(output / "settings.json", settings.model_dump_json(indent=2) + "\n")
+    sets, validation = _open_data(settings, config, data_cache or output / "data", report)
     with torch_threads(threads):
         run = TrainingRun(settings, config, output, device)
-        if not fresh and (output / "last.pt").is_file():
+        if resume and (output / "last.pt").is_file():
             run.restore()
-        return run.go(sets, validation, tell)
+        return run.run(sets, validation, report)
 
 
 def network_config(settings: TrainSettings) -> NetworkConfig:
@@ -69,10 +90,10 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
         SegmentationError: A class name is unknown or named twice.
     """
     names: list[str] = []
-    for part in (part.strip() for part in settings.classes.split(",")):
-        names.extend(PRESETS.get(part, (part,)))
+    for part in settings.classes.split(","):
+        names.extend(PRESETS.get(part.strip(), (part.strip(),)))
     unknown = [name for name in names if name not in COCO_NAMES]
-    if unknown or len(set(names)) != len(names) or not names:
+    if unknown or len(set(names)) != len(names):
         reason = f"'{unknown[0]}' is no COCO class" if unknown else "one is named twice"
         raise SegmentationError(f"the classes '{settings.classes}' cannot be learned: {reason}")
     if settings.network == "embedded":
@@ -88,36 +109,239 @@ def input_size(config: NetworkConfig) -> tuple[int, int]:
     return config.min_side, round(config.min_side * 4 / 3)
 
 
-def _check_settings(settings: TrainSettings, output: Path, resume: bool) -> bool:
-    """Write down the settings of a new run; True if this is one."""
-    path = output / "settings.json"
-    if resume and path.is_file():
-        before = read_json(path, kind=SegmentationError)
-        if not isinstance(before, dict):
-            raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
-        now = json.loads(settings.model_dump_json())
-        changed = sorted(key for key in now if before.get(key) != now[key] and key not in ("iterations", "patience"))
-        if changed:
-            values = f"{before.get(changed[0])!r}, now {now[changed[0]]!r}"
+def _check_settings(settings: TrainSettings, path: Path) -> None:
+    """Raise where the folder's run has other settings than its length."""
+    before = read_json(path, kind=SegmentationError) if path.is_file() else {}
+    if not isinstance(before, dict):
+        raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
+    for key, value in json.loads(settings.model_dump_json()).items():
+        if before.get(key, value) != value and key not in ("iterations", "patience"):
             raise SegmentationError(
-                f"{output} holds a training run with another {changed[0]}: {values}",
+                f"{path.parent} holds a training run with another {key}: {before[key]!r}, now {value!r}",
                 "name another folder, or do not resume",
             )
-        write_atomic(path, settings.model_dump_json(indent=2) + "\n")
-        return False
-    write_atomic(path, settings.model_dump_json(indent=2) + "\n")
-    return True
 
 
 def _open_data(
-    settings: TrainSettings, config: NetworkConfig, cache: Path, tell: Callable[[TrainProgress], None]
+    settings: TrainSettings, config: NetworkConfig, cache: Path, report: Callable[[TrainProgress], None]
 ) -> tuple[list[PreparedImages], PreparedImages]:
     height, width = input_size(config)
 
     def prepared(done: int, total: int) -> None:
-        tell(TrainProgress("data", done, total, {}))
+        report(TrainProgress("data", done, total, {}))
 
     def load(text: str) -> PreparedImages:
         return PreparedImages(prepare(open_labelled(text), cache, height, width, prepared), config.classes)
 
     return [load(text) for text in settings.data], load(settings.validation)
+
+
+class TrainingRun:
+    """The state of a training run: network, averaged weights, optimiser and scores.
+
+    Args:
+        settings: Network, data and schedule.
+        config: The network's shape.
+        output: Folder of the run.
+        device: ``cpu`` or ``cuda:N``.
+    """
+
+    def __init__(self, settings: TrainSettings, config: NetworkConfig, output: Path, device: str) -> None:
+        torch.manual_seed(settings.seed)
+        self.settings, self.output, self.device = settings, output, device
+        self.network = MaskRCNN(config)
+        if settings.init:
+            _initialise(self.network, Path(settings.init))
+        self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = copy.deepcopy(self.network).eval()
+        parameters = list(self.network.parameters())
+        groups: list[dict[str, Any]] = [
+            {"params": [parameter for parameter in parameters if parameter.dim() > 1]},
+            {"params": [parameter for parameter in parameters if parameter.dim() <= 1], "weight_decay": 0.0},
+        ]
+        self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay)
+        self.step = 0
+        self.rows: list[dict[str, float]] = []
+        self.best = {"iou": -1.0, "step": 0.0}
+        self.recent: dict[str, list[float]] = {name: [] for name in LOSSES}
+
+    def run(
+        self, sets: list[PreparedImages], validation: PreparedImages, report: Callable[[TrainProgress], None]
+    ) -> TrainResult:
+        """Learn until the last step, or until the validation score stops improving."""
+        settings, total = self.settings, self.settings.iterations
+        if not sum(map(len, sets)) or not len(validation):
+            raise SegmentationError("there are no images to learn from or to validate on")
+        stopped = "finished"
+        while self.step < total:
+            losses = self._learn(batch_of(sets, settings, self.step))
+            self.step += 1
+            for name, value in losses.items():
+                self.recent[name].append(value)
+            report(TrainProgress("train", self.step, total, losses))
+            evaluate = self.step % settings.evaluate_every == 0 or self.step == total
+            if evaluate:
+                report(TrainProgress("validation", self.step, total, self._evaluate(validation)))
+            if evaluate or self.step % settings.checkpoint_every == 0:
+                self.save()
+            waited = (self.step - self.best["step"]) / settings.evaluate_every
+            if evaluate and settings.patience and waited >= settings.patience:
+                stopped = "no gain"
+                break
+        return TrainResult(self.output / "best.pt", int(self.best["step"]), self.best["iou"], stopped)
+
+    def _learn(self, batch: list[Example]) -> dict[str, float]:
+        settings = self.settings
+        self.network.train()
+        if self.step >= 0.8 * settings.iterations:  # the weights settle to fixed batch statistics
+            for module in self.network.modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.eval()
+        for group in self.optimiser.param_groups:
+            group["lr"] = _rate(self.step, settings)
+        images = torch.from_numpy(np.stack([example.rgb for example in batch])).to(self.device)
+        images = images.permute(0, 3, 1, 2).float() / 255
+        boxes, labels, masks = (
+            [torch.from_numpy(getattr(example, name)).to(self.device) for example in batch]
+            for name in ("boxes", "labels", "masks")
+        )
+        generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
+        with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=settings.precision == "bfloat16"):
+            losses = self.network.losses(images, boxes, labels, masks, generator, settings.proposals)
+        total = torch.stack(list(losses.values())).sum()
+        if not torch.isfinite(total):
+            reason = f"training diverged at step {self.step}: the loss is {float(total)}"
+            raise SegmentationError(reason, "lower the learning rate")
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        self.optimiser.step()
+        self._update_average()
+        return {name: float(value.detach()) for name, value in losses.items()}
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        decay = min(self.settings.average, (self.step + 1) / (self.step + 10))
+        weights = self.network.state_dict()
+        for key, value in self.average.state_dict().items():
+            if value.is_floating_point():
+                value.lerp_(weights[key], 1 - decay)
+            else:
+                value.copy_(weights[key])
+
+    def _evaluate(self, validation: PreparedImages) -> dict[str, float]:
+        """Score the averaged weights, keep them if they are the best, and write the learning curve."""
+        row = {"step": float(self.step)}
+        row.update({name: float(np.mean(values)) for name, values in self.recent.items() if values})
+        row["loss"] = sum(row[name] for name in LOSSES if name in row)
+        row.update(validate(self.average, validation, self.device))
+        self.recent = {name: [] for name in LOSSES}
+        self.rows.append(row)
+        if row["iou"] > self.best["iou"]:
+            self.best = {"iou": row["iou"], "step": float(self.step)}
+            save_network(self.average, self.output / "best.pt")
+            save_network(self.average, self.output / "best-half.pt", half=True)
+        table = pd.DataFrame(self.rows)
+        write_atomic(self.output / "curve.csv", table.to_csv(index=False, float_format="%.6g"))
+        title = f"{self.settings.network}, {'CFPN' if self.settings.cfpn else 'FPN'}: losses and validation scores"
+        draw_curve(table, self.output / "curve.html", title)
+        return row
+
+    def save(self) -> None:
+        """Write the whole state of the run to ``last.pt``."""
+        content = {
+            "format": "dynslam-bench/training/1",
+            "step": self.step,
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "rows": self.rows,
+            "best": self.best,
+            "recent": self.recent,
+        }
+        with replacing(self.output / "last.pt") as temporary, temporary.open("wb") as file:
+            torch.save(content, file)
+
+    def restore(self) -> None:
+        """Continue from ``last.pt``.
+
+        Raises:
+            SegmentationError: The file does not fit.
+        """
+        content: dict[str, Any] = dict(read_checkpoint(self.output / "last.pt"))
+        try:
+            self.network.load_state_dict(content["network"])
+            self.average.load_state_dict(content["average"])
+            self.optimiser.load_state_dict(content["optimiser"])
+            self.step, self.rows = int(content["step"]), list(content["rows"])
+            self.best, self.recent = dict(content["best"]), dict(content["recent"])
+        except (LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise SegmentationError(f"{self.output / 'last.pt'} does not fit these settings: {reason}") from error
+
+
+def draw_curve(table: pd.DataFrame, path: Path, title: str) -> None:
+    """Draw losses (log scale) and scores over the step as a page.
+
+    Args:
+        table: Columns ``step`` and some of the curves.
+        path: The page; plotly's script lies beside it.
+        title: Above it.
+    """
+    from plotly.subplots import make_subplots  # type: ignore[import-untyped]
+
+    figure = make_subplots(cols=2, subplot_titles=("losses", "validation scores"))
+    for column, names in enumerate((("loss", *LOSSES), SCORES), start=1):
+        for name in table.columns.intersection(list(names)):
+            figure.add_scatter(x=table["step"], y=table[name], name=name, row=1, col=column)
+    figure.update_layout(title=title, yaxis_type="log", yaxis2_range=[0, 1])
+    figure.write_html(path, include_plotlyjs="directory")
+
+
+def _rate(step: int, settings: TrainSettings) -> float:
+    """Learning rate of a step: linear warm-up, then a cosine down to 1 %."""
+    if step < settings.warmup:
+        return settings.learning_rate * (step + 1) / settings.warmup
+    share = (step - settings.warmup) / max(settings.iterations - settings.warmup, 1)
+    return settings.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(share, 1.0))))
+
+
+def _initialise(network: MaskRCNN, path: Path) -> None:
+    """Start from a checkpoint; heads whose class count differs keep their random start."""
+    state = canonical_names(split(read_checkpoint(path), str(path))[0])
+    per_class = ("roi_heads.box_predictor.", "roi_heads.mask_predictor.mask_fcn_logits.")
+    for key, value in network.state_dict().items():
+        if key.startswith(per_class) and key in state and state[key].shape != value.shape:
+            state[key] = value
+    load_strictly(network, state, str(path))
+
+
+@torch.no_grad()
+def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> dict[str, float]:
+    """Scores of a network on prepared images, detections from score 0.5.
+
+    Returns:
+        ``iou`` (mean over objects of the best detection's IoU), ``pixel_iou`` (all classes' pixels together) and
+        ``recall`` (share of objects with IoU >= 0.5).
+    """
+    network.eval()
+    best: list[float] = []
+    counts = MaskCounts()
+    for index in range(len(images)):
+        example = images[index]
+        height, width = example.rgb.shape[:2]
+        image = torch.from_numpy(example.rgb).to(device).permute(2, 0, 1).float() / 255
+        detections = network.detect(image, score=CONFIDENCE)
+        boxes, planes = detections.boxes.cpu().numpy(), detections.masks.float().cpu().numpy()
+        labels = detections.labels.cpu().numpy()
+        masks = [paste(plane, box, height, width, 0.5, exact=True) for plane, box in zip(planes, boxes, strict=True)]
+        for truth, label in zip(example.masks, example.labels.tolist(), strict=True):
+            same_class = [mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]
+            best.append(max((compare_masks(mask, truth).iou or 0.0 for mask in same_class), default=0.0))
+        union = np.any(masks, axis=0) if masks else np.zeros((height, width), bool)
+        counts = counts + compare_masks(union, np.asarray(example.masks.any(axis=0)))
+    return {
+        "iou": float(np.mean(best)) if best else 0.0,
+        "pixel_iou": counts.iou or 0.0,
+        "recall": float(np.mean(np.array(best) >= 0.5)) if best else 0.0,
+    }

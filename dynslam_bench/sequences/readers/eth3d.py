@@ -9,12 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.geometry.tum_file import read_table
-
-from . import tum
-from .contents import Contents
-from .frame_names import pinhole
-from .lists import read_associations
+from dynslam_bench.geometry.trajectory_files import read_table
+from dynslam_bench.sequences.readers import tum
+from dynslam_bench.sequences.readers.lists import Contents, pinhole, read_associations
 
 FPS = 27.1
 DEPTH_FACTOR = 5000.0

@@ -12,13 +12,17 @@ from pathlib import Path
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .bodies import camera_on_body, camera_truth
-from .contents import Contents
-from .frame_names import stamped
-from .lists import ImageList
-from .nanoseconds import floats, nanoseconds, read_rows
-from .yaml_numbers import numbers, read_yaml, section
+from dynslam_bench.sequences.readers.lists import Contents, ImageList, stamped
+from dynslam_bench.sequences.readers.tables import (
+    camera_on_body,
+    camera_truth,
+    floats,
+    nanoseconds,
+    numbers,
+    read_rows,
+    read_yaml,
+    section,
+)
 
 MILLIMETRES = 1000.0
 

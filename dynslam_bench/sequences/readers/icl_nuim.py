@@ -14,11 +14,8 @@ import numpy as np
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import load_tum
-
-from .contents import Contents
-from .frame_names import find_names
-from .lists import list_folder
+from dynslam_bench.geometry.trajectory_files import load_tum
+from dynslam_bench.sequences.readers.lists import Contents, find_names, list_folder
 
 CAMERA = Camera(640, 480, 481.20, 480.0, 319.5, 239.5)
 FPS = 30.0

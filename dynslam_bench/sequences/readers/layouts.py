@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import cast
 
 from dynslam_bench.core.errors import SequenceError
-
-from .contents import Contents
+from dynslam_bench.sequences.readers.lists import Contents
 
 
 @dataclass(frozen=True)

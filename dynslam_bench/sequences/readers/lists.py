@@ -1,4 +1,4 @@
-"""Read ``rgb.txt`` and ``depth.txt``: stamps and file names, with a count of every line that was not used."""
+"""What a folder of images holds: stamped lists of files, their pairs, and counts of all that was not used."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.reading import read_lines
-from dynslam_bench.geometry.stamps import ns_of, parse_ns, refuse_close, to_seconds
+from dynslam_bench.core.images import image_size
+from dynslam_bench.core.reading import MEGABYTE, read_bytes, read_lines
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import format_ns, ns_of, parse_ns, refuse_close, to_seconds
+from dynslam_bench.geometry.trajectory import Trajectory
 
 MOST_LINES = 1_000_000
 """Nine hours at 30 frames a second; a longer list is refused before it fills the memory."""
@@ -64,29 +67,20 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
         SequenceError: The file is missing or no text, a line does not have these four parts, or two stamps differ by
             less than 1 us.
     """
-    colour: dict[int | None, tuple[str, int | None, str]] = {}
-    rows = read_stamped_lines(path)
-    for number, (stamp, rest) in enumerate(rows):
+    rows: list[tuple[int | None, str]] = []
+    pairs: dict[int | None, tuple[int, str]] = {}
+    for number, (stamp, rest) in enumerate(read_stamped_lines(path), start=1):
         if len(rest) != 3:
             raise SequenceError(
-                f"entry {number + 1} of {path} has {len(rest) + 1} parts, expected 4: timestamp colour timestamp depth"
+                f"entry {number} of {path} has {len(rest) + 1} parts, expected 4: timestamp colour timestamp depth"
             )
-        colour[stamp] = (rest[0], _number(rest[1], path), rest[2])
-    good = {
-        stamp: (row[0], row[1], row[2]) for stamp, row in colour.items() if stamp is not None and row[1] is not None
-    }
-    if not good:
-        raise SequenceError(f"{path} lists no pair of images ({len(rows)} lines, {len(colour)} with a stamp)")
-    order = sorted(good)
-    counts = {
-        "bad_stamps": len(colour) - len(good),
-        "duplicate_stamps": len(rows) - len(colour),
-        "unsorted": _count_unsorted([stamp for stamp, _ in rows]),
-    }
-    first = ImageList(np.array(order, dtype=np.int64), tuple(good[stamp][0] for stamp in order), **counts)
-    refuse_close(first.stamps_ns, str(path), SequenceError, lambda stamp: _line_of(path, stamp))
-    depth_stamps = np.array([good[stamp][1] for stamp in order], dtype=np.int64)
-    return first, ImageList(depth_stamps, tuple(good[stamp][2] for stamp in order))
+        depth_stamp = _number(rest[1], path)
+        rows.append((None if depth_stamp is None else stamp, rest[0]))
+        if depth_stamp is not None:
+            pairs[stamp] = depth_stamp, rest[2]
+    colour = make_image_list(rows, described=str(path))
+    depth = [pairs[stamp] for stamp in colour.stamps_ns.tolist()]
+    return colour, ImageList(np.array([stamp for stamp, _ in depth], np.int64), tuple(file for _, file in depth))
 
 
 def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
@@ -169,14 +163,179 @@ def _number(text: str, where: object) -> int | None:
 
 def _line_of(path: Path, ns: int) -> int | None:
     """The last line of a list that begins with a stamp; None where `path` is no file."""
-    found = None
+    line_number = None
     for number, line in enumerate(read_lines(path, kind=SequenceError) if path.is_file() else (), start=1):
         parts = line.replace(",", " ").split()
         if parts and not parts[0].startswith("#") and _number(parts[0], path) == ns:
-            found = number
-    return found
+            line_number = number
+    return line_number
 
 
 def _count_unsorted(stamps: list[int | None]) -> int:
-    known = [stamp for stamp in stamps if stamp is not None]
-    return sum(later < earlier for earlier, later in pairwise(known))
+    finite = [stamp for stamp in stamps if stamp is not None]
+    return sum(later < earlier for earlier, later in pairwise(finite))
+
+
+# The result of every reader, from which `RecordedSequence` is made.
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """Images and poses of a folder, whatever its layout.
+
+    Attributes:
+        colour: Colour images and their stamps in seconds.
+        depth: Depth images, registered to the colour images, and their stamps.
+        paired: Whether the two lists are paired already, entry by entry; otherwise they are associated by time.
+        truth: Camera-to-world poses; None if there are none.
+        truth_dropped: One phrase on the poses that were not taken as they stand; empty for none.
+        camera: Intrinsics that the folder states; None where it does not.
+        fps: Nominal frame rate in Hz that the folder or the layout states; None where neither does.
+        missing_depth: Raw value beside 0 that stands for a missing depth; None for none.
+        furthest_m: Depth beyond this, in metres, is no measurement (a rendered sky); None for no limit.
+    """
+
+    colour: ImageList
+    depth: ImageList
+    paired: bool = False
+    truth: Trajectory | None = None
+    truth_dropped: str = ""
+    camera: Camera | None = None
+    fps: float | None = None
+    missing_depth: int | None = None
+    furthest_m: float | None = None
+
+
+# Entries of list files that did not become frames, and why.
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """Counts of one sequence's opening.
+
+    Attributes:
+        colour_listed: Usable entries of ``rgb.txt``.
+        depth_listed: Usable entries of ``depth.txt``.
+        pairs: Frames: colour images with a depth image.
+        colour_unpaired: Colour images without a depth image within the tolerance.
+        depth_unpaired: Depth images that no colour image took.
+        bad_stamps: Entries whose stamp was not finite.
+        duplicate_stamps: Entries whose stamp came again later.
+        unsorted: Entries whose stamp lay before the one above it; put in order.
+        unnamed: Entries without a file name.
+        absent: Entries whose file does not exist (tolerated up to 2 % of a list).
+        max_time_difference_s: The tolerance of the pairing, seconds.
+        ground_truth_poses: Usable poses of ``groundtruth.txt``; 0 where there is none.
+        ground_truth_dropped: Lines of ``groundtruth.txt`` that hold no usable pose, with the reasons.
+        frames_without_ground_truth: Frames with no pose within 0.02 s.
+        largest_hole_s: Longest time between consecutive poses within the frames' span, seconds; 0 without poses.
+    """
+
+    colour_listed: int
+    depth_listed: int
+    pairs: int
+    colour_unpaired: int
+    depth_unpaired: int
+    bad_stamps: int = 0
+    duplicate_stamps: int = 0
+    unsorted: int = 0
+    unnamed: int = 0
+    absent: int = 0
+    max_time_difference_s: float = 0.02
+    ground_truth_poses: int = 0
+    ground_truth_dropped: str = ""
+    frames_without_ground_truth: int = 0
+    largest_hole_s: float = 0.0
+
+    @property
+    def any(self) -> bool:
+        """Whether anything at all was dropped or put in order."""
+        counts = (
+            self.colour_unpaired,
+            self.bad_stamps,
+            self.duplicate_stamps,
+            self.unsorted,
+            self.unnamed,
+            self.absent,
+        )
+        return any(counts) or bool(self.ground_truth_dropped)
+
+    def describe(self) -> str:
+        """One line: the frames, and all counts that are not zero."""
+        parts = [
+            f"{self.pairs} frames of {self.colour_listed} colour and {self.depth_listed} depth images "
+            f"(|dt| < {self.max_time_difference_s:g} s)"
+        ]
+        for count, what in (
+            (self.colour_unpaired, "colour images without depth"),
+            (self.depth_unpaired, "depth images unused"),
+            (self.bad_stamps, "stamps not finite"),
+            (self.duplicate_stamps, "duplicate stamps"),
+            (self.unsorted, "stamps out of order"),
+            (self.unnamed, "lines without a file name"),
+            (self.absent, "listed files that do not exist"),
+        ):
+            if count:
+                parts.append(f"{count} {what}")
+        if self.ground_truth_poses:
+            parts.append(f"{self.ground_truth_poses} ground-truth poses")
+            if self.frames_without_ground_truth:
+                parts.append(
+                    f"{self.frames_without_ground_truth} frames without ground truth within 0.02 s "
+                    f"(largest hole {self.largest_hole_s:.2f} s)"
+                )
+        else:
+            parts.append("no ground truth")
+        if self.ground_truth_dropped:
+            parts.append(self.ground_truth_dropped)
+        return "; ".join(parts)
+
+
+# Images of folders without lists: found by their names, sized by their headers.
+
+
+def find_names(folder: Path, pattern: str) -> list[str]:
+    """Paths of the files that match, relative to the folder, in the order of their names; at least one.
+
+    Raises:
+        SequenceError: There is none.
+    """
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
+    if not names or len(names) > MOST_LINES:
+        raise SequenceError(f"{folder} holds {len(names)} files {pattern}", "is it the folder of one sequence?")
+    return names
+
+
+def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageList:
+    """Images with a stamp each, in nanoseconds, put in order of time.
+
+    Raises:
+        SequenceError: The numbers differ, or stamps are equal or less than 1 us apart.
+    """
+    if len(files) != len(stamps):
+        raise SequenceError(f"{where} holds {len(files)} images but {len(stamps)} stamps")
+    order = np.argsort(stamps, kind="stable")
+    ordered = stamps[order]
+    equal = np.flatnonzero(np.diff(ordered) == 0)
+    if len(equal):
+        raise SequenceError(
+            f"{where} holds {len(equal)} stamps twice, the first is {format_ns(int(ordered[equal[0]]))} s"
+        )
+    refuse_close(ordered, where, SequenceError)
+    return ImageList(ordered, tuple(files[i] for i in order))
+
+
+def pinhole(folder: Path, first: str, fx: float, fy: float, cx: float, cy: float, depth_factor: float) -> Camera:
+    """A camera without distortion; its size is that of the first colour image.
+
+    Raises:
+        SequenceError: The image has no size, or a focal length is not positive.
+    """
+    size = image_size(read_bytes(folder / first, limit=512 * MEGABYTE, kind=SequenceError))
+    if size is None:
+        raise SequenceError(f"image {folder / first} is no PNG, JPEG, TIFF, BMP or PNM")
+    if not (fx > 0 and fy > 0 and depth_factor > 0):
+        raise SequenceError(
+            f"the camera of {folder} has the focal lengths {fx:g} and {fy:g} and {depth_factor:g} depth units a metre"
+        )
+    return Camera(*size, fx, fy, cx, cy, depth_factor=depth_factor)

@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import nearest_gap
-
-from . import tum
-from .contents import Contents
-from .frame_names import pinhole
-from .lists import read_image_list
-from .yaml_numbers import numbers, read_yaml, section
+from dynslam_bench.sequences.readers import tum
+from dynslam_bench.sequences.readers.lists import Contents, pinhole, read_image_list
+from dynslam_bench.sequences.readers.tables import numbers, read_yaml, section
 
 CAMERA_FRAME, BASE_FRAME = "d400_color_optical_frame", "base_link"
 DEPTH_FACTOR = 1000.0

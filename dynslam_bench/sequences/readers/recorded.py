@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
-from typing import NoReturn
 
+import cv2
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, MaskSource
-from dynslam_bench.core.digests import contents_digest
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.harmless import inside
+from dynslam_bench.core.fingerprint import contents_digest
+from dynslam_bench.core.images import MOST_BYTES, read_image
+from dynslam_bench.core.reading import read_bytes
 from dynslam_bench.core.records import digest
+from dynslam_bench.core.sanitise import inside
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.rigs import in_camera_axes
-from dynslam_bench.geometry.trajectory import Trajectory
-
-from .contents import Contents
-from .diagnostics import Dropped
-from .lists import ImageList
+from dynslam_bench.sequences.readers.lists import Contents, Dropped, ImageList
 
 GROUND_TRUTH_DT_S = 0.02
 SLOWEST_S = 5.0
@@ -73,7 +72,14 @@ class RecordedSequence:
 
     Attributes:
         folder: The sequence's folder.
-        timestamps_ns: Stamps of the colour images in nanoseconds, int64 ``[N]``.
+        id: For example ``tum/fr3/walking_xyz``.
+        camera: Intrinsics of the colour images.
+        timestamps: Stamps of the colour images in seconds ``[N]``, strictly increasing.
+        timestamps_ns: The same in nanoseconds, int64 ``[N]``.
+        depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's `depth_delay_s` added.
+        ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps; None without any.
+        masks: None: recorded sequences come without exact masks.
+        fps: Nominal frame rate in Hz; where none is stated, the inverse of the median interval (30 for one frame).
         dropped: What was not used, and why.
 
     Raises:
@@ -90,7 +96,10 @@ class RecordedSequence:
         any_depth_size: bool = False,
     ) -> None:
         self.folder = folder
-        self._description = description
+        self.id, self.camera = description.id, description.camera
+        self.license, self.citation = description.license, description.citation
+        self.tags, self.split = description.tags, description.split
+        self.masks: MaskSource | None = None
         self._any_depth_size = any_depth_size
         self._missing_depth, self._furthest_m = contents.missing_depth, contents.furthest_m
         delay_s = description.camera.depth_delay_s
@@ -98,16 +107,13 @@ class RecordedSequence:
         colour, depth = contents.colour, replace(contents.depth, stamps_ns=delayed)
         for file in (*colour.files, *depth.files):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
-        if contents.paired and not delay_s:
-            index = np.arange(len(colour)), np.arange(len(colour))
-            _check_files(folder, colour.files, "colour")
-            _check_files(folder, depth.files, "depth")
-            absent = 0
-        else:
-            listed = len(colour) + len(depth)
-            colour, depth = _existing(folder, colour, "colour"), _existing(folder, depth, "depth")
-            absent = listed - len(colour) - len(depth)
-            index = associate(colour.stamps, depth.stamps, max_time_difference_s)
+        listed = len(colour) + len(depth)
+        paired = contents.paired and not delay_s
+        tolerated = 0.0 if paired else MISSING_TOLERATED
+        colour, depth = _existing(folder, colour, "colour", tolerated), _existing(folder, depth, "depth", tolerated)
+        absent = listed - len(colour) - len(depth)
+        order = np.arange(len(colour))
+        index = (order, order) if paired else associate(colour.stamps, depth.stamps, max_time_difference_s)
         if not len(index[0]):
             gap = float(nearest_gap(colour.stamps, depth.stamps).min())
             raise SequenceError(
@@ -116,87 +122,51 @@ class RecordedSequence:
                 "do both lists use the same clock?",
             )
         self.timestamps_ns = colour.stamps_ns[index[0]]
-        self.timestamps_ns.flags.writeable = False
-        self._timestamps = colour.stamps[index[0]]
-        _check_unit(folder, self._timestamps)
-        self._timestamps.flags.writeable = False
-        self._depth_timestamps = depth.stamps[index[1]]
+        self.timestamps = colour.stamps[index[0]]
+        self.timestamps_ns.flags.writeable = self.timestamps.flags.writeable = False
+        _check_unit(folder, self.timestamps)
+        self.fps = description.fps or (float(1 / np.median(np.diff(self.timestamps))) if len(index[0]) > 1 else 30.0)
+        self.depth_timestamps = depth.stamps[index[1]]
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
-        self._ground_truth = _turned(contents.truth, description.R_body_cam)
-        self.dropped = _count(
-            colour,
-            depth,
-            index,
-            absent,
-            max_time_difference_s,
-            self._timestamps,
-            self._ground_truth,
-            contents.truth_dropped,
-        )
+        self.ground_truth = contents.truth
+        if contents.truth is not None and description.R_body_cam is not None:
+            poses = in_camera_axes(contents.truth.T_world_cam, description.R_body_cam)
+            self.ground_truth = contents.truth.with_poses(poses)
+        self.dropped = self._count(colour, depth, absent, max_time_difference_s, contents.truth_dropped)
         self[0]
 
-    @property
-    def id(self) -> str:
-        """For example ``tum/fr3/walking_xyz``."""
-        return self._description.id
-
-    @property
-    def camera(self) -> Camera:
-        """Intrinsics of the colour images."""
-        return self._description.camera
-
-    @property
-    def timestamps(self) -> NDArray[np.float64]:
-        """Stamps of the colour images in seconds ``[N]``, strictly increasing."""
-        return self._timestamps
-
-    @property
-    def depth_timestamps(self) -> NDArray[np.float64]:
-        """Stamps of the frames' depth images in seconds ``[N]``, the camera's `depth_delay_s` added."""
-        return self._depth_timestamps
+    def _count(
+        self, colour: ImageList, depth: ImageList, absent: int, max_time_difference_s: float, truth_dropped: str
+    ) -> Dropped:
+        stamps, truth = self.timestamps, self.ground_truth
+        without, hole = 0, 0.0
+        if truth is not None:
+            without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
+            within = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+            hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
+        return Dropped(
+            colour_listed=len(colour),
+            depth_listed=len(depth),
+            pairs=len(stamps),
+            colour_unpaired=len(colour) - len(stamps),
+            depth_unpaired=len(depth) - len(stamps),
+            bad_stamps=colour.bad_stamps + depth.bad_stamps,
+            duplicate_stamps=colour.duplicate_stamps + depth.duplicate_stamps,
+            unsorted=colour.unsorted + depth.unsorted,
+            unnamed=colour.unnamed + depth.unnamed,
+            absent=absent,
+            max_time_difference_s=max_time_difference_s,
+            ground_truth_poses=0 if truth is None else len(truth),
+            ground_truth_dropped=truth_dropped,
+            frames_without_ground_truth=without,
+            largest_hole_s=hole,
+        )
 
     @property
     def colour_files(self) -> dict[float, str]:
         """The colour image of each stamp, relative to `folder`."""
-        return dict(zip(self._timestamps.tolist(), self._colour, strict=True))
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """Camera-to-world poses in the frame of the motion capture, at their own stamps; None if there are none."""
-        return self._ground_truth
-
-    @property
-    def masks(self) -> MaskSource | None:
-        """None: recorded sequences come without exact masks."""
-        return None
-
-    @property
-    def fps(self) -> float:
-        """Nominal frame rate in Hz; where none is stated, the inverse of the median interval (30 for one frame)."""
-        if self._description.fps is not None:
-            return self._description.fps
-        return float(1 / np.median(np.diff(self._timestamps))) if len(self) > 1 else 30.0
-
-    @property
-    def license(self) -> str:
-        """Licence of the data."""
-        return self._description.license
-
-    @property
-    def citation(self) -> str:
-        """What to cite."""
-        return self._description.citation
-
-    @property
-    def tags(self) -> frozenset[str]:
-        """For example ``high-dynamic``."""
-        return self._description.tags
-
-    @property
-    def split(self) -> str:
-        """``tune``, ``held-out`` or empty."""
-        return self._description.split
+        return dict(zip(self.timestamps.tolist(), self._colour, strict=True))
 
     def digest(self) -> str:
         """Digest of camera, frame rate, stamps, ground truth and the contents of all paired images."""
@@ -204,7 +174,7 @@ class RecordedSequence:
 
     @cached_property
     def _digest(self) -> str:
-        truth = self._ground_truth
+        truth = self.ground_truth
         poses = None if truth is None else [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
         try:
             images = contents_digest(self.folder / file for file in (*self._colour, *self._depth))
@@ -219,7 +189,6 @@ class RecordedSequence:
         return len(self._colour)
 
     def __getitem__(self, index: int) -> Frame:
-        from .images import read_colour, read_depth
 
         index = range(len(self))[index]
         size = (self.camera.width, self.camera.height)
@@ -235,27 +204,10 @@ class RecordedSequence:
             missing=self._missing_depth,
             furthest_m=self._furthest_m,
         )
-        return Frame(index, float(self._timestamps[index]), rgb, depth)
+        return Frame(index, float(self.timestamps[index]), rgb, depth)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
-
-    def verify(self, indices: Iterable[int] | None = None) -> list[str]:
-        """Decode frames and say what is wrong with them.
-
-        Args:
-            indices: Which frames; all by default.
-
-        Returns:
-            One line a damaged frame; empty if all are sound.
-        """
-        faults = []
-        for index in range(len(self)) if indices is None else indices:
-            try:
-                self[index]
-            except SequenceError as error:
-                faults.append(f"frame {index}: {error}")
-        return faults
 
 
 def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
@@ -271,26 +223,20 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
     )
 
 
-def _existing(folder: Path, images: ImageList, kind: str) -> ImageList:
-    """The images whose files are there; a few may be missing, as in some published sequences."""
-    missing = {file for file in images.files if _file_size(folder / file) is None}
-    if len(missing) > MISSING_TOLERATED * len(images):
-        _refuse(folder, [file for file in images.files if file in missing], len(images), kind, "missing")
-    there = [i for i, file in enumerate(images.files) if file not in missing]
-    kept = replace(images, stamps_ns=images.stamps_ns[there], files=tuple(images.files[i] for i in there))
-    _check_files(folder, kept.files, kind)
-    return kept
-
-
-def _check_files(folder: Path, files: tuple[str, ...], kind: str) -> None:
-    """Refuse images that are missing or empty."""
-    sizes = {file: _file_size(folder / file) for file in files}
-    missing = [file for file in files if sizes[file] is None]
-    if missing:
-        _refuse(folder, missing, len(files), kind, "missing")
-    empty = [file for file in files if sizes[file] == 0]
-    if empty:
-        _refuse(folder, empty, len(files), kind, "empty (0 bytes)")
+def _existing(folder: Path, images: ImageList, kind: str, tolerated: float = MISSING_TOLERATED) -> ImageList:
+    """The images whose files are there; a few may be missing, as in some published sequences, and none empty."""
+    sizes = [_file_size(folder / file) for file in images.files]
+    there = [i for i, size in enumerate(sizes) if size is not None]
+    for state, allowed in (("missing", tolerated), ("empty (0 bytes)", 0.0)):
+        at_fault = [
+            file for file, size in zip(images.files, sizes, strict=True) if size == (None if state == "missing" else 0)
+        ]
+        if len(at_fault) > allowed * len(images):
+            raise SequenceError(
+                f"{len(at_fault)} of {len(images)} {kind} images of {folder} are {state}, the first is {at_fault[0]}",
+                "fetch the sequence again, or remove their lines from the list",
+            )
+    return replace(images, stamps_ns=images.stamps_ns[there], files=tuple(images.files[i] for i in there))
 
 
 def _file_size(path: Path) -> int | None:
@@ -300,49 +246,113 @@ def _file_size(path: Path) -> int | None:
         return None
 
 
-def _refuse(folder: Path, files: list[str], listed: int, kind: str, state: str) -> NoReturn:
-    raise SequenceError(
-        f"{len(files)} of {listed} {kind} images of {folder} are {state}, the first is {files[0]}",
-        "fetch the sequence again, or remove their lines from the list",
+# Decoding of colour and depth images.
+
+
+def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.uint8]:
+    """The image as uint8 ``[H, W, 3]``, red first; grey images are repeated over the channels.
+
+    Args:
+        path: An image of 8 bits a channel.
+        size: Width and height that it has to have; None for any.
+        mismatch: Ends the message where it has another one.
+
+    Raises:
+        SequenceError: The file is missing, empty, truncated, of another size, no image, or has more than 8 bits a
+            channel.
+    """
+    image = read_image(
+        path, size=size, mismatch=mismatch, hint="name the right camera with --camera", kind=SequenceError
     )
+    if image.dtype != np.uint8:
+        raise SequenceError(
+            f"colour image {path} has {image.dtype.itemsize * 8} bits a channel, expected 8",
+            "do rgb.txt and depth.txt name the right files?",
+        )
+    if image.ndim == 2:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+    code = cv2.COLOR_BGRA2RGB if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
+    return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
 
 
-def _turned(truth: Trajectory | None, R_body_cam: tuple[tuple[float, float, float], ...] | None) -> Trajectory | None:
-    """The camera's orientations, of a truth that holds those of the body that carries it."""
-    if truth is None or R_body_cam is None:
-        return truth
-    return truth.with_poses(in_camera_axes(truth.T_world_cam, R_body_cam))
+def read_depth(
+    path: Path,
+    depth_factor: float,
+    *,
+    size: tuple[int, int] | None = None,
+    mismatch: str = "",
+    missing: int | None = None,
+    furthest_m: float | None = None,
+) -> NDArray[np.float32]:
+    """The image as float32 ``[H, W]`` in metres, 0 where the depth is missing.
+
+    Args:
+        path: A 16-bit image of one channel, or an ``.npy`` array of metres.
+        depth_factor: Raw units a metre of an image.
+        size: Width and height that it has to have; None for any.
+        mismatch: Ends the message where it has another one.
+        missing: Raw value beside 0 that stands for a missing depth; None for none.
+        furthest_m: Depth beyond this is missing; None for no limit.
+
+    Raises:
+        SequenceError: The file is missing, empty, truncated, of another size, no image, or not of 16 bits in one
+            channel.
+    """
+    if path.suffix == ".npy":
+        depth = read_metres(path, size=size, mismatch=mismatch)
+    else:
+        raw = _read_raw(path, depth_factor, size, mismatch)
+        depth = raw.astype(np.float32) / np.float32(depth_factor)
+        if missing is not None:
+            depth[raw == missing] = 0
+    if furthest_m is not None:
+        depth[depth > furthest_m] = 0
+    return depth
 
 
-def _count(
-    colour: ImageList,
-    depth: ImageList,
-    index: tuple[NDArray[np.intp], NDArray[np.intp]],
-    absent: int,
-    max_time_difference_s: float,
-    stamps: NDArray[np.float64],
-    truth: Trajectory | None,
-    ground_truth_dropped: str,
-) -> Dropped:
-    without, hole = 0, 0.0
-    if truth is not None:
-        without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
-        inside = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
-        hole = float(np.diff(np.concatenate([stamps[:1], inside, stamps[-1:]])).max(initial=0.0))
-    return Dropped(
-        colour_listed=len(colour),
-        depth_listed=len(depth),
-        pairs=len(stamps),
-        colour_unpaired=len(colour) - len(index[0]),
-        depth_unpaired=len(depth) - len(index[1]),
-        bad_stamps=colour.bad_stamps + depth.bad_stamps,
-        duplicate_stamps=colour.duplicate_stamps + depth.duplicate_stamps,
-        unsorted=colour.unsorted + depth.unsorted,
-        absent=absent,
-        unnamed=colour.unnamed + depth.unnamed,
-        max_time_difference_s=max_time_difference_s,
-        ground_truth_poses=0 if truth is None else len(truth),
-        ground_truth_dropped=ground_truth_dropped,
-        frames_without_ground_truth=without,
-        largest_hole_s=hole,
-    )
+def _read_raw(path: Path, depth_factor: float, size: tuple[int, int] | None, mismatch: str) -> NDArray[np.uint16]:
+    hint = "set the preprocessing's width and height to resize both"
+    image = read_image(path, size=size, mismatch=mismatch, hint=hint, kind=SequenceError)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise SequenceError(
+            f"depth image {path} has {channels} channel(s) of {image.dtype.itemsize * 8} bits (values {image.min()} to "
+            f"{image.max()}), expected 1 of 16 bits",
+            f"store depth x {depth_factor:g} as 16-bit PNG; an 8-bit image has lost its range",
+        )
+    return image.astype(np.uint16, copy=False)
+
+
+# Depth as arrays of metres in NumPy's own format; the size is checked before memory is taken.
+
+
+def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.float32]:
+    """The array as float32 ``[H, W]`` in metres; what is not finite or below 0 is missing, that is 0.
+
+    Args:
+        path: An ``.npy`` file of floating-point numbers.
+        size: Width and height that it has to have; None for any.
+        mismatch: Ends the message where it has another one.
+
+    Raises:
+        SequenceError: The file is missing, damaged, of another size, or holds something else.
+    """
+    data = read_bytes(path, limit=MOST_BYTES, kind=SequenceError)
+    stream = BytesIO(data)
+    try:
+        version = npy.read_magic(stream)
+        header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, in_columns, kind = header(stream)
+    except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
+        raise SequenceError(f"depth array {path} cannot be read ({len(data)} bytes)", "it is no .npy file") from error
+    rest = len(data) - stream.tell()
+    if len(shape) != 2 or kind.kind != "f" or rest != int(kind.itemsize) * int(shape[0]) * int(shape[1]) or not rest:
+        raise SequenceError(
+            f"depth array {path} claims {kind} of shape {str(shape)[:60]} over {rest} bytes, expected rows of metres"
+        )
+    if size is not None and shape != size[::-1]:
+        raise SequenceError(f"depth array {path} is {shape[1]}x{shape[0]}, {mismatch}")
+    values = np.frombuffer(data, kind, offset=stream.tell()).reshape(shape, order="F" if in_columns else "C")
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = np.ascontiguousarray(values, dtype=np.float32)
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

@@ -17,9 +17,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.stamps import from_seconds, to_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
-
-from .contents import Contents
-from .frame_names import find_names, stamped
+from dynslam_bench.sequences.readers.lists import Contents, find_names, stamped
 
 CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, depth_factor=1000.0)
 FPS = 30.0
@@ -46,16 +44,20 @@ def read(folder: Path, fps: float | None = None) -> Contents:
     stamps = from_seconds(int(number) / rate for number in numbers)
     colour, depth = stamped(files, stamps, str(folder)), [f"frame-{number}.depth.png" for number in numbers]
     poses = [read_pose(folder / f"frame-{number}.pose.txt") for number in numbers]
-    known = [i for i, pose in enumerate(poses) if pose is not None]
-    tracked = np.array([poses[i] for i in known])
-    truth = Trajectory(to_seconds(stamps[known]), tracked, stamps[known]) if known else None
-    dropped = f"ground truth: {len(poses) - len(known)} of {len(poses)} poses lost" if len(known) < len(poses) else ""
+    tracked_frames = [i for i, pose in enumerate(poses) if pose is not None]
+    tracked = np.array([poses[i] for i in tracked_frames])
+    truth = Trajectory(to_seconds(stamps[tracked_frames]), tracked, stamps[tracked_frames]) if tracked_frames else None
+    dropped = (
+        f"ground truth: {len(poses) - len(tracked_frames)} of {len(poses)} poses lost"
+        if len(tracked_frames) < len(poses)
+        else ""
+    )
     paired = stamped(depth, stamps, str(folder))
     return Contents(colour, paired, True, truth, dropped, CAMERA, rate, missing_depth=MISSING)
 
 
 def read_pose(path: Path) -> NDArray[np.float64] | None:
-    """A 4x4 pose, as it stands; None where it is no number, as KinectFusion writes a lost frame.
+    """A 4x4 pose, unchanged; None where it is no number, as KinectFusion writes a lost frame.
 
     Raises:
         SequenceError: The file is missing, or holds no rigid transformation.

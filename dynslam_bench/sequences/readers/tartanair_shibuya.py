@@ -14,10 +14,8 @@ from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import read_stamped_table, read_table
-
-from .contents import Contents
-from .frame_names import find_names, stamped
+from dynslam_bench.geometry.trajectory_files import read_stamped_table, read_table
+from dynslam_bench.sequences.readers.lists import Contents, find_names, stamped
 
 FOCAL = 772.5483399593904
 CAMERA = Camera(640, 360, FOCAL, FOCAL, 320.0, 180.0, depth_factor=1.0, baseline_m=0.25)

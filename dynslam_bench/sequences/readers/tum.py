@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import load_tum
-
-from .contents import Contents
-from .lists import ImageList, list_folder, read_associations, read_image_list
+from dynslam_bench.geometry.trajectory_files import load_tum
+from dynslam_bench.sequences.readers.lists import Contents, ImageList, list_folder, read_associations, read_image_list
 
 ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 GROUND_TRUTHS = ("groundtruth.txt", "pose.txt")

@@ -13,12 +13,18 @@ import numpy as np
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
-
-from .bodies import camera_on_body, camera_truth
-from .contents import Contents
-from .frame_names import stamped
-from .nanoseconds import column, floats, nanoseconds, read_rows
-from .yaml_numbers import numbers, read_yaml, section
+from dynslam_bench.sequences.readers.lists import Contents, stamped
+from dynslam_bench.sequences.readers.tables import (
+    camera_on_body,
+    camera_truth,
+    column,
+    floats,
+    nanoseconds,
+    numbers,
+    read_rows,
+    read_yaml,
+    section,
+)
 
 COLUMNS = ("ts_rgb_0 (ns)", "path_rgb_0", "ts_depth_0 (ns)", "path_depth_0")
 POSE = ("ts (ns)", "tx (m)", "ty (m)", "tz (m)", "qx", "qy", "qz", "qw")

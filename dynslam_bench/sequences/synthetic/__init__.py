@@ -9,19 +9,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .families.registry import SYNTHETIC_IDS, TWIN_IDS
-from .ids import SyntheticId, parse_synthetic_id
-from .settings import CAMERA, HELD_OUT_INSTANCES, TUNE_INSTANCES, RenderSettings
+from dynslam_bench.sequences.synthetic.ids import REPLICA_IDS, SYNTHETIC_IDS, SyntheticId, parse_synthetic_id
+from dynslam_bench.sequences.synthetic.settings import CAMERA, HELD_OUT_SCENES, TUNE_SCENES, RenderSettings
 
 if TYPE_CHECKING:
-    from .sequence import SyntheticSequence
+    from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 
 __all__ = [
     "CAMERA",
-    "HELD_OUT_INSTANCES",
+    "HELD_OUT_SCENES",
+    "REPLICA_IDS",
     "SYNTHETIC_IDS",
-    "TUNE_INSTANCES",
-    "TWIN_IDS",
+    "TUNE_SCENES",
     "RenderSettings",
     "SyntheticId",
     "open_synthetic",
@@ -48,7 +47,7 @@ def open_synthetic(
     Raises:
         SequenceError: Unknown id, or a scene or length out of range.
     """
-    from .sequence import SyntheticSequence
+    from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 
     parsed = parse_synthetic_id(id) if isinstance(id, str) else id
     return SyntheticSequence(parsed, cache_root, settings or RenderSettings(), threads)

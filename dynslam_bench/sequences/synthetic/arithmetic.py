@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 from functools import reduce
-from typing import Any, overload
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Reals = TypeVar("Reals", float, Array)
 
 _HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 """Pi / 2 in parts of 33 bits, so that a product with a whole number below 2^20 is exact (fdlibm's)."""
@@ -37,6 +38,7 @@ def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
 def _sine(x: float | Array, quarters: int) -> Any:
     """The sine of x + quarters * pi / 2."""
     many = isinstance(x, np.ndarray)
+    x = x if many else float(x)
     turns: Any = np.floor(x * 0.6366197723675814 + 0.5) if many else math.floor(x * 0.6366197723675814 + 0.5)
     rest = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
     square = rest * rest
@@ -49,22 +51,14 @@ def _sine(x: float | Array, quarters: int) -> Any:
     return np.where(quadrants & 2, -values, values)
 
 
-@overload
-def sin(x: float) -> float: ...
-@overload
-def sin(x: Array) -> Array: ...
-def sin(x: float | Array) -> float | Array:
+def sin(x: Reals) -> Reals:
     """Sine of a number or of an array, radians; x within 1e6."""
-    return _sine(x if isinstance(x, np.ndarray) else float(x), 0)  # type: ignore[no-any-return]
+    return _sine(x, 0)  # type: ignore[no-any-return]
 
 
-@overload
-def cos(x: float) -> float: ...
-@overload
-def cos(x: Array) -> Array: ...
-def cos(x: float | Array) -> float | Array:
+def cos(x: Reals) -> Reals:
     """Cosine of a number or of an array, radians; x within 1e6."""
-    return _sine(x if isinstance(x, np.ndarray) else float(x), 1)  # type: ignore[no-any-return]
+    return _sine(x, 1)  # type: ignore[no-any-return]
 
 
 def atan2(y: float, x: float) -> float:
@@ -88,7 +82,7 @@ def atan2(y: float, x: float) -> float:
 
 def arctan2(y: Array, x: Array) -> Array:
     """Angles of vectors (x, y), arrays of one dimension."""
-    return np.array([atan2(*each) for each in zip(y.tolist(), x.tolist(), strict=True)])
+    return np.array([atan2(v, u) for v, u in zip(y.tolist(), x.tolist(), strict=True)])
 
 
 def exp(x: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Ids of the rendered sequences; light: imports neither numba nor OpenCV."""
+"""Ids and families of the rendered sequences; light: imports neither numba nor OpenCV."""
 
 from __future__ import annotations
 
@@ -8,12 +8,22 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dynslam_bench.core.errors import SequenceError, did_you_mean
+from dynslam_bench.sequences.synthetic.loops import FAST, LOOP, TRACKING
+from dynslam_bench.sequences.synthetic.objects import OBJECTS
+from dynslam_bench.sequences.synthetic.replicas import CONDITIONS, CROWD, SITTING, SYNCHRONOUS, WALKING, Family
+from dynslam_bench.sequences.synthetic.scene import World
+from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, HELD_OUT_SCENES, MAX_FRAMES
 
-from .families.registry import FAMILIES, SYNTHETIC_IDS
-from .scenes.world import World
-from .settings import DEFAULT_FRAMES, HELD_OUT_INSTANCES, MAX_FRAMES
+FAMILIES: dict[str, Family] = {
+    family.name: family for family in (WALKING, SITTING, LOOP, FAST, OBJECTS, CROWD, SYNCHRONOUS, TRACKING, *CONDITIONS)
+}
+REPLICA_IDS = (*WALKING.ids(), *SITTING.ids())
+"""The eight synthetic replicas of TUM's fr3 dynamic sequences."""
+SYNTHETIC_IDS = tuple(name for family in FAMILIES.values() for name in family.ids())
+"""Every rendered sequence that is listed, scene 0, default length."""
 
-_OPTIONS = {"scene": (0, HELD_OUT_INSTANCES.stop - 1), "frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
+
+_OPTIONS = {"scene": (0, HELD_OUT_SCENES.stop - 1), "frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
 """What may stand behind the question mark, with the least and the largest value."""
 _ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<scene>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
 
@@ -24,7 +34,7 @@ class SyntheticId:
 
     Attributes:
         family: For example ``walking`` or ``loop``.
-        variant: For the twins the camera's motion; may be empty.
+        variant: For the replicas of TUM's sequences the camera's motion; may be empty.
         scene: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held out.
         frames: Length of the sequence; frames are the same whatever the length.
         noise: Seed of the sensors' noise: another draw of the same scene. None is the scene's own draw.
@@ -58,7 +68,7 @@ class SyntheticId:
     @property
     def split(self) -> Literal["tune", "held-out"]:
         """Which split the scene belongs to."""
-        return "held-out" if self.scene in HELD_OUT_INSTANCES else "tune"
+        return "held-out" if self.scene in HELD_OUT_SCENES else "tune"
 
     @property
     def whole(self) -> str:
@@ -92,16 +102,16 @@ def parse_synthetic_id(text: str) -> SyntheticId:
 
 def _options(written: Sequence[str], text: str) -> dict[str, int]:
     """The values of options such as ``scene=3``, each at most once."""
-    found: dict[str, int] = {}
+    options: dict[str, int] = {}
     for option in written:
         key, separator, value = option.partition("=")
         if key not in _OPTIONS or not separator:
             forms = "write ?scene=N, ?frames=N, ?noise=SEED, or several, as ?scene=100&frames=60"
             raise SequenceError(f"'{text}' has an unknown option '{option}'", forms)
-        if key in found:
+        if key in options:
             raise SequenceError(f"'{text}' names {key} twice", "leave one out")
-        found[key] = _integer(value, key, text, *_OPTIONS[key])
-    return found
+        options[key] = _integer(value, key, text, *_OPTIONS[key])
+    return options
 
 
 def _integer(value: str, what: str, text: str, low: int, high: int) -> int:

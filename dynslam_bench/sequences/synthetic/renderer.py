@@ -1,4 +1,8 @@
-"""Renders frames of a scene: geometry, colour, depth as measured, masks and flow."""
+"""Renders frames of a scene: geometry, colour, depth as measured, masks and flow.
+
+All rows of a frame see the scene from one pose, or each from its own under a rolling shutter: then the camera's pose is
+exact for every row, while things and people are placed as they are when the middle of the image is exposed.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
@@ -15,18 +19,144 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.sequences.synthetic import kernels, sensors
+from dynslam_bench.sequences.synthetic.arithmetic import cos, exp, norm, power, product, sin
+from dynslam_bench.sequences.synthetic.ids import SyntheticId
+from dynslam_bench.sequences.synthetic.kernels import NEAR_M
+from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE
+from dynslam_bench.sequences.synthetic.scene import Scene, Snapshot
+from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RenderSettings
+from dynslam_bench.sequences.synthetic.textures import TextureAtlas
 
-from .arithmetic import cos, exp, norm, power, product, sin
-from .bounds import bounds_of
-from .ids import SyntheticId
-from .kernels import motion as motion_kernels
-from .kernels import raycast as kernels
-from .kernels import sensors
-from .scenes.parts import QUAD, ROUND_CONE
-from .scenes.scene import Scene, Snapshot
-from .scenes.textures import Atlas
-from .settings import CAMERA, FPS, RenderSettings
-from .views import View, rolling_flow, view_of
+Array = NDArray[np.float64]
+_ROUNDS = 5
+"""Rounds of the search for the row that sees a point; each shrinks the error by the rows' motion a row, 0.1 or less."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The scene as the rows of one frame see it.
+
+    Attributes:
+        middle: The scene when the middle of the image is exposed.
+        poses: ``[R, 4, 4]`` camera poses of all rows; R is 1 or the height of the image.
+        scale: ``[P, 3]`` scale of each primitive's local axes.
+    """
+
+    middle: Snapshot
+    poses: Array
+    scale: Array
+
+    @property
+    def rolling(self) -> bool:
+        """Whether every row has its own pose."""
+        return len(self.poses) > 1
+
+    def local(self, visible: NDArray[np.int32]) -> Array:
+        """Maps ``[R, P, 12]`` from the camera to the primitives, as in `Snapshot`.
+
+        Under a rolling shutter those of the primitives `visible` alone are filled in.
+        """
+        if not self.rolling:
+            return self.middle.local[None]
+        inverse = np.swapaxes(self.middle.rotation[visible], 1, 2) / self.scale[visible, :, None]
+        poses = np.repeat(self.poses[:, None, :3], len(visible), axis=1)
+        poses[..., 3] -= self.middle.origin[visible]
+        local = np.empty((len(self.poses), len(self.scale), 12))
+        local[:, visible] = (product(inverse, poses)).reshape(len(poses), -1, 12)
+        return local
+
+    def at_row(self, row: int) -> Snapshot:
+        """The scene from the pose of a row."""
+        return self.middle if not self.rolling else replace(self.middle, T_world_cam=self.poses[row])
+
+
+def row_times(index: int, readout_s: float) -> Array:
+    """When each row of frame `index` is exposed, seconds from the start; the image's middle at the frame's stamp."""
+    rows = (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
+    return index / FPS + rows * readout_s
+
+
+def view_of(scene: Scene, index: int) -> View:
+    """How frame `index` sees the scene."""
+    middle, readout = scene.snapshot(index / FPS), scene.world.optics.readout_s
+    if readout == 0:
+        return View(middle, middle.T_world_cam[None], scene.scale)
+    return View(middle, scene.poses(row_times(index, readout)), scene.scale)
+
+
+def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -> NDArray[np.float32]:
+    """Exact flow float32 ``[H, W, 2]`` in pixels between frames whose rows have poses of their own.
+
+    A point is seen in the other frame by the row onto which that very row's pose projects it. Beyond the image's first
+    and last row the pose goes on as that row's.
+    """
+    v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1)
+    turns, places = now.poses[:, :3, :3], now.poses[:, :3, 3]
+    world = product(rays * depth[..., None], np.swapaxes(turns, 1, 2)) + places[:, None]
+    turn = product(other.middle.rotation, np.swapaxes(now.middle.rotation, 1, 2))
+    shift = other.middle.origin - product(turn, now.middle.origin[:, :, None])[:, :, 0]
+    primitive = np.maximum(hit >> 3, 0)
+    world = product(turn[primitive], world[..., None])[..., 0] + shift[primitive]
+    row, last = v.copy(), CAMERA.height - 1
+    for _ in range(_ROUNDS):
+        first = np.clip(np.floor(row), 0, last - 1).astype(np.int64)
+        share = np.clip(row - first, 0.0, 1.0)[..., None]
+        ends = []
+        for near in (first, first + 1):
+            away = world - other.poses[near, :3, 3]
+            ends.append(product(away[..., None, :], other.poses[near, :3, :3])[..., 0, :])
+        points = (1 - share) * ends[0] + share * ends[1]
+        w = np.where(points[..., 2] > 0.05, points[..., 2], np.nan)
+        x, row_now = points[..., 0] / w * CAMERA.fx + CAMERA.cx, points[..., 1] / w * CAMERA.fy + CAMERA.cy
+        row = np.where(np.isfinite(row_now), row_now, row)
+    flow = np.stack([x - u, row_now - v], axis=-1)
+    flow[hit < 0] = np.nan
+    return flow.astype(np.float32)
+
+
+# Where in the image a primitive can be seen: the rectangle around the part of its box that lies before the camera.
+
+_MARGIN_PX = 2.0
+_EDGES = np.array([(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i >> axis & 1])
+"""The twelve edges of a box, as pairs of corners; bit k of a corner's number is its side along axis k."""
+
+
+def bounds_of(points: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Bounds of boxes.
+
+    Args:
+        points: Corners ``[P, 8, 3]`` in the camera frame, metres.
+
+    Returns:
+        Least depth of all corners, and least u, least v, greatest u, greatest v (pixels, with a margin); an empty
+        rectangle (least above greatest) where a box lies behind the camera.
+    """
+    depth = points[:, :, 2]
+    rectangle = _project(points, depth > NEAR_M)
+    crossing = np.flatnonzero((depth.min(axis=1) <= NEAR_M) & (depth.max(axis=1) > NEAR_M))
+    if len(crossing):
+        a, b = points[crossing][:, _EDGES[:, 0]], points[crossing][:, _EDGES[:, 1]]
+        cut = (a[..., 2] > NEAR_M) != (b[..., 2] > NEAR_M)
+        share = (NEAR_M - a[..., 2]) / np.where(cut, b[..., 2] - a[..., 2], 1.0)
+        ends = a + share[..., None] * (b - a)
+        at_cut = _project(ends, cut)
+        rectangle[:2, crossing] = np.minimum(rectangle[:2, crossing], at_cut[:2])
+        rectangle[2:, crossing] = np.maximum(rectangle[2:, crossing], at_cut[2:])
+    low_u, low_v, high_u, high_v = rectangle
+    return depth.min(axis=1), low_u - _MARGIN_PX, low_v - _MARGIN_PX, high_u + _MARGIN_PX, high_v + _MARGIN_PX
+
+
+def _project(points: Array, valid: NDArray[np.bool_]) -> Array:
+    """Rectangle ``[4, P]`` (least u, v, greatest u, v) around the valid ones of points ``[P, K, 3]``."""
+    z = np.where(valid, points[..., 2], 1.0)
+    u = points[..., 0] / z * CAMERA.fx + CAMERA.cx
+    v = points[..., 1] / z * CAMERA.fy + CAMERA.cy
+    low = [np.where(valid, x, np.inf).min(axis=1) for x in (u, v)]
+    high = [np.where(valid, x, -np.inf).max(axis=1) for x in (u, v)]
+    return np.stack(low + high)
+
 
 _BAND = 48
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
@@ -46,18 +176,16 @@ _LAMPS = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """One frame as it goes to disk, and the exact geometry behind it.
+    """One frame as it is stored.
 
     Attributes:
         rgb: uint8 ``[H, W, 3]``.
         raw_depth: uint16 ``[H, W]`` in units of 1 / 5000 m, 0 = missing, as the sensor measures it.
-        exact_depth: float64 ``[H, W]`` z-depth in metres, 0 where nothing is hit.
         instances: uint8 ``[H, W]``.
     """
 
     rgb: NDArray[np.uint8]
     raw_depth: NDArray[np.uint16]
-    exact_depth: NDArray[np.float64]
     instances: NDArray[np.uint8]
 
 
@@ -86,7 +214,7 @@ class Renderer:
         self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
 
     @cached_property
-    def atlas(self) -> Atlas:
+    def atlas(self) -> TextureAtlas:
         """The textures; drawn when the first frame is coloured."""
         return self.scene.atlas()
 
@@ -110,7 +238,7 @@ class Renderer:
             color = self._blur(now, index, hit, depth, color)
         rgb = self._expose(index, color)
         ids = np.append(self.scene.instance, 0).astype(np.uint8)
-        return Rendered(rgb, raw, depth, ids[hit >> 3])
+        return Rendered(rgb, raw, ids[hit >> 3])
 
     def flow(self, index: int, other: int) -> NDArray[np.float32]:
         """Exact flow float32 ``[H, W, 2]`` in pixels from frame `index` to frame `other`; NaN where there is none.
@@ -123,7 +251,7 @@ class Renderer:
             return rolling_flow(now, after, hit, depth)
         flow = np.empty((*hit.shape, 2), np.float32)
         motion = self._motion(now.middle, after.middle)
-        self._rows(lambda a, b: motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
+        self._rows(lambda a, b: kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
         return flow
 
     def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -148,9 +276,9 @@ class Renderer:
         jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
 
         def work(a: int, b: int) -> None:
-            seen = now.at_row((a + b) // 2)
-            lights = self._lights(seen, time)
-            facets = self._facets(seen, lights)
+            snapshot = now.at_row((a + b) // 2)
+            lights = self._lights(snapshot, time)
+            facets = self._facets(snapshot, lights)
             for first, end, maps in _rows_of(local, a, b):
                 kernels.shade_pixels(
                     first, end, self._intrinsics, *tiles, scene.kind, maps, scene.shape, scene.texture, scene.uv,
@@ -171,15 +299,15 @@ class Renderer:
         def work(a: int, b: int) -> None:
             row = (a + b) // 2
             motion = self._motion(now.at_row(row), after.at_row(row))
-            motion_kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow)
+            kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow)
 
         self._rows(work, bands=now.rolling)
         shutter, exact, shares = (
             self.color_sensor.shutter,
             sharp.astype(np.float64).ravel(),
-            motion_kernels.tap_shares(),
+            kernels.tap_shares(),
         )
-        self._rows(lambda a, b: motion_kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
+        self._rows(lambda a, b: kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
         return blurred
 
     def _rows(self, work: Callable[[int, int], None], *, bands: bool = False) -> None:
@@ -206,12 +334,12 @@ class Renderer:
         )
         chosen = np.linspace(0, len(view.poses) - 1, 9 if view.rolling else 1).astype(int)
         bounds = [bounds_of(product(world - pose[:3, 3], pose[:3, :3])) for pose in view.poses[chosen]]
-        nearest, low_u, low_v = (np.min([each[k] for each in bounds], axis=0) for k in range(3))
-        high_u, high_v = (np.max([each[k] for each in bounds], axis=0) for k in (3, 4))
+        nearest, low_u, low_v = (np.min([bound[k] for bound in bounds], axis=0) for k in range(3))
+        high_u, high_v = (np.max([bound[k] for bound in bounds], axis=0) for k in (3, 4))
         if view.rolling:
             nearest = nearest - _SLACK_M
         tiles_x, tiles_y = -(-CAMERA.width // kernels.TILE), -(-CAMERA.height // kernels.TILE)
-        seen = (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
+        visible = (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
         boxes = np.stack(
             [
                 np.clip(low_u, 0, CAMERA.width - 1),
@@ -223,7 +351,7 @@ class Renderer:
         )
         boxes = (boxes // kernels.TILE).astype(np.int32)
         order = np.argsort(nearest, kind="stable")
-        order = order[seen[order]].astype(np.int32)
+        order = order[visible[order]].astype(np.int32)
         start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
         tiles = tiles_x, np.asarray(start, np.int32), np.asarray(members, np.int32), nearest
         return tiles, view.local(order)
@@ -271,8 +399,8 @@ class Renderer:
         facets = np.empty((len(axes), 6, 5))
         facets[:, 0::2, :3], facets[:, 1::2, :3] = -axes, axes
         facets[scene.kind == QUAD, 4:, :3] = axes[scene.kind == QUAD, 2:]
-        seen = snap.T_world_cam[:3, 3] - snap.origin
-        behind = (product(seen[:, None, :], snap.rotation) < 0)[:, 0, 2] & (scene.kind == QUAD)
+        to_camera = snap.T_world_cam[:3, 3] - snap.origin
+        behind = (product(to_camera[:, None, :], snap.rotation) < 0)[:, 0, 2] & (scene.kind == QUAD)
         facets[behind, 4:, :3] *= -1
         facets[:, :, 3] = lights[0, 3] + product(
             np.maximum(product(facets[:, :, :3], lights[1:, :3].T), 0), lights[1:, 3]
@@ -357,12 +485,10 @@ class Renderer:
         if optics.gain != 1 or optics.auto_exposure:
             mean = max(float(color.mean(dtype=np.float64)) * optics.gain, 1.0)
             gain *= optics.gain * power(_MEAN_GREY / mean, optics.auto_exposure)
-        gains = np.repeat(gain[:, None], 3, axis=1)
-        offset = np.zeros_like(gains)
         rgb = np.empty(color.shape, np.uint8)
         seed = np.uint64((self._seed + 0x9E3779B97F4A7C15 * (2 * index + 1)) & 0xFFFFFFFFFFFFFFFF)
         read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
-        self._rows(lambda a, b: sensors.expose(a, b, seed, color, gains, offset, read, shot, rgb))
+        self._rows(lambda a, b: sensors.expose(a, b, seed, color, gain, read, shot, rgb))
         return rgb
 
 

@@ -1,28 +1,170 @@
-"""The rendered sequence: frames are rendered when first read, then come from the cache."""
+"""The rendered sequence: frames are rendered when first read, then come from the cache.
+
+The cache is a folder in TUM layout. ``rgb/``, ``depth/`` and ``masks/`` hold one PNG a frame, named by its stamp; lists
+name them. Every file appears by an atomic rename and every read checks the PNG's checksums, so several processes may
+render into one folder, an interrupted rendering is resumed, and a damaged file counts as missing.
+"""
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
+from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import format_ns
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.sequences.cameras import write_camera
+from dynslam_bench.sequences.readers.lists import read_stamped_lines
+from dynslam_bench.sequences.synthetic.ids import SyntheticId
+from dynslam_bench.sequences.synthetic.renderer import Rendered, Renderer, default_threads, row_times
+from dynslam_bench.sequences.synthetic.scene import Scene
+from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
+from dynslam_bench.sequences.view import Masks
 
-from .frame_cache import FrameStore
-from .ids import SyntheticId
-from .renderer import Rendered, Renderer, default_threads
-from .scenes.scene import Scene
-from .settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
-from .views import row_times
+_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+_MODES = {"masks": ("L",), "depth": ("I;16", "I"), "rgb": ("RGB",)}
+"""Kinds of images, in the order in which they are stored, and Pillow's names of their pixel formats."""
+
+
+# Huffman coding after the SUB filter: as small as level 1 on noisy images, and more than twice as fast.
+_FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+if hasattr(cv2, "IMWRITE_PNG_FILTER"):
+    _FAST_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+_MASK_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+def encode_png(image: NDArray[Any]) -> bytes:
+    """A PNG of an RGB (uint8, three channels) or single-channel (uint8, uint16) image.
+
+    Raises:
+        SequenceError: The encoder refuses the image.
+    """
+    stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    done, data = cv2.imencode(".png", stored, _MASK_PNG if image.ndim == 2 and image.dtype == np.uint8 else _FAST_PNG)
+    if not done:
+        raise SequenceError(f"cannot encode an image of shape {image.shape} and type {image.dtype} as PNG")
+    return bytes(data.tobytes())
+
+
+def is_intact_png(data: bytes, size: tuple[int, int] | None = None, modes: tuple[str, ...] = ()) -> bool:
+    """Whether the bytes are a complete PNG whose chunks all carry the right checksum.
+
+    Args:
+        data: The file.
+        size: Width and height that it has to have; None for any.
+        modes: Pillow's names of the pixel formats it may have; empty for any.
+    """
+    try:
+        with Image.open(BytesIO(data), formats=["PNG"]) as image:
+            image.verify()
+    except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError):  # Pillow's, if damaged
+        return False
+    return data.endswith(_END) and size in (None, image.size) and (not modes or image.mode in modes)
+
+
+class FrameStore:
+    """The cache folder of one rendered sequence.
+
+    Args:
+        folder: The folder; it need not exist.
+        camera: For ``camera.toml`` and the expected image size.
+    """
+
+    def __init__(self, folder: Path, camera: Camera) -> None:
+        self.folder = folder
+        self.camera = camera
+
+    def path(self, kind: str, stamp: float) -> Path:
+        """Where a frame's image of a kind (``rgb``, ``depth``, ``masks``) lies."""
+        return self.folder / kind / f"{stamp:.6f}.png"
+
+    def is_intact(self, stamp: float) -> bool:
+        """Whether all images of a frame lie in the cache, complete and of the right size and type."""
+        return all(self._bytes(kind, stamp) is not None for kind in _MODES)
+
+    def read(self, kind: str, stamp: float) -> NDArray[Any] | None:
+        """An image (RGB order), or None if it is missing or damaged.
+
+        Raises:
+            SequenceError: The file exists but cannot be read (permissions, input error).
+        """
+        data = self._bytes(kind, stamp)
+        try:
+            image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            return None
+        if image is None:
+            return None
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if kind == "rgb" else image
+
+    def _bytes(self, kind: str, stamp: float) -> bytes | None:
+        """The bytes of an image file if it is intact and what it should be."""
+        path = self.path(kind, stamp)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise SequenceError(
+                f"cannot read {path}: {error.strerror}", "check the permissions of the cache"
+            ) from error
+        return data if is_intact_png(data, (self.camera.width, self.camera.height), _MODES[kind]) else None
+
+    def write(self, stamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.uint16], masks: NDArray[np.uint8]) -> None:
+        """Store a frame; the colour image comes last, so that a frame with one is complete.
+
+        Raises:
+            DynslamError: The folder cannot be written.
+        """
+        images: dict[str, NDArray[Any]] = {"masks": masks, "depth": depth, "rgb": rgb}
+        for kind, image in images.items():
+            write_atomic(self.path(kind, stamp), encode_png(image))
+
+    def has(self, stamp: float) -> bool:
+        """Whether all images of a frame lie in the cache (not checked for damage)."""
+        return all(self.path(kind, stamp).is_file() for kind in _MODES)
+
+    def write_lists(self, truth: Trajectory) -> None:
+        """Write ``rgb.txt``, ``depth.txt`` and ``masks.txt`` of the frames there are, the poses and the camera.
+
+        The poses are those of `truth`, or those already listed where these are more.
+        """
+        listed = [float(stamp) for stamp in truth.timestamps if self.has(float(stamp))]
+        for kind in _MODES:
+            lines = [f"# {kind} images of a rendered sequence", "# timestamp filename", "#"]
+            stamps = {f"{stamp:.6f}" for stamp in listed} | self._listed(kind)
+            lines += [f"{stamp} {kind}/{stamp}.png" for stamp in sorted(stamps, key=float)]
+            write_atomic(self.folder / f"{kind}.txt", "\n".join(lines) + "\n")
+        poses = self.folder / "groundtruth.txt"
+        if not poses.is_file() or sum(1 for _ in read_lines(poses, kind=SequenceError)) < len(truth) + 2:
+            write_tum(poses, truth, comment="exact poses of a rendered sequence")
+        write_camera(self.folder / "camera.toml", self.camera, fps=FPS)
+
+    def _listed(self, kind: str) -> set[str]:
+        path = self.folder / f"{kind}.txt"
+        if not path.is_file():
+            return set()
+        stamps = {format_ns(ns)[:-3] for ns, _ in read_stamped_lines(path) if ns is not None}
+        return {stamp for stamp in stamps if (self.folder / kind / f"{stamp}.png").is_file()}
+
 
 START_S = 1000.0
 """Stamp of the first frame in seconds."""
@@ -36,17 +178,29 @@ class SyntheticSequence:
         cache_root: Folder under which rendered frames are kept; None keeps nothing and renders every time.
         settings: What differs from the default rendering.
         threads: Threads a frame; None for the cores there are, at most four. The frames do not depend on it.
+
+    Attributes:
+        id: For example ``synthetic/walking_xyz?scene=0&frames=600``.
+        whole_id: The id without its length, for example ``synthetic/walking_xyz?scene=0``: all lengths cut the same
+            script.
+        split: ``tune`` (scenes 0-99) or ``held-out`` (100-199).
+        noise: Seed of the sensors' noise; None for the scene's own.
+        timestamps: Stamps of all frames in seconds.
+        store: The cache of its frames; None without one.
     """
 
     def __init__(
         self, sequence: SyntheticId, cache_root: Path | None, settings: RenderSettings, threads: int | None = None
     ) -> None:
-        self._id = sequence
+        self._id, self._cache_root = sequence, cache_root
         self.settings = settings
         self.threads = threads or default_threads()
         self._lock = threading.Lock()
-        stamps = START_S + np.arange(sequence.frames) / FPS
-        self._timestamps = np.round(stamps, 6)
+        self.id, self.whole_id = str(sequence), sequence.whole
+        self.split, self.noise = sequence.split, sequence.noise
+        self.fps, self.license = FPS, "CC0-1.0"
+        self.citation = f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
+        self.timestamps = np.round(START_S + np.arange(sequence.frames) / FPS, 6)
         self.store: FrameStore | None = None
         if cache_root is not None:
             noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
@@ -54,57 +208,30 @@ class SyntheticSequence:
             label = f"{sequence.name}@{sequence.scene}{noise}-{self._key()}"
             self.store = FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
 
-    def __getstate__(self) -> dict[str, object]:
-        # Without the lock and the renderer, which are made anew where the copy is used.
-        return {
-            key: value
-            for key, value in vars(self).items()
-            if key in ("_id", "settings", "threads", "_timestamps", "store")
-        }
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        vars(self).update(state)
-        self._lock = threading.Lock()
-
-    @property
-    def id(self) -> str:
-        """For example ``synthetic/walking_xyz?scene=0&frames=600``."""
-        return str(self._id)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._id, self._cache_root, self.settings, self.threads)
 
     @property
     def camera(self) -> Camera:
         """The camera of TUM's fr3 sequences, without distortion; the fast sequences' has a rolling shutter."""
         return replace(CAMERA, readout_s=self.scene.world.optics.readout_s)
 
-    @property
-    def timestamps(self) -> NDArray[np.float64]:
-        """Stamps of all frames in seconds."""
-        return self._timestamps
-
     @cached_property
     def ground_truth(self) -> Trajectory:
         """Exact camera-to-world poses of all frames; needs no rendering."""
-        return Trajectory(self._timestamps, self.scene.poses(np.arange(len(self)) / FPS))
+        return Trajectory(self.timestamps, self.scene.poses(np.arange(len(self)) / FPS))
 
     @property
-    def fps(self) -> float:
-        """30 Hz."""
-        return FPS
+    def masks(self) -> Masks:
+        """Exact masks of the instances, by frame index."""
+        return Masks(self._masks_of)
 
-    @property
-    def license(self) -> str:
-        """Rendered by this package: nobody else's rights."""
-        return "CC0-1.0"
-
-    @property
-    def citation(self) -> str:
-        """What to cite."""
-        return f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
-
-    @property
-    def masks(self) -> SyntheticMasks:
-        """Exact instance masks."""
-        return SyntheticMasks(self)
+    def _masks_of(self, index: int) -> FrameMasks:
+        i = range(len(self))[index]
+        ids = None if self.store is None else self.store.read("masks", float(self.timestamps[i]))
+        if ids is None:
+            ids = self.renderer.geometry(i)[1]
+        return FrameMasks(ids, self.scene.world.class_names, self.scene.moving(i))
 
     @cached_property
     def scene(self) -> Scene:
@@ -115,21 +242,6 @@ class SyntheticSequence:
     def renderer(self) -> Renderer:
         """The renderer; built when the first frame is rendered."""
         return Renderer(self._id, self.settings, self.threads)
-
-    @property
-    def split(self) -> str:
-        """``tune`` (scenes 0-99) or ``held-out`` (100-199)."""
-        return self._id.split
-
-    @property
-    def noise(self) -> int | None:
-        """Seed of the sensors' noise; None for the scene's own."""
-        return self._id.noise
-
-    @property
-    def whole_id(self) -> str:
-        """The id without its length, for example ``synthetic/walking_xyz?scene=0``: all lengths cut the same script."""
-        return self._id.whole
 
     def digest(self) -> str:
         """Short digest of the renderer's version and all parameters."""
@@ -148,7 +260,7 @@ class SyntheticSequence:
 
     def __getitem__(self, index: int) -> Frame:
         i = range(len(self))[index]
-        stamp = float(self._timestamps[i])
+        stamp = float(self.timestamps[i])
         if self.store is not None:
             rgb, raw = self.store.read("rgb", stamp), self.store.read("depth", stamp)
             if rgb is not None and raw is not None:
@@ -190,7 +302,7 @@ class SyntheticSequence:
             DynslamError: The cache cannot be written; frames already rendered stay.
         """
         store = self.store
-        todo = [i for i in range(len(self)) if store is None or not store.is_intact(float(self._timestamps[i]))]
+        todo = [i for i in range(len(self)) if store is None or not store.is_intact(float(self.timestamps[i]))]
         done = len(self) - len(todo)
         if progress is not None:
             progress(done, len(self))
@@ -217,25 +329,10 @@ class SyntheticSequence:
                 renderer = self.renderer
         made = renderer.render(index)
         if self.store is not None:
-            self.store.write(float(self._timestamps[index]), made.rgb, made.raw_depth, made.instances)
+            self.store.write(float(self.timestamps[index]), made.rgb, made.raw_depth, made.instances)
             if lists and (index == len(self) - 1 or index == 0):
                 self.store.write_lists(self.ground_truth)
         return made
-
-
-class SyntheticMasks:
-    """Exact masks of a rendered sequence, by frame index."""
-
-    def __init__(self, sequence: SyntheticSequence) -> None:
-        self.sequence = sequence
-
-    def __getitem__(self, index: int) -> FrameMasks:
-        sequence = self.sequence
-        i = range(len(sequence))[index]
-        ids = None if sequence.store is None else sequence.store.read("masks", float(sequence.timestamps[i]))
-        if ids is None:
-            ids = sequence.renderer.geometry(i)[1]
-        return FrameMasks(ids, sequence.scene.world.class_names, sequence.scene.moving(i))
 
 
 def _metres(raw: NDArray[np.uint16]) -> NDArray[np.float32]:

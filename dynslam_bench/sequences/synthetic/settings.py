@@ -18,8 +18,8 @@ CAMERA = Camera(width=640, height=480, fx=535.4, fy=539.2, cx=320.1, cy=247.6, d
 FPS = 30.0
 DEFAULT_FRAMES = 600
 MAX_FRAMES = 36_000
-TUNE_INSTANCES = range(0, 100)
-HELD_OUT_INSTANCES = range(100, 200)
+TUNE_SCENES = range(0, 100)
+HELD_OUT_SCENES = range(100, 200)
 
 
 class DepthSensor(Settings):

@@ -1,10 +1,14 @@
-"""The real ORB-SLAM3, through the PyPI package pyorbslam3, in a process of its own."""
+"""The real ORB-SLAM3 (PyPI package pyorbslam3) in a process of its own; its vocabulary and settings file."""
 
 from __future__ import annotations
 
+import hashlib
+import lzma
 import math
 import os
 import sys
+from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +17,130 @@ import numpy as np
 import dynslam_bench
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.folders import vocabularies_folder
+from dynslam_bench.core.reading import MEGABYTE, read_bytes
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
+from dynslam_bench.trackers.adapters.subprocess_tracker import FinalizingProgramTracker, ProgramTracker
 
-from .settings import OrbSlam3Settings
-from .subprocess_tracker import FinalizingProgramTracker, ProgramTracker
-from .vocabulary import find_vocabulary
+ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
+HINT = (
+    f"name ORBvoc.txt of the ORB-SLAM3 repository or another ORB vocabulary in DBoW2's text format, .txt or .txt.xz, "
+    f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
+)
+MAX_BYTES = 512 * MEGABYTE
+"""The vocabulary of ORB-SLAM3 has 145 MB."""
+MAX_MEMORY = 256 * MEGABYTE
+"""Memory that its decompression may take."""
+TOKENS = 35
+"""Of a node: parent, whether it is a leaf, 32 bytes of the descriptor, weight."""
+
+
+def files(settings: OrbSlam3Settings) -> list[Path]:
+    """The vocabulary file, part of a run's identity.
+
+    Raises:
+        TrackerError: See `find_vocabulary`.
+    """
+    return [find_vocabulary(settings.vocabulary)]
+
+
+def find_vocabulary(setting: str) -> Path:
+    """The vocabulary as a checked ``.txt`` file.
+
+    Args:
+        setting: Path of a ``.txt`` or ``.txt.xz`` file; empty for the environment variable's.
+
+    Raises:
+        TrackerError: None is named, it is missing, cannot be read, or is no complete vocabulary.
+    """
+    named = setting.strip() or os.environ.get(ENVIRONMENT_VARIABLE, "").strip()
+    if not named:
+        raise TrackerError("orbslam3 needs an ORB vocabulary and none is named", HINT)
+    path = Path(named).expanduser().absolute()
+    if not path.is_file():
+        raise TrackerError(f"orbslam3: no vocabulary file {path}", HINT)
+    try:
+        stamp = path.stat()
+        return _prepared(path, stamp.st_size, stamp.st_mtime_ns)
+    except OSError as error:
+        raise TrackerError(f"orbslam3: cannot read the vocabulary {path}: {error.strerror}", HINT) from error
+
+
+@lru_cache(maxsize=8)
+def _prepared(path: Path, size: int, modified_ns: int) -> Path:
+    """Decompress if need be, check; once in a process as long as the file's size and time stay."""
+    packed = read_bytes(path, limit=MAX_BYTES, kind=TrackerError)
+    if path.suffix != ".xz":
+        _check(packed, path)
+        return path
+    target = vocabularies_folder() / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
+    if target.is_file():
+        return _prepared(target, target.stat().st_size, target.stat().st_mtime_ns)
+    try:
+        text = _unpack(packed)
+    except (lzma.LZMAError, EOFError, ValueError) as error:
+        raise TrackerError(
+            f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file: {error}", HINT
+        ) from None
+    _check(text, path)
+    write_atomic(target, text)
+    return target
+
+
+def _unpack(packed: bytes) -> bytes:
+    """The content of an .xz file; ValueError for one that unpacks to far more than a vocabulary."""
+    reader = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=MAX_MEMORY)
+    text = reader.decompress(packed, max_length=MAX_BYTES)
+    if not reader.eof:
+        raise ValueError(f"it is truncated, or unpacks to more than {MAX_BYTES >> 20} MB")
+    return text
+
+
+def _check(text: bytes, path: Path) -> None:
+    """Check that the text is a complete vocabulary; ORB-SLAM3's loader does not.
+
+    Raises:
+        TrackerError: Names the first line that is wrong.
+    """
+    lines = text.splitlines()
+    header = lines[0].split() if lines else []
+    try:
+        branching, depth, _, _ = map(int, header)
+        fits = 2 <= branching <= 20 and 1 <= depth <= 10
+    except ValueError:
+        fits = False
+    if not fits:
+        shown = b" ".join(header)[:40].decode(errors="replace")
+        raise TrackerError(
+            f"orbslam3: {path} is no ORB vocabulary: line 1 is '{shown}', not '<branching> <depth> <score> <weight>'",
+            HINT,
+        )
+    fault = _first_fault(text.rstrip().splitlines()[1:])
+    if fault:
+        raise TrackerError(f"orbslam3: the vocabulary {path} ({len(lines)} lines) is damaged: {fault}", HINT)
+
+
+def _first_fault(nodes: Iterable[bytes]) -> str:
+    """The first fault of the tree, or an empty string; node 0 is the root, node i is on line i + 1."""
+    childless = {0}
+    for node, line in enumerate(nodes, start=1):
+        tokens = line.split()
+        if len(tokens) != TOKENS or not b"".join(tokens[:-1]).isdigit():
+            return f"line {node + 1} is not a node of {TOKENS} numbers"
+        parent = int(tokens[0])
+        if parent >= node:
+            return f"line {node + 1} names parent {parent}, which has not come yet"
+        childless.discard(parent)
+        if tokens[1] == b"0":
+            childless.add(node)
+    return f"{len(childless)} inner nodes have no children, as if its end were missing" if childless else ""
+
 
 WORKER = "dynslam_bench.trackers.adapters.orbslam3_worker"
-BORDER_PX = 16  # ORB-SLAM3 looks for no corners so near to the edge of a pyramid level
+BORDER_PX = 16
+"""ORB-SLAM3 extracts no corners so near to the edge of a pyramid level."""
 _VIEWER = (
     ("KeyFrameSize", 0.05), ("KeyFrameLineWidth", 1.0), ("GraphLineWidth", 0.9), ("PointSize", 2.0),
     ("CameraSize", 0.08), ("CameraLineWidth", 3.0), ("ViewpointX", 0.0), ("ViewpointY", -0.7), ("ViewpointZ", -1.8),
@@ -43,7 +163,7 @@ class OrbSlam3Program(ProgramTracker):
     """
 
     sensor: str
-    """How ORB-SLAM3 calls what it is given."""
+    """ORB-SLAM3's name of the sensor."""
 
     def __init__(self, settings: OrbSlam3Settings, context: TrackerContext) -> None:
         self.settings = settings
@@ -61,7 +181,7 @@ class OrbSlam3Program(ProgramTracker):
         """Write its settings file from the camera, start it and load the vocabulary.
 
         Raises:
-            TrackerError: ORB-SLAM3 cannot take the camera, or does not start; names what it said last.
+            TrackerError: ORB-SLAM3 cannot take the camera, or does not start; names its last message.
         """
         check_camera(camera, self.settings)
         super().reset(camera, rng=rng)
@@ -74,19 +194,19 @@ class OrbSlam3Program(ProgramTracker):
 
 
 class OrbSlam3(OrbSlam3Program, FinalizingProgramTracker):
-    """In RGB-D mode: online what it answers at each frame, final what it saves at the end."""
+    """RGB-D mode: online poses are its answers at each frame, final ones what it saves at the end."""
 
     sensor = "RGBD"
 
 
 class OrbSlam3Monocular(OrbSlam3Program):
-    """In monocular mode, which saves no poses of frames at the end; depth is not handed to it."""
+    """Monocular mode, which saves no poses of frames at the end; it gets no depth."""
 
     sensor = "MONOCULAR"
 
 
 def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
-    """Refuse what would make ORB-SLAM3 crash or track nonsense.
+    """Refuse cameras with which ORB-SLAM3 crashes or returns meaningless poses.
 
     Raises:
         TrackerError: Another camera model, intrinsics that are none, or an image too small for the pyramid.
@@ -146,7 +266,7 @@ def settings_yaml(camera: Camera, settings: OrbSlam3Settings, fps: float) -> str
 
 
 def _real(value: float) -> str:
-    """A number that OpenCV's parser takes for a real one: always with a point, as ``1.0`` or ``1.0e-07``."""
+    """A number that OpenCV's parser reads as real: always with a point, as ``1.0`` or ``1.0e-07``."""
     text = repr(value)
     mantissa, exponent, power = text.partition("e")
     return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power

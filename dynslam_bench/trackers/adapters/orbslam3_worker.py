@@ -1,4 +1,4 @@
-"""The process in which ORB-SLAM3 runs: its crashes, its `exit()`, its threads and its chatter stay in here."""
+"""The process in which ORB-SLAM3 runs: it isolates its crashes, its `exit()`, its threads and its output."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .serve import serve
+from dynslam_bench.trackers.adapters.serve import serve
 
 STATES = {"OK": "ok", "OK_KLT": "ok", "RECENTLY_LOST": "lost", "LOST": "lost"}
 
@@ -44,7 +44,7 @@ class Worker:
     def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
         """One frame; without depth in monocular mode."""
         if self._final is not None:
-            raise RuntimeError("finalize() has stopped ORB-SLAM3's threads: only reset() begins anew")
+            raise RuntimeError("finalize() has stopped ORB-SLAM3's threads: only reset() starts again")
         start = time.perf_counter()
         image = np.ascontiguousarray(rgb)
         if self._monocular:

@@ -1,4 +1,4 @@
-"""A foreign program that answers JSON lines: start, ask with a time limit, end; its death becomes one clear error."""
+"""An external program that answers JSON lines; a fault or its death becomes one clear error."""
 
 from __future__ import annotations
 
@@ -24,20 +24,19 @@ from dynslam_bench.core.reading import parse_json
 
 _SET_PARENT_DEATH_SIGNAL = 1
 LOGGER = logging.getLogger(__name__)
-"""Told, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
-
+"""Gets, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
 LONGEST_LINE = 1 << 26
 """Bytes of the longest line that is taken from a program: a final trajectory of half a million poses."""
 
 
 class Program:
-    """One run of a foreign program.
+    """One run of an external program.
 
     Requests go to its standard input, one JSON object a line; it answers each with one JSON object a line on its
-    standard output. Lines that do not begin with ``{`` are log output and skipped, as is all it writes to its standard
-    error; the last ones are kept for error messages, all of them go to `LOGGER`. It has a session of its own, so that
-    it is ended together with whatever it started, and it should end by itself at the end of its standard input; on
-    Linux it is killed when the process that started it dies.
+    standard output. Lines that do not begin with ``{`` are log output and skipped, as is its standard error; the last
+    ones are kept for error messages, all of them go to `LOGGER`. It has a session of its own, so that its child
+    processes end with it. It should end by itself at the end of its standard input; on Linux it is killed when the
+    process that started it dies.
 
     Args:
         name: For messages.
@@ -58,7 +57,8 @@ class Program:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
-        self._said = {"out": _Said(), "err": _Said()}
+        self._lines: dict[str, str] = {}
+        self._fresh_lines: dict[str, str] = {}  # since the last request
         self._partial = {"out": b"", "err": b""}
         self._answers: deque[str] = deque()
         try:
@@ -89,18 +89,21 @@ class Program:
         return self._process.poll() is None
 
     @property
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line that is not blank of what it wrote as log.
 
-        What it wrote since the last request counts before what it wrote earlier, and standard error before standard
-        output: a program's standard output often arrives late, when it is flushed at the end.
+        Lines since the last request count before earlier ones, and standard error before standard output, which often
+        arrives late, when it is flushed at the end.
         """
         for channel, partial in self._partial.items():
-            if partial.strip():
-                self._said[channel].add(partial.decode(errors="replace"))
-                self._partial[channel] = b""
-        said = sorted(self._said.items(), key=lambda item: (item[1].fresh, item[0] == "err"), reverse=True)
-        return next((words.last for _, words in said if words.last), "")
+            self._keep_line(channel, partial.decode(errors="replace"))
+            self._partial[channel] = b""
+        lines = (self._fresh_lines, self._lines)
+        return next((kept[channel] for kept in lines for channel in ("err", "out") if channel in kept), "")
+
+    def _keep_line(self, channel: str, text: str) -> None:
+        if text.strip():
+            self._lines[channel] = self._fresh_lines[channel] = text.strip()[:300]
 
     def ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
         """Send a request and wait for its answer.
@@ -114,8 +117,7 @@ class Program:
             TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
         """
         self._refuse_surplus(doing)
-        for said in self._said.values():
-            said.fresh = False
+        self._fresh_lines.clear()
         line = memoryview(json.dumps(request, allow_nan=False).encode() + b"\n")
         text = self._exchange(line, timeout_s, doing)
         try:
@@ -129,7 +131,7 @@ class Program:
         return answer
 
     def _refuse_surplus(self, doing: str) -> None:
-        """An answer that nobody asked for would be taken for the next one's: a pose of the wrong frame."""
+        """Raise on an unrequested answer: it would be taken for the next one, a pose of the wrong frame."""
         if self.alive:
             self._read(0.0)
         if self._answers:
@@ -174,10 +176,9 @@ class Program:
                     raise self._death(doing) from None
             left = deadline - time.monotonic()
             if left <= 0:
-                words = self.last_words
+                line_shown = f"; its last line: '{self.last_line}'" if self.last_line else ""
                 self.kill()
-                said = f"; its last line: '{words}'" if words else ""
-                raise TrackerError(f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{said}")
+                raise TrackerError(f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{line_shown}")
             alive = self.alive
             open_ = self._read(min(left, 0.01 if line else 0.5))
             if not self._answers and not (alive and open_):
@@ -185,7 +186,7 @@ class Program:
         return self._answers.popleft()
 
     def _read(self, wait: float) -> bool:
-        """Take in what it writes within `wait` seconds; False once its standard output has ended."""
+        """Read its output for up to `wait` seconds; False once its standard output has ended."""
         if not self._selector.get_map():
             return False
         for key, _ in self._selector.select(wait):
@@ -203,12 +204,12 @@ class Program:
                 if channel == "out" and text.lstrip().startswith("{"):
                     self._answers.append(text)
                 elif text.strip():
-                    self._said[channel].add(text)
+                    self._keep_line(channel, text)
                     LOGGER.info("[%s] %s", self.name, text)
         return any(key.data == "out" for key in self._selector.get_map().values())
 
     def _drain(self) -> None:
-        """Take in the rest of its words; a grandchild may hold the pipe open for ever."""
+        """Read the rest of its output; a grandchild may hold the pipe open for ever."""
         for _ in range(64):
             if not self._selector.get_map() or not self._selector.select(0.0):
                 break
@@ -221,10 +222,10 @@ class Program:
             self.kill()
             return TrackerError(f"{self.name} {doing}: closed its output without an answer")
         self._drain()
-        words = self.last_words
+        line = self.last_line
         self.kill()
-        said = f"; its last line: '{words}'" if words else "; it wrote no message"
-        return TrackerError(f"{self.name} {doing}: the program {_describe(code)}{said}")
+        shown = f"its last line: '{line}'" if line else "it wrote no message"
+        return TrackerError(f"{self.name} {doing}: the program {_describe(code)}; {shown}")
 
 
 def parse_answer(text: str) -> dict[str, Any]:
@@ -239,21 +240,10 @@ def parse_answer(text: str) -> dict[str, Any]:
     return answer
 
 
-class _Said:
-    """What a program wrote to one channel, beside its answers."""
-
-    def __init__(self) -> None:
-        self.last = ""
-        self.fresh = False
-
-    def add(self, text: str) -> None:
-        self.last, self.fresh = text.strip()[:300], True
-
-
 def end_with_parent() -> Callable[[], object] | None:
-    """What a program's process does before it begins, so that Linux kills it when this one dies; None elsewhere.
+    """A function that runs in the new process before the program, so that Linux kills it when this process dies.
 
-    Linux means the thread that starts it: only the main thread's end is this process's end.
+    None elsewhere, and in threads: Linux watches the thread that starts the process.
     """
     if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
         return None

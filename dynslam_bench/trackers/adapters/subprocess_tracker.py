@@ -2,29 +2,193 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.contracts.tracker import TrackerContext, TrackingState, TrackResult
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.errors import DynslamError, TrackerError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError
+from dynslam_bench.core.files import SHARED_MEMORY, TemporaryFolder
 from dynslam_bench.core.seeding import derive_seed
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.trackers.adapters.program import Program
+from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
 
-from .answers import read_final_answer, read_track_answer
-from .exchange import ImageExchange
-from .program import Program
-from .settings import ProgramSettings, SubprocessSettings
-
+FRAME_FILE = "frame.raw"
 PROTOCOL = 2
-"""Of the JSON lines; since 2 the answer to ``track`` repeats its index."""
+"""Version of the JSON lines."""
+CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m", "readout_s")
+
+
+def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[], float]) -> TrackResult:
+    """The result of one frame.
+
+    Args:
+        answer: The program's answer.
+        who: Program and frame, for messages.
+        elapsed_s: Seconds since the request; ``transfer`` is what its own timings leave of them.
+
+    Raises:
+        TrackerError: It is no pose.
+    """
+    state = answer.get("state")
+    if not isinstance(state, str) or state not in get_args(TrackingState):
+        states = ", ".join(get_args(TrackingState))
+        raise TrackerError(f"{who}: answered state {str(state)[:80]!r}", f"known: {states}")
+    pose = _pose(answer.get("T_world_cam"), who)
+    if pose is None and state == "ok":
+        raise TrackerError(f"{who}: answered state 'ok' without T_world_cam")
+    stats = _numbers(answer.get("stats"), "stats", who)
+    timings = _numbers(answer.get("timings"), "timings", who)
+    timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
+    return TrackResult(pose, cast(TrackingState, state), stats, timings)
+
+
+def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
+    """The final trajectory; rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``, camera to world.
+
+    Raises:
+        TrackerError: It is no trajectory.
+    """
+    try:
+        rows = np.asarray(answer.get("trajectory"), dtype=np.float64).reshape(-1, 8)
+    except (TypeError, ValueError, OverflowError):
+        raise TrackerError(
+            f"{who}: 'trajectory' is not a list of rows of 8 numbers", "timestamp tx ty tz qx qy qz qw"
+        ) from None
+    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    if not (np.abs(norms - 1) < 1e-3).all():  # also catches NaN
+        raise TrackerError(f"{who}: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:g}")
+    try:
+        return Trajectory(rows[:, 0], se3.from_quaternion(rows[:, 1:4], rows[:, 4:]))
+    except DynslamError as error:
+        raise TrackerError(f"{who}: {error}") from error
+
+
+def _pose(value: Any, who: str) -> NDArray[np.float64] | None:
+    if value is None:
+        return None
+    try:
+        pose = np.asarray(value, dtype=np.float64).reshape(4, 4)
+    except (TypeError, ValueError, OverflowError):
+        raise TrackerError(
+            f"{who}: T_world_cam is not 16 numbers: {str(value)[:80]}", "row by row, camera to world"
+        ) from None
+    if not se3.is_pose(pose):
+        raise TrackerError(f"{who}: T_world_cam is no rigid pose: {pose.tolist()}")
+    return pose
+
+
+def _numbers(value: Any, what: str, who: str) -> dict[str, float]:
+    try:
+        return {str(key): float(number) for key, number in (value or {}).items()}
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        raise TrackerError(f"{who}: {what} is not an object of numbers: {str(value)[:80]}") from None
+
+
+class ImageExchange:
+    """A private folder through which the frames reach a program; removed by `close`, at the latest with the object.
+
+    ``raw``: one file ``frame.raw`` of fixed size, in shared memory where the system has it. It holds the colour image
+    (uint8 ``[H, W, 3]``, red first, row by row) at `rgb_offset` and the depth (little-endian float32 ``[H, W]``,
+    metres, 0 = missing) at `depth_offset`, and is overwritten before each ``track``. ``png``: for each frame an 8-bit
+    colour PNG and a 16-bit depth PNG in units of ``1 / depth_factor`` metres, as in TUM's files; those of the frame
+    before are removed.
+
+    Args:
+        camera: Of the frames.
+        mode: ``raw`` or ``png``.
+    """
+
+    def __init__(self, camera: Camera, mode: Literal["raw", "png"]) -> None:
+        self.camera, self.mode = camera, mode
+        self._last: tuple[Path, ...] = ()
+        colour = camera.height * camera.width * 3
+        self.depth_offset = -(-colour // 16) * 16
+        size = self.depth_offset + camera.height * camera.width * 4
+        self._temporary = _with_space(size) if mode == "raw" else TemporaryFolder()
+        self.folder = self._temporary.path
+        if mode == "raw":
+            self._memory = np.memmap(self.folder / FRAME_FILE, np.uint8, "r+", shape=(size,))
+            self._rgb = self._memory[:colour].reshape(camera.height, camera.width, 3)
+            self._depth = self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
+
+    def announce(self) -> dict[str, Any]:
+        """The part ``images`` of the ``reset`` request."""
+        if self.mode == "png":
+            return {"mode": "png", "depth_factor": self.camera.depth_factor}
+        return {
+            "mode": "raw",
+            "file": str(self.folder / FRAME_FILE),
+            "rgb_offset": 0,
+            "depth_offset": self.depth_offset,
+            "bytes": int(self._memory.size),
+        }
+
+    def put(self, frame: Frame) -> dict[str, Any]:
+        """Hand over a frame; returns the paths for the ``track`` request, in mode ``png``.
+
+        Raises:
+            TrackerError: The images do not have the camera's size.
+        """
+        expected = (self.camera.height, self.camera.width)
+        if frame.rgb.shape != (*expected, 3) or frame.depth.shape != expected:
+            raise TrackerError(
+                f"frame {frame.index} has colour {frame.rgb.shape} and depth {frame.depth.shape}, "
+                f"but the camera is {self.camera.width}x{self.camera.height}"
+            )
+        if self.mode == "raw":
+            np.copyto(self._rgb, frame.rgb)
+            np.copyto(self._depth, frame.depth)
+            return {}
+        return self._write_png(frame)
+
+    def _write_png(self, frame: Frame) -> dict[str, Any]:
+        rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
+        units = np.rint(np.nan_to_num(frame.depth) * self.camera.depth_factor).clip(0, 65535).astype(np.uint16)
+        fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        for path, image in ((rgb, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)), (depth, units)):
+            if not cv2.imwrite(str(path), image, fast):
+                raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
+        for old in self._last:
+            if old not in (rgb, depth):
+                old.unlink(missing_ok=True)
+        self._last = (rgb, depth)
+        return {"rgb": str(rgb), "depth": str(depth)}
+
+    def close(self) -> None:
+        """Remove the folder; may be called more than once."""
+        self._temporary.close()
+
+
+def _with_space(size: int) -> TemporaryFolder:
+    """A folder with the file for the frames, its space allocated: on a full disk SIGBUS would end the run later.
+
+    Raises:
+        InfrastructureError: There is no room, neither in shared memory nor among the temporary files.
+    """
+    reasons = []
+    for base in (SHARED_MEMORY, None):
+        folder = None
+        try:
+            folder = TemporaryFolder(base)
+            (folder.path / FRAME_FILE).write_bytes(bytes(size))
+            return folder
+        except OSError as error:
+            reasons.append(f"{base or tempfile.gettempdir()}: {error.strerror}")
+            if folder is not None:
+                folder.close()
+    raise InfrastructureError(f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space")
 
 
 class ProgramTracker:
@@ -58,7 +222,7 @@ class ProgramTracker:
         self._exchange: ImageExchange | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProgramTracker:
-        """Refused: what a program holds in memory cannot be copied.
+        """Refused: the memory of another process cannot be copied.
 
         Raises:
             TrackerError: Always.
@@ -66,7 +230,7 @@ class ProgramTracker:
         raise TrackerError(f"{self.name} is a program of its own, whose state cannot be copied")
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
-        """Start the program and tell it the camera.
+        """Start the program and send it the camera.
 
         Raises:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
@@ -83,15 +247,8 @@ class ProgramTracker:
             "op": "reset",
             "protocol": PROTOCOL,
             "camera": {
-                "width": camera.width,
-                "height": camera.height,
-                "fx": camera.fx,
-                "fy": camera.fy,
-                "cx": camera.cx,
-                "cy": camera.cy,
+                **{name: getattr(camera, name) for name in CAMERA_FIELDS},
                 "distortion": list(camera.distortion),
-                "baseline_m": camera.baseline_m,
-                "readout_s": camera.readout_s,
                 "fps": self.context.fps,
             },
             "images": self._exchange.announce(),
@@ -108,7 +265,7 @@ class ProgramTracker:
             raise
 
     def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
-        """What else the program is told at ``reset``; `folder` is a private one that lives as long as the sequence."""
+        """The part ``options`` of the ``reset`` request; `folder` is private and lives as long as the sequence."""
         return {}
 
     def track(self, frame: Frame) -> TrackResult:
@@ -117,7 +274,7 @@ class ProgramTracker:
         ``timings`` are those that the program states, with the rest of the time as ``transfer``.
 
         Raises:
-            TrackerError: It dies, hangs, or answers what is no pose.
+            TrackerError: It dies, hangs, or does not answer with a pose.
         """
         program, exchange = self._running()
         start = time.perf_counter()
@@ -154,7 +311,7 @@ class FinalizingProgramTracker(ProgramTracker):
         """The program's final trajectory; rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``, camera to world.
 
         Raises:
-            TrackerError: It dies, hangs, or answers what is no trajectory.
+            TrackerError: It dies, hangs, or does not answer with a trajectory.
         """
         program, _ = self._running()
         answer = program.ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-from dynslam_bench.culling.blocks.depth_blocks_settings import DepthBlockSettings
-
-from .composition import SemanticSystemSettings, UnrepairedSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import BoxEpipolarSettings, DepthBlockSettings
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    UnrepairedSettings,
+    composed,
+    describe_masks,
+    describe_matches,
+)
 
 
 class BlitzSlamSettings(SemanticSystemSettings):
@@ -24,17 +23,10 @@ class BlitzSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: BlitzSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B9 and B1, then B3 inside the boxes with F from outside them."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.depth_blocks import DepthBlockFilter
-
-    filters = [
-        DepthBlockFilter(settings.depth_blocks, settings.segmentation),
-        BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
-    ]
-    return compose(settings, context, filters, settings.flow)
-
+build = composed(
+    ("depth_blocks:DepthBlockFilter", "depth_blocks", "segmentation"),
+    ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"),
+)
 
 SPEC = TrackerSpec(
     id="blitz-slam",
@@ -48,8 +40,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Fan et al., Blitz-SLAM, Pattern Recognition 2022",
     assumptions=(
-        masks_in_words(BlitzSlamSettings().segmentation),
-        matches_in_words(BlitzSlamSettings().flow, BlitzSlamSettings().box_epipolar.unmatched),
+        describe_masks(BlitzSlamSettings().segmentation),
+        describe_matches(BlitzSlamSettings().flow, BlitzSlamSettings().box_epipolar.unmatched),
         "RANSAC of 1 px, 0.99 for the fundamental matrix (not stated), refitted to its inliers",
         "with fewer than 20 matches outside the boxes all kept ones count; its boxes are those of the masks",
         "which classes are movable (not stated)",

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, grown_in_words, links_in_words, masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_dilation,
+    describe_links,
+    describe_masks,
+)
 
 
 class CfpSlamSettings(SemanticSystemSettings):
@@ -23,12 +23,7 @@ class CfpSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: CfpSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B10, B8 as a weight of the optimiser."""
-    from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
-
-    return compose(settings, context, [ProbabilityFilter(settings.probability, settings.segmentation)], settings.flow)
-
+build = composed(("moving_probability:ProbabilityFilter", "probability", "segmentation"))
 
 SPEC = TrackerSpec(
     id="cfp-slam",
@@ -42,11 +37,11 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Hu et al., CFP-SLAM, IROS 2022",
     assumptions=(
-        masks_in_words(CfpSlamSettings().segmentation),
-        links_in_words(CfpSlamSettings().flow),
+        describe_masks(CfpSlamSettings().segmentation),
+        describe_links(CfpSlamSettings().flow),
         "constant-velocity boxes instead of its Kalman filter",
         "depth repair instead of DBSCAN in the box",
-        grown_in_words(CfpSlamSettings().segmentation),
+        describe_dilation(CfpSlamSettings().segmentation),
         "a Bayes filter of 0.9 on the masks as static probability, a feature's and not a map point's",
         "greedy association of boxes instead of the Hungarian one",
     ),

@@ -5,17 +5,18 @@ Theirs is monocular: `chen-slam-mono`. `chen-slam` is the same with depth, to st
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-
-from .composition import SemanticSystemSettings, compose
-from .monocular import BACKEND, MonocularSemanticSettings
-from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import BoxEpipolarSettings
+from dynslam_bench.trackers.systems.composition import (
+    BACKEND,
+    MonocularSemanticSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_dilation,
+    describe_masks,
+    describe_matches,
+)
 
 
 class ChenSlamSettings(SemanticSystemSettings):
@@ -32,16 +33,9 @@ class ChenSlamMonoSettings(MonocularSemanticSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: ChenSlamSettings | ChenSlamMonoSettings, context: TrackerContext) -> SlamPipeline:
-    """B1, then B3 on the rest."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
-
-    filters = [
-        SemanticFilter(settings.segmentation),
-        BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
-    ]
-    return compose(settings, context, filters, settings.flow)
+build = composed(
+    ("semantic:SemanticFilter", "segmentation"), ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
+)
 
 
 def _spec(name: str, summary: str, settings: type[ChenSlamSettings | ChenSlamMonoSettings], sensor: str) -> TrackerSpec:
@@ -59,9 +53,9 @@ def _spec(name: str, summary: str, settings: type[ChenSlamSettings | ChenSlamMon
         license="MIT (re-implemented from the description)",
         citation="Chen et al., Micromachines 13(11) 2006, 2022",
         assumptions=(
-            masks_in_words(defaults.segmentation),
-            matches_in_words(defaults.flow, defaults.box_epipolar.unmatched),
-            grown_in_words(defaults.segmentation),
+            describe_masks(defaults.segmentation),
+            describe_matches(defaults.flow, defaults.box_epipolar.unmatched),
+            describe_dilation(defaults.segmentation),
             "epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
             sensor,
         ),

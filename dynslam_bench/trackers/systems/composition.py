@@ -1,49 +1,56 @@
-"""How a system is put together: one back end for all, a list of filters of its own."""
+"""How a system is composed: one back end for all, and filters of its own; settings and specs that systems share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.contracts.tracker import Tracker, TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
+from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.guard import GuardSettings
+from dynslam_bench.culling.settings import Unmatched
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.segmentation.classes import expand_classes
-from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings
+from dynslam_bench.flow.settings import FlowMethodSettings
+from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes
 from dynslam_bench.sequences.settings import PreprocessingSettings
-from dynslam_bench.slam.settings import BackendSettings
-
-SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
-"""Where masks can come from, as `segmentation.source` names it."""
+from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts.filter import DynamicFilter
-    from dynslam_bench.segmentation.masks.schedule import MaskScheduler
+    from dynslam_bench.segmentation.schedule import MaskScheduler
     from dynslam_bench.slam.pipeline import SlamPipeline
+
+SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
+"""Sources of masks, as `segmentation.source` names them."""
+_SECOND: dict[str, Any] = {"segmentation.schedule": "every_nth", "segmentation.n": 2}
+FAST_MASKS = {"fast": _SECOND | {"segmentation.crowded_share": 0.5}}
+"""Preset: the network runs on every second frame, and on every frame while masks cover half of the view.
+
+``docs/tuning.md`` compares the presets with the defaults on held-out scenes.
+"""
+FAST_FLOW = {"fast": _SECOND | {"flow.budget": 24}}
+"""Preset: the network runs on every second frame, and the flow searches for less than half as long."""
 
 
 class UnrepairedSettings(SegmentationSettings):
-    """Segmentation for systems with another use of depth: nothing repairs a mask there."""
+    """Segmentation for systems with another use of depth: masks are not repaired."""
 
     repair: Literal["none"] = Field("none", description="masks are not repaired")
-    repair_depth_m: float = Field(0.2, description="no effect: masks are not repaired")
-    repair_band_px: int = Field(8, description="no effect: masks are not repaired")
 
 
 class ObjectSettings(UnrepairedSettings):
-    """Segmentation for systems that look at objects or their boxes: nothing grows or repairs a mask there."""
+    """Segmentation for systems that judge objects or boxes: masks are neither repaired nor grown."""
 
-    dilation_px: Literal[0] = Field(0, description="masks are not grown: objects and boxes count as they were found")
+    dilation_px: Literal[0] = Field(0, description="masks are not grown")
 
 
 class SystemSettings(Settings):
-    """What every system on our back end has."""
+    """Settings of every system on this project's back end."""
 
     preprocessing: PreprocessingSettings = PreprocessingSettings()
     features: FeatureSettings = FeatureSettings()
@@ -51,37 +58,80 @@ class SystemSettings(Settings):
     guard: GuardSettings = GuardSettings()
 
     def verify(self) -> None:
-        """A map that is named is there."""
+        """Raise `SettingsError` where the named map does not exist."""
         self.backend.map.verify()
 
 
 class SemanticSystemSettings(SystemSettings):
-    """A system that uses masks or boxes; one whose own default is the source ``none`` does without."""
+    """A system that uses masks or boxes; they are optional where its default source is ``none``."""
 
     segmentation: SegmentationSettings = SegmentationSettings()
 
     def verify(self) -> None:
-        """A system that lives on masks does not quietly become another one without them."""
+        """Raise `SettingsError` where a system that needs masks has none: it would become another system."""
         super().verify()
         default: SegmentationSettings = type(self).model_fields["segmentation"].get_default(call_default_factory=True)
         if self.segmentation.source == "none" != default.source:
             raise SettingsError(
                 "this system needs masks, but segmentation.source is 'none'",
-                f"sources: {SOURCES}; without masks run dynaslam-g, emfoa-oft-no-masks, opf-slam or orb-slam2",
+                f"sources: {SOURCES}; without masks run dynaslam-g, 'emfoa-oft?masks=none', opf-slam or orb-slam2",
             )
 
 
+class MonocularSystemSettings(SystemSettings):
+    """A system that uses no depth."""
+
+    backend: MonocularBackendSettings = MonocularBackendSettings()
+
+
+class MonocularSemanticSettings(MonocularSystemSettings, SemanticSystemSettings):
+    """A system that uses masks and no depth; repair needs depth."""
+
+    segmentation: UnrepairedSettings = UnrepairedSettings()
+
+
+class PublishedFlowSettings(FlowMethodSettings):
+    """Lucas-Kanade as published systems use it: none of their sources names a forward-backward check."""
+
+    method: Literal["daisy", "lucas-kanade", "dis"] = Field(
+        "lucas-kanade", description="which flow; the published one is Lucas-Kanade"
+    )
+    forward_backward_px: float = Field(
+        0.0, ge=0.0, le=100.0, description="largest forward-backward error in pixels; 0, no check, as published"
+    )
+
+
 def movable_classes(filters: Sequence[DynamicFilter]) -> frozenset[str]:
-    """The classes that filters watch though they are not held for dynamic by themselves: their setting ``movable``."""
-    named = (getattr(getattr(each, "settings", None), "movable", "") for each in filters)
+    """The classes that filters watch although they are not dynamic by themselves: their setting ``movable``."""
+    named = (getattr(getattr(block, "settings", None), "movable", "") for block in filters)
     return frozenset().union(*(expand_classes(names) for names in named if names))
+
+
+def composed(*filters: tuple[str, ...]) -> Callable[[Any, TrackerContext], Tracker]:
+    """A tracker factory: the filters of a system on the shared back end.
+
+    The filters are loaded when a tracker is built, so that the module of a system imports neither torch nor OpenCV.
+
+    Args:
+        filters: In the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups of the
+            system's settings that the class takes.
+    """
+
+    def build(settings: SystemSettings, context: TrackerContext) -> Tracker:
+        blocks = [
+            load_object(f"dynslam_bench.culling.{name}")(*(getattr(settings, group) for group in groups))
+            for name, *groups in filters
+        ]
+        return compose(settings, context, blocks, getattr(settings, "flow", None))
+
+    return build
 
 
 def compose(
     settings: SystemSettings,
     context: TrackerContext,
     filters: Sequence[DynamicFilter] = (),
-    flow: FlowSettings | None = None,
+    flow: FlowMethodSettings | None = None,
 ) -> SlamPipeline:
     """The pipeline of a system.
 
@@ -96,32 +146,31 @@ def compose(
         SettingsError: The settings hold an online setting that has an effect and that no part takes.
     """
     from dynslam_bench.core.stage_cache import StageCache
-    from dynslam_bench.features.build_extractor import build_extractor
     from dynslam_bench.features.cached import cached_extractor
-    from dynslam_bench.flow.build_flow import build_flow
+    from dynslam_bench.features.registry import build_extractor
+    from dynslam_bench.flow.registry import build_flow
     from dynslam_bench.segmentation.cached import cache_segmenter
-    from dynslam_bench.slam.build_backend import build_backend
+    from dynslam_bench.slam.backend import build_backend
     from dynslam_bench.slam.pipeline import SlamPipeline
-    from dynslam_bench.slam.stage_clock import CachedStage
+    from dynslam_bench.slam.stages import CachedStage
 
     cache = None if context.cache is None else StageCache(Path(context.cache))
     cached: dict[str, CachedStage] = {}
-    extractor = build_extractor(settings.features)
-    if cache is not None:
-        extractor = cached["features"] = cached_extractor(extractor, settings.features, cache, context.threads)
-    masks = _mask_stage(settings, context, filters, deferred=cache is not None)
-    if masks is not None and cache is not None:
-        segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
-        if segmenter is not None:
-            cached["segmentation"] = segmenter
     features = settings.features
-    backend = build_backend(settings.backend, features.scale_factor, features.levels, features.extractor)
+    extractor = build_extractor(features)
+    masks = _mask_stage(settings, context, filters, deferred=cache is not None)
+    if cache is not None:
+        extractor = cached["features"] = cached_extractor(extractor, features, cache, context.threads)
+        if masks is not None:
+            segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
+            if segmenter is not None:
+                cached["segmentation"] = segmenter
     return SlamPipeline(
         extractor=extractor,
         masks=masks,
         filters=filters,
         flow=None if flow is None else build_flow(flow, device=context.device, threads=context.threads),
-        backend=backend,
+        backend=build_backend(settings.backend, features.scale_factor, features.levels, features.extractor),
         settings=settings,
         cached=cached,
     )
@@ -130,12 +179,17 @@ def compose(
 def _mask_stage(
     settings: SystemSettings, context: TrackerContext, filters: Sequence[DynamicFilter], *, deferred: bool
 ) -> MaskScheduler | None:
-    """Where the system's masks come from; None without a source, unless a filter needs one."""
-    from dynslam_bench.segmentation.masks.schedule import build_mask_stage
+    """The segmentation stage; None without a source.
 
-    masks = None
+    Raises:
+        SegmentationError: A filter needs masks, and there is no source of them.
+    """
+    from dynslam_bench.segmentation.build_segmenter import build_segmenter
+    from dynslam_bench.segmentation.schedule import MaskScheduler
+
+    segmenter = None
     if isinstance(settings, SemanticSystemSettings):
-        masks = build_mask_stage(
+        segmenter = build_segmenter(
             settings.segmentation,
             sequence_id=context.sequence_id,
             masks=context.masks,
@@ -144,14 +198,66 @@ def _mask_stage(
             deferred=deferred,
             also=movable_classes(filters),
         )
-    needing = [each.name for each in filters if {"masks", "boxes"} & each.needs]
+        if segmenter is not None:
+            return MaskScheduler(settings.segmentation, segmenter)
+    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
     if needing and not isinstance(settings, SemanticSystemSettings):
         raise SegmentationError(
             f"filter '{needing[0]}' needs masks, but {type(settings).__name__} has no group segmentation",
             "derive the system's settings from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)",
         )
-    if masks is None and needing:
+    if needing:
         raise SegmentationError(
             f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'", f"sources: {SOURCES}"
         )
-    return masks
+    return None
+
+
+# Sentences of the specs are made from the settings, so that a spec states the numbers in force.
+
+BACKEND = (
+    "monocular back end: the unit of length is the median depth of the first map; "
+    "no loop closing unless asked for (backend.loop_closing.enabled)"
+)
+"""Assumption of every monocular system."""
+CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convolutions are zero (plain Mask R-CNN)"
+"""Where the paper's improved mask branch acts."""
+UNMATCHED: dict[Unmatched, str] = {
+    "keep": "a feature that the flow loses is not judged and stays (not stated)",
+    "drop": "a feature that the flow loses is dropped",
+    "judge": "a feature that the flow loses is judged by the place where it was lost",
+}
+"""Treatment of features without a match, by the setting `unmatched`."""
+
+
+def describe_masks(segmentation: SegmentationSettings, *, boxes: bool = False) -> str:
+    """Source of a system's masks or boxes, and what the shared stage adds to them."""
+    what = "boxes are those of the instance masks, which" if boxes else "masks"
+    frames = segmentation.compensate
+    bridged = f"bridged for {frames} segmented frames" if frames else "not bridged"
+    return (
+        f"{what} come from the stage that all systems share: scores of at least {segmentation.confidence:g}, "
+        f"missed detections {bridged}"
+    )
+
+
+def describe_dilation(segmentation: SegmentationSettings) -> str:
+    """How far a system's masks are grown, where its source is silent."""
+    return f"masks grown by {segmentation.dilation_px} px (not stated)"
+
+
+def describe_tracks(flow: FlowMethodSettings) -> str:
+    """How a system's flow is computed."""
+    limit = flow.forward_backward_px
+    check = f"a check of {limit:g} px on the way back" if limit else "no check on the way back"
+    return f"Lucas-Kanade tracks (window {flow.window_px} px, begun at the motion model's guess, {check})"
+
+
+def describe_matches(flow: FlowMethodSettings, unmatched: Unmatched) -> str:
+    """How a system that tests matches computes them, and how it treats features without one."""
+    return f"matches are {describe_tracks(flow)}; {UNMATCHED[unmatched]}"
+
+
+def describe_links(flow: FlowMethodSettings) -> str:
+    """How a system with a memory of features follows them, and how it treats new ones."""
+    return f"features are followed by {describe_tracks(flow)}, not by descriptors; one without a past begins at 0.5"

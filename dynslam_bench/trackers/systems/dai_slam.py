@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.correlation_graph_settings import CorrelationSettings
-from dynslam_bench.flow.settings import FlowSettings
-
-from .composition import SystemSettings, compose
-from .published import tracks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import CorrelationSettings
+from dynslam_bench.flow.settings import FlowMethodSettings
+from dynslam_bench.trackers.systems.composition import SystemSettings, composed, describe_tracks
 
 
 class DaiSlamSettings(SystemSettings):
     """The correlation graph on Lucas-Kanade tracks."""
 
     correlation: CorrelationSettings = CorrelationSettings()
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: FlowMethodSettings = FlowMethodSettings(method="lucas-kanade")
 
 
-def build(settings: DaiSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B7 in the front end."""
-    from dynslam_bench.culling.blocks.correlation_graph import CorrelationFilter
-
-    return compose(settings, context, [CorrelationFilter(settings.correlation)], settings.flow)
-
+build = composed(("correlation_graph:CorrelationFilter", "correlation"))
 
 SPEC = TrackerSpec(
     id="dai-slam",
@@ -43,7 +31,7 @@ SPEC = TrackerSpec(
     assumptions=(
         "the graph is over tracked features and their last frames; the paper's is over map points and their keyframes, "
         "with a second one over a window of keyframes",
-        f"features are followed by {tracks_in_words(DaiSlamSettings().flow)}; one that it loses is not judged",
+        f"features are followed by {describe_tracks(DaiSlamSettings().flow)}; one that it loses is not judged",
         "each edge is tested against the oldest common observation of at most 8 frames ago; no Huber step",
         "components are those of points observed for 4 frames or more; younger points follow the settled ones around "
         "them; what has neither flow nor depth is never judged",

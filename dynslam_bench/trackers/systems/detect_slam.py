@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, links_in_words, masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
+from dynslam_bench.culling.settings import ProbabilitySettings
+from dynslam_bench.trackers.systems.composition import (
+    ObjectSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    compose,
+    describe_links,
+    describe_masks,
+)
 
 
 class DetectSlamSettings(SemanticSystemSettings):
@@ -22,9 +22,9 @@ class DetectSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: DetectSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B2 on keyframes feeds B8."""
-    from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
+def build(settings: DetectSlamSettings, context: TrackerContext) -> Tracker:
+    """Boxes on keyframes feed the moving probability."""
+    from dynslam_bench.culling.moving_probability import ProbabilityFilter
 
     block = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")
     return compose(settings, context, [block], settings.flow)
@@ -41,8 +41,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhong et al., Detect-SLAM, WACV 2018",
     assumptions=(
-        masks_in_words(DetectSlamSettings().segmentation, boxes=True),
-        links_in_words(DetectSlamSettings().flow),
+        describe_masks(DetectSlamSettings().segmentation, boxes=True),
+        describe_links(DetectSlamSettings().flow),
         "rate 0.3 and threshold 0.75 (no readable source)",
         "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection at "
         "least on every tenth frame",

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.residual_clusters_settings import ResidualSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import ResidualSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks
 
 
 class DgsSlamSettings(SemanticSystemSettings):
@@ -21,12 +14,7 @@ class DgsSlamSettings(SemanticSystemSettings):
     residual: ResidualSettings = ResidualSettings()
 
 
-def build(settings: DgsSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B14."""
-    from dynslam_bench.culling.blocks.residual_clusters import ResidualFilter
-
-    return compose(settings, context, [ResidualFilter(settings.residual, settings.segmentation)])
-
+build = composed(("residual_clusters:ResidualFilter", "residual", "segmentation"))
 
 SPEC = TrackerSpec(
     id="dgs-slam",
@@ -40,7 +28,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yan et al., DGS-SLAM, Remote Sensing 14(3) 795, 2022",
     assumptions=(
-        masks_in_words(DgsSlamSettings().segmentation),
+        describe_masks(DgsSlamSettings().segmentation),
         "the warp: every eighth pixel of the frame goes to the nearest one of the previous image by the motion model's "
         "prediction, before the frame's own pose is known",
         "24 clusters that move with a prior of 0.9 (people) or 0.05, four times the residual where they do",

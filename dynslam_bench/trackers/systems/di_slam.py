@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
+from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.guard import GuardSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.culling.settings import BoxEpipolarSettings, MultiViewSettings
+from dynslam_bench.trackers.systems.composition import (
+    ObjectSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_masks,
+    describe_matches,
+)
 
 
 class DiSlamSettings(SemanticSystemSettings):
@@ -26,17 +25,9 @@ class DiSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: DiSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B3 stricter inside boxes, then B4."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
-
-    filters = [
-        BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
-        MultiViewFilter(settings.multiview),
-    ]
-    return compose(settings, context, filters, settings.flow)
-
+build = composed(
+    ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"), ("multiview_depth:MultiViewFilter", "multiview")
+)
 
 SPEC = TrackerSpec(
     id="di-slam",
@@ -50,8 +41,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Wei et al., DI-SLAM, Applied Sciences 15(8) 4446, 2025",
     assumptions=(
-        masks_in_words(DiSlamSettings().segmentation, boxes=True),
-        matches_in_words(DiSlamSettings().flow, DiSlamSettings().box_epipolar.unmatched),
+        describe_masks(DiSlamSettings().segmentation, boxes=True),
+        describe_matches(DiSlamSettings().flow, DiSlamSettings().box_epipolar.unmatched),
         "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature that the flow loses "
         "by the place where it was lost (`unmatched = judge`), and takes distances in the previous image",
         "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept ones",

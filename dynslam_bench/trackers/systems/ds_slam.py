@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.moving_vote_settings import MovingVoteSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import MovingVoteSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks
 
 
 class DsSlamSettings(SemanticSystemSettings):
@@ -21,12 +14,7 @@ class DsSlamSettings(SemanticSystemSettings):
     moving_vote: MovingVoteSettings = MovingVoteSettings()
 
 
-def build(settings: DsSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B3 on corners of its own, B11 as one global vote, B1 on people."""
-    from dynslam_bench.culling.blocks.moving_vote import MovingVoteFilter
-
-    return compose(settings, context, [MovingVoteFilter(settings.moving_vote, settings.segmentation)])
-
+build = composed(("moving_vote:MovingVoteFilter", "moving_vote", "segmentation"))
 
 SPEC = TrackerSpec(
     id="ds-slam",
@@ -40,7 +28,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description; the authors' code derives from ORB-SLAM2, GPL-3.0)",
     citation="Yu et al., DS-SLAM, IROS 2018",
     assumptions=(
-        masks_in_words(DsSlamSettings().segmentation),
+        describe_masks(DsSlamSettings().segmentation),
         "corners are undistorted before F is fitted (the code fits raw pixels)",
     ),
     remarks="has no degeneracy guard: the published system fails on walking_rpy (0.44 m)",

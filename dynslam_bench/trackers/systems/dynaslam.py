@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.multiview_depth_settings import MultiViewSettings
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .composition import SemanticSystemSettings, SystemSettings, compose
-from .published import CFPN, masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.contracts.filter import DynamicFilter
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.trackers.systems.composition import (
+    CFPN,
+    SemanticSystemSettings,
+    SystemSettings,
+    composed,
+    describe_masks,
+)
 
 
 class DynaSlamMasksSettings(SemanticSystemSettings):
@@ -40,28 +40,11 @@ class DynaSlamGeometrySettings(SystemSettings):
     multiview: MultiViewSettings = MultiViewSettings()
 
 
-def build(settings: DynaSlamSettings | DynaSlamGeometrySettings, context: TrackerContext) -> SlamPipeline:
-    """N+G: B1, then B4 and B5; without a semantic stage G alone.
-
-    The code takes the union of both masks. The paper keeps the geometric mask where both find an object; the union
-    stands for both here.
-    """
-    from dynslam_bench.culling.blocks.multiview_depth import MultiViewFilter
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
-
-    filters: list[DynamicFilter] = [MultiViewFilter(settings.multiview)]
-    if isinstance(settings, SemanticSystemSettings):
-        filters.insert(0, SemanticFilter(settings.segmentation))
-    return compose(settings, context, filters)
-
-
-def build_masks_only(settings: DynaSlamMasksSettings, context: TrackerContext) -> SlamPipeline:
-    """N: B1 alone."""
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
-
-    return compose(settings, context, [SemanticFilter(settings.segmentation)])
-
-
+MASKS = ("semantic:SemanticFilter", "segmentation")
+MULTIVIEW = ("multiview_depth:MultiViewFilter", "multiview")
+build = composed(MASKS, MULTIVIEW)
+build_masks_only = composed(MASKS)
+build_geometry_only = composed(MULTIVIEW)
 GEOMETRY = (
     "a seed needs a neighbourhood of nearly one depth (variance below 0.001 m^2, missing depth as 0), as in the code",
     "the next pixel of a region is the one nearest to its mean to 5 mm",
@@ -77,14 +60,14 @@ UNION = "the masks of N and G are united, as in the code (the paper keeps G's wh
 
 
 def _assumptions(settings: SystemSettings, *, as_in_code: bool) -> tuple[str, ...]:
-    said: list[str] = []
+    sentences: list[str] = []
     if isinstance(settings, SemanticSystemSettings):
-        said += [masks_in_words(settings.segmentation), CFPN, PEOPLE, GROWN, BORDER]
+        sentences += [describe_masks(settings.segmentation), CFPN, PEOPLE, GROWN, BORDER]
     if isinstance(settings, DynaSlamSettings | DynaSlamGeometrySettings):
-        said += GEOMETRY if as_in_code else [*GEOMETRY, START, NO_BORDER]
+        sentences += GEOMETRY if as_in_code else [*GEOMETRY, START, NO_BORDER]
     if isinstance(settings, DynaSlamSettings):
-        said.append(UNION)
-    return tuple(said)
+        sentences.append(UNION)
+    return tuple(sentences)
 
 
 def _spec(
@@ -121,5 +104,5 @@ SPECS = [
     _spec("", "N+G", DynaSlamSettings, "build", "faithful-paper", BOTH),
     _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", "faithful-code", BOTH),
     _spec("-n", "N", DynaSlamMasksSettings, "build_masks_only", "faithful-code", ("DynaSLAM N",)),
-    _spec("-g", "G", DynaSlamGeometrySettings, "build", "inspired", ("DynaSLAM G",), G_FALLS_SHORT),
+    _spec("-g", "G", DynaSlamGeometrySettings, "build_geometry_only", "inspired", ("DynaSLAM G",), G_FALLS_SHORT),
 ]

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.template_matching_settings import TemplateSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import TemplateSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks
 
 
 class DynaTmSlamSettings(SemanticSystemSettings):
@@ -21,12 +14,7 @@ class DynaTmSlamSettings(SemanticSystemSettings):
     template: TemplateSettings = TemplateSettings()
 
 
-def build(settings: DynaTmSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B2 with B13."""
-    from dynslam_bench.culling.blocks.template_matching import TemplateFilter
-
-    return compose(settings, context, [TemplateFilter(settings.template, settings.segmentation)])
-
+build = composed(("template_matching:TemplateFilter", "template", "segmentation"))
 
 SPEC = TrackerSpec(
     id="dynatm-slam",
@@ -40,7 +28,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhong et al., DynaTM-SLAM, Robotics and Autonomous Systems 174, 2024",
     assumptions=(
-        masks_in_words(DynaTmSlamSettings().segmentation, boxes=True),
+        describe_masks(DynaTmSlamSettings().segmentation, boxes=True),
         "patch, window and correlation threshold; the patch is shifted, not warped",
         "a feature in a box without depth or history goes with the box",
         "no object constraints in bundle adjustment",

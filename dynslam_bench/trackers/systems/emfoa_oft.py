@@ -1,45 +1,50 @@
-"""EMFOA-OFT-SLAM as the paper describes it, our own system made from it, and the ablations of both.
+"""EMFOA-OFT-SLAM as the paper describes it, this project's system made from it, and the ablations of both.
+
+An ablation is a variant: its id names the system and what differs, as in ``emfoa-oft?masks=none``.
 
 The paper: masks of an improved Mask R-CNN drop the features on people; DAISY Filter Flow, optimised by the elite
 moth-flame algorithm, matches the remaining ORB points with the previous image; the fundamental matrix of those matches
-culls what leaves its epipolar line; the rest is tracked and mapped. `docs/method.md` says who runs which equation.
+culls points off their epipolar lines; the rest is tracked and mapped. `docs/method.md` lists who runs which equation.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
-from dynslam_bench.culling.blocks.free_space_settings import FreeSpaceSettings
-from dynslam_bench.culling.blocks.rigid_motion_settings import RigidMotionSettings
-from dynslam_bench.flow.settings import FlowSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, SystemSettings, compose
-from .presets import FAST_FLOW
-from .published import CFPN, grown_in_words, masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.contracts.filter import DynamicFilter
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
+from dynslam_bench.core.plugins import load_object
+from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, RigidMotionSettings
+from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
+from dynslam_bench.trackers.systems.composition import (
+    BACKEND,
+    CFPN,
+    FAST_FLOW,
+    MonocularSemanticSettings,
+    ObjectSettings,
+    SemanticSystemSettings,
+    SystemSettings,
+    compose,
+    describe_dilation,
+    describe_masks,
+)
 
 
 class EpipolarTestSettings(SystemSettings):
-    """Flow at the points, and the epipolar test that asks before it culls."""
+    """Flow at the points, and the guarded epipolar test."""
 
     flow: FlowSettings = FlowSettings()
     epipolar: EpipolarSettings = EpipolarSettings()
 
 
 class DepthTestSettings(EpipolarTestSettings):
-    """The tests of depth besides."""
+    """The tests of depth as well."""
 
     motion: RigidMotionSettings = RigidMotionSettings()
     free_space: FreeSpaceSettings = FreeSpaceSettings()
 
 
 class EmfoaOftSettings(DepthTestSettings, SemanticSystemSettings):
-    """Settings of our own system."""
+    """Settings of this project's system."""
 
 
 class MaskedEpipolarTestSettings(EpipolarTestSettings, SemanticSystemSettings):
@@ -49,7 +54,7 @@ class MaskedEpipolarTestSettings(EpipolarTestSettings, SemanticSystemSettings):
 class LucasKanadeSettings(EmfoaOftSettings):
     """Lucas-Kanade flow."""
 
-    flow: FlowSettings = FlowSettings(method="lucas-kanade")
+    flow: FlowMethodSettings = FlowMethodSettings(method="lucas-kanade")  # type: ignore[assignment]
 
 
 class PatchMatchSettings(EmfoaOftSettings):
@@ -65,7 +70,7 @@ class LiteralSettings(EmfoaOftSettings):
 
 
 class ObjectVoteSettings(MaskedEpipolarTestSettings):
-    """Objects go by the epipolar vote of their points."""
+    """Objects are dynamic by the epipolar vote of their points."""
 
     segmentation: ObjectSettings = ObjectSettings()
     epipolar: EpipolarSettings = EpipolarSettings(mode="object")
@@ -79,9 +84,9 @@ class ObjectVoteDepthTestSettings(EmfoaOftSettings):
 
 
 class PaperTestSettings(EpipolarTestSettings):
-    """The paper's flow, dense and with all terms, and its test: F judges every frame, every failing point goes."""
+    """The paper's flow, dense and with all terms, and its test on every frame, without the guard."""
 
-    flow: FlowSettings = FlowSettings(mode="dense", terms=3)
+    flow: DenseFlowSettings = DenseFlowSettings(terms=3)  # type: ignore[assignment]
     epipolar: EpipolarSettings = EpipolarSettings(
         min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0, max_contradiction=1.0
     )
@@ -92,39 +97,38 @@ class PaperSettings(PaperTestSettings, SemanticSystemSettings):
 
 
 class PaperSparseSettings(PaperSettings):
-    """The paper's test on the flow of our own system."""
+    """The paper's test on the flow of this project's system."""
 
-    flow: FlowSettings = FlowSettings()
-
-
-def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
-    """Mask culling, flow and epipolar culling, depth consistency: those of them that the settings have a group for."""
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
-
-    filters: list[DynamicFilter] = []
-    if isinstance(settings, SemanticSystemSettings):
-        filters.append(SemanticFilter(settings.segmentation))
-    return _with_geometry(settings, context, filters)
+    flow: FlowSettings = FlowSettings()  # type: ignore[assignment]
 
 
-def build_object_mode(settings: MaskedEpipolarTestSettings, context: TrackerContext) -> SlamPipeline:
-    """Ablation: no mask culling; an object goes if the epipolar vote of its points says that it moves (step 3)."""
-    return _with_geometry(settings, context, [])
+class EmfoaOftMonoSettings(MonocularSemanticSettings, EpipolarTestSettings):
+    """This project's system without depth: the paper calls itself monocular in half of its text."""
 
 
-def _with_geometry(settings: SystemSettings, context: TrackerContext, filters: list[DynamicFilter]) -> SlamPipeline:
-    from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
-    from dynslam_bench.culling.blocks.free_space import FreeSpaceFilter
-    from dynslam_bench.culling.blocks.rigid_motion import RigidMotionFilter
+def build(settings: SystemSettings, context: TrackerContext) -> Tracker:
+    """Masks, epipolar test, rigid motion in depth, free space: those that the settings have a group for."""
+    return _build(settings, context, masks=isinstance(settings, SemanticSystemSettings))
 
-    if not isinstance(settings, EpipolarTestSettings):
-        return compose(settings, context, filters)
-    filters.append(EpipolarFilter(settings.epipolar))
-    if isinstance(settings, DepthTestSettings) and settings.motion.enabled:
-        filters.append(RigidMotionFilter(settings.motion))
-    if isinstance(settings, DepthTestSettings) and settings.free_space.enabled:
-        filters.append(FreeSpaceFilter(settings.free_space))
-    return compose(settings, context, filters, settings.flow)
+
+def build_vote(settings: SystemSettings, context: TrackerContext) -> Tracker:
+    """Ablation without mask culling: the epipolar vote of its points decides on an object (`EpipolarFilter`)."""
+    return _build(settings, context, masks=False)
+
+
+def _build(settings: SystemSettings, context: TrackerContext, *, masks: bool) -> Tracker:
+    blocks = (
+        ("semantic:SemanticFilter", "segmentation", masks),
+        ("epipolar:EpipolarFilter", "epipolar", True),
+        ("rigid_motion:RigidMotionFilter", "motion", True),
+        ("free_space:FreeSpaceFilter", "free_space", True),
+    )
+    filters = []
+    for name, group, wanted in blocks:
+        own = getattr(settings, group, None)
+        if wanted and own is not None and getattr(own, "enabled", True):
+            filters.append(load_object(f"dynslam_bench.culling.{name}")(own))
+    return compose(settings, context, filters, getattr(settings, "flow", None))
 
 
 WHOSE = (
@@ -134,8 +138,9 @@ WHOSE = (
 )
 SKIPPED = "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"
 SENSOR = "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)"
-NOT_STATED = ("epipolar threshold 1 px and RANSAC (not stated in the paper)", SENSOR)
+NOT_STATED = "epipolar threshold 1 px and RANSAC (not stated in the paper)"
 GUARDS = "a failing point goes only where its neighbours fail too, and an F that depth contradicts is not used (ours)"
+GUARD_WITHOUT_DEPTH = "a failing point goes only where its neighbours fail too (ours)"
 SPARSE = "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; no Eq. 2 and 3 (ours)"
 DENSE = (
     "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, 7 and 2 grey levels",
@@ -145,79 +150,86 @@ DENSE = (
 DEPTH = "rigid motion in depth and free space seen before are tested as well (ours, no part of the paper)"
 
 
-def _assumptions(name: str, settings: type[SystemSettings]) -> tuple[str, ...]:
-    said = [WHOSE] if name == "emfoa-oft" else []
-    defaults = settings()
-    if isinstance(defaults, SemanticSystemSettings):
-        said += [masks_in_words(defaults.segmentation), CFPN]
-        if defaults.segmentation.dilation_px:
-            said.append(grown_in_words(defaults.segmentation))
-    if not isinstance(defaults, EpipolarTestSettings):
-        return (*said, SENSOR)
-    said += NOT_STATED
-    if defaults.flow.method == "daisy":
-        said += DENSE if defaults.flow.mode == "dense" else [SPARSE]
-    if not issubclass(settings, PaperTestSettings):
-        said += [SKIPPED, GUARDS]
-    if issubclass(settings, DepthTestSettings):
-        said.append(DEPTH)
-    return tuple(said)
+def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
+    paper = isinstance(settings, PaperTestSettings)
+    sentences: list[str] = []
+    if isinstance(settings, SemanticSystemSettings):
+        sentences += [describe_masks(settings.segmentation), CFPN]
+        if settings.segmentation.dilation_px:
+            sentences.append(describe_dilation(settings.segmentation))
+    if not isinstance(settings, EpipolarTestSettings):
+        return (*sentences, SENSOR)
+    monocular = isinstance(settings, EmfoaOftMonoSettings)
+    sentences += [NOT_STATED] if monocular else [NOT_STATED, SENSOR]
+    if settings.flow.method == "daisy":
+        sentences += [SPARSE] if isinstance(settings.flow, FlowSettings) else DENSE
+    if not paper:
+        sentences += [SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
+    if isinstance(settings, DepthTestSettings):
+        sentences.append(DEPTH)
+    return (*sentences, BACKEND) if monocular else tuple(sentences)
 
 
-def _spec(name: str, summary: str, settings: type[SystemSettings], factory: str = "build") -> TrackerSpec:
-    labels = {
-        "emfoa-oft": "EMFOA-OFT with depth tests, our own (our back end)",
-        "emfoa-oft-paper": "EMFOA-OFT-SLAM (our back end)",
-    }
-    paper = name == "emfoa-oft-paper"
+def _spec(name: str, label: str, settings: type[SystemSettings], summary: str) -> TrackerSpec:
     return TrackerSpec(
         id=name,
-        entry_point=f"{__name__}:{factory}",
-        label=labels.get(name, f"{name} (ablation)"),
+        entry_point=f"{__name__}:build",
+        label=f"{label} (our back end)",
         settings=settings,
         summary=summary,
-        provenance="faithful-paper" if paper else "own",
-        ranked=name in labels,
-        presets=FAST_FLOW if name == "emfoa-oft" else {},
+        sensors="rgb" if issubclass(settings, MonocularSemanticSettings) else "rgbd",
+        provenance="own",
         license="MIT",
         citation="EMFOA-OFT-SLAM: the paper that this toolkit implements; see docs/method.md",
-        published_as=("EMFOA-OFT-SLAM",) if paper else (),
-        assumptions=_assumptions(name, settings),
+        assumptions=_assumptions(settings()),
     )
 
 
-SPECS = [
+EMFOA_OFT = replace(
     _spec(
         "emfoa-oft",
-        "our own system: masks, EMFOA-optimised sparse flow, guarded epipolar test, tests of depth",
+        "EMFOA-OFT with depth tests, our own",
         EmfoaOftSettings,
+        "our own system: masks, EMFOA-optimised sparse flow, guarded epipolar test, tests of depth",
     ),
+    presets=FAST_FLOW,
+    assumptions=(WHOSE, *_assumptions(EmfoaOftSettings())),
+)
+PAPER = replace(
     _spec(
         "emfoa-oft-paper",
-        "the paper's system: masks, EMFOA-optimised dense DAISY Filter Flow, epipolar culling",
+        "EMFOA-OFT-SLAM",
         PaperSettings,
+        "the paper's system: masks, EMFOA-optimised dense DAISY Filter Flow, epipolar culling",
     ),
-    _spec("emfoa-oft-paper-sparse", "ablation: the paper's test on the flow of our own system", PaperSparseSettings),
-    _spec("emfoa-oft-paper-no-masks", "ablation: the paper's flow and epipolar test alone", PaperTestSettings),
-    _spec(
-        "emfoa-oft-no-depth-test", "ablation: without the tests of depth, which are ours", MaskedEpipolarTestSettings
-    ),
-    _spec("emfoa-oft-no-masks", "ablation: geometry alone", DepthTestSettings),
-    _spec("emfoa-oft-no-masks-no-depth-test", "ablation: the guarded epipolar test alone", EpipolarTestSettings),
-    _spec("emfoa-oft-no-flow", "ablation: masks alone", SemanticSystemSettings),
-    _spec("emfoa-oft-lk", "ablation: Lucas-Kanade instead of DAISY Filter Flow", LucasKanadeSettings),
-    _spec("emfoa-oft-patchmatch", "ablation: PatchMatch instead of EMFOA", PatchMatchSettings),
-    _spec("emfoa-oft-literal", "ablation: the moth-flame equations as printed", LiteralSettings),
-    _spec(
-        "emfoa-oft-object",
-        "ablation: objects go by the vote of their points, not by class",
-        ObjectVoteSettings,
-        "build_object_mode",
-    ),
-    _spec(
-        "emfoa-oft-object-depth-test",
-        "ablation: the vote of an object's points, and the tests of depth",
-        ObjectVoteDepthTestSettings,
-        "build_object_mode",
-    ),
-]
+    provenance="faithful-paper",
+    published_as=("EMFOA-OFT-SLAM",),
+)
+MONOCULAR = _spec(
+    "emfoa-oft-mono",
+    "EMFOA-OFT, monocular",
+    EmfoaOftMonoSettings,
+    "our own system without depth: masks, EMFOA-optimised sparse flow, guarded epipolar test",
+)
+VARIANTS: dict[str, tuple[type[SystemSettings], str]] = {
+    "emfoa-oft?depth=none": (MaskedEpipolarTestSettings, "without the tests of depth, which are ours"),
+    "emfoa-oft?masks=none": (DepthTestSettings, "geometry alone"),
+    "emfoa-oft?masks=none&depth=none": (EpipolarTestSettings, "the guarded epipolar test alone"),
+    "emfoa-oft?masks=vote": (ObjectVoteDepthTestSettings, "the vote of an object's points, and the tests of depth"),
+    "emfoa-oft?masks=vote&depth=none": (ObjectVoteSettings, "objects go by the vote of their points, not by class"),
+    "emfoa-oft?flow=none": (SemanticSystemSettings, "masks alone"),
+    "emfoa-oft?flow=lucas-kanade": (LucasKanadeSettings, "Lucas-Kanade instead of DAISY Filter Flow"),
+    "emfoa-oft?search=patchmatch": (PatchMatchSettings, "PatchMatch instead of EMFOA"),
+    "emfoa-oft?search=emfoa-literal": (LiteralSettings, "the moth-flame equations as printed"),
+    "emfoa-oft-paper?flow=sparse": (PaperSparseSettings, "the paper's test on the flow of our own system"),
+    "emfoa-oft-paper?masks=none": (PaperTestSettings, "the paper's flow and epipolar test alone"),
+}
+"""Ablations: id, settings, and what differs."""
+
+
+def _variant(name: str, settings: type[SystemSettings], difference: str) -> TrackerSpec:
+    spec = replace(_spec(name, name, settings, f"ablation: {difference}"), label=f"{name} (ablation)", ranked=False)
+    return replace(spec, entry_point=f"{__name__}:build_vote") if "masks=vote" in name else spec
+
+
+SPECS = [EMFOA_OFT, PAPER, MONOCULAR, *(_variant(name, *variant) for name, variant in VARIANTS.items())]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.moving_probability_settings import ProbabilitySettings
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, grown_in_words, links_in_words, masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_dilation,
+    describe_links,
+    describe_masks,
+)
 
 
 class HuaiSlamSettings(SemanticSystemSettings):
@@ -25,12 +25,7 @@ class HuaiSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: HuaiSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B10, depth-split masks, B8."""
-    from dynslam_bench.culling.blocks.moving_probability import ProbabilityFilter
-
-    return compose(settings, context, [ProbabilityFilter(settings.probability, settings.segmentation)], settings.flow)
-
+build = composed(("moving_probability:ProbabilityFilter", "probability", "segmentation"))
 
 SPEC = TrackerSpec(
     id="huai-slam",
@@ -43,9 +38,9 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Huai et al., Sensors 25(6) 1696, 2025",
     assumptions=(
-        masks_in_words(HuaiSlamSettings().segmentation),
-        links_in_words(HuaiSlamSettings().flow),
-        grown_in_words(HuaiSlamSettings().segmentation),
+        describe_masks(HuaiSlamSettings().segmentation),
+        describe_links(HuaiSlamSettings().flow),
+        describe_dilation(HuaiSlamSettings().segmentation),
         "Bayes filter of 0.9; greedy association of constant-velocity boxes",
         "masks are fitted to depth at their border, within 0.33 m, and not cut by it as a whole",
     ),

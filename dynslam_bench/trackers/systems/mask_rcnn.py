@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.trackers.systems.composition import (
+    CFPN,
+    FAST_MASKS,
+    SemanticSystemSettings,
+    composed,
+    describe_masks,
+)
 
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-
-from .composition import SemanticSystemSettings, compose
-from .presets import FAST_MASKS
-from .published import CFPN, masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
-
-
-def build(settings: SemanticSystemSettings, context: TrackerContext) -> SlamPipeline:
-    """Semantic culling, then the shared back end."""
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
-
-    return compose(settings, context, [SemanticFilter(settings.segmentation)])
-
+build = composed(("semantic:SemanticFilter", "segmentation"))
 
 SPEC = TrackerSpec(
     id="mask-rcnn",
@@ -32,7 +24,7 @@ SPEC = TrackerSpec(
     license="MIT",
     citation="He et al., Mask R-CNN, ICCV 2017; Bescos et al., DynaSLAM, IEEE RA-L 2018 (variant N)",
     assumptions=(
-        masks_in_words(SemanticSystemSettings().segmentation),
+        describe_masks(SemanticSystemSettings().segmentation),
         CFPN,
         "masks of people alone; DynaSLAM, whose rule it is, culls nineteen classes (dynaslam-n)",
         "no further drop of features at the border of the grown mask",

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import BoxEpipolarSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_masks,
+    describe_matches,
+)
 
 
 class MorSlamSettings(SemanticSystemSettings):
@@ -23,17 +22,9 @@ class MorSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: MorSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B9, B1, B3."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-    from dynslam_bench.culling.blocks.semantic import SemanticFilter
-
-    filters = [
-        SemanticFilter(settings.segmentation),
-        BoxEpipolarFilter(settings.box_epipolar, settings.segmentation),
-    ]
-    return compose(settings, context, filters, settings.flow)
-
+build = composed(
+    ("semantic:SemanticFilter", "segmentation"), ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
+)
 
 SPEC = TrackerSpec(
     id="mor-slam",
@@ -46,8 +37,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yao et al., MOR-SLAM, Mathematics 11(19) 4037, 2023",
     assumptions=(
-        masks_in_words(MorSlamSettings().segmentation),
-        matches_in_words(MorSlamSettings().flow, MorSlamSettings().box_epipolar.unmatched),
+        describe_masks(MorSlamSettings().segmentation),
+        describe_matches(MorSlamSettings().flow, MorSlamSettings().box_epipolar.unmatched),
         "closing of 7 px, depth step 0.1 m, epipolar threshold 1 px; RANSAC 1 px, 0.99, refitted to its inliers",
         "depth decides within 8 px of a mask's border; holes inside are filled whatever their depth",
     ),

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_depth_settings import BoxDepthSettings
-from dynslam_bench.culling.blocks.reseeding_settings import ReseedingSettings
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import BoxDepthSettings, ReseedingSettings
 from dynslam_bench.features.settings import FeatureSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks
 
 
 class NgdSlamSettings(SemanticSystemSettings):
@@ -25,17 +17,9 @@ class NgdSlamSettings(SemanticSystemSettings):
     reseeding: ReseedingSettings = ReseedingSettings(budget=1000)
 
 
-def build(settings: NgdSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B2 cut out by depth; B10 between detections; B12 fills up what is left."""
-    from dynslam_bench.culling.blocks.box_depth import BoxDepthFilter
-    from dynslam_bench.culling.blocks.reseeding import ReseedingFilter
-
-    filters = [
-        BoxDepthFilter(settings.box_depth, settings.segmentation),
-        ReseedingFilter(settings.reseeding, settings.features),
-    ]
-    return compose(settings, context, filters)
-
+build = composed(
+    ("box_depth:BoxDepthFilter", "box_depth", "segmentation"), ("reseeding:ReseedingFilter", "reseeding", "features")
+)
 
 SPEC = TrackerSpec(
     id="ngd-slam",
@@ -49,7 +33,7 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Zhang et al., NGD-SLAM, arXiv 2405.07392",
     assumptions=(
-        masks_in_words(NgdSlamSettings().segmentation, boxes=True),
+        describe_masks(NgdSlamSettings().segmentation, boxes=True),
         "detection on every third frame stands in for its asynchronous detector",
         "masks are carried by our sparse flow, not by its clustering of corners",
         "its tracking of static corners with a PnP of its own between keyframes is left out",

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.epipolar_settings import EpipolarSettings
-
-from .composition import SystemSettings, compose
-from .published import PublishedFlowSettings
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import EpipolarSettings
+from dynslam_bench.trackers.systems.composition import PublishedFlowSettings, SystemSettings, composed
 
 
 class OpfSlamSettings(SystemSettings):
@@ -23,12 +16,7 @@ class OpfSlamSettings(SystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: OpfSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B3 alone, without semantics and without a degeneracy guard."""
-    from dynslam_bench.culling.blocks.epipolar import EpipolarFilter
-
-    return compose(settings, context, [EpipolarFilter(settings.epipolar)], settings.flow)
-
+build = composed(("epipolar:EpipolarFilter", "epipolar"))
 
 SPEC = TrackerSpec(
     id="opf-slam",

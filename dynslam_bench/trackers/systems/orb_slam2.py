@@ -1,4 +1,4 @@
-"""The shared back end alone, in the manner of ORB-SLAM2 (Mur-Artal and Tardos 2017), RGB-D.
+"""The shared back end alone, in the manner of ORB-SLAM2 (Mur-Artal and Tardos 2017), with depth and without.
 
 No dynamic handling beyond the robust kernel and the chi-square tests of the pose optimiser.
 """
@@ -6,14 +6,10 @@ No dynamic handling beyond the robust kernel and the chi-square tests of the pos
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-
-from .composition import SystemSettings, compose
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.trackers.systems.composition import BACKEND, MonocularSystemSettings, SystemSettings, composed
 
 
 class UnfilteredSettings(SystemSettings):
@@ -21,14 +17,22 @@ class UnfilteredSettings(SystemSettings):
 
     @property
     def unused(self) -> Mapping[str, str]:
-        """Where nothing is culled there is nothing to guard."""
+        """The guard of the filters."""
         return {"guard": "the system has no filter"}
 
 
-def build(settings: SystemSettings, context: TrackerContext) -> SlamPipeline:
-    """The shared back end with no filter at all."""
-    return compose(settings, context)
+class UnfilteredMonocularSettings(MonocularSystemSettings, UnfilteredSettings):
+    """Settings of a system without depth and without any filter."""
 
+
+build = composed()
+SHARED = (
+    "features spread by the cells of a grid, not by a quadtree",
+    "relocalisation and matching without a bag of words",
+    "mapping in step with tracking, in one thread",
+    "the rolling shutter of a camera whose readout is known is undone, which ORB-SLAM2 does not do",
+)
+"""Deviations with depth and without."""
 
 SPEC = TrackerSpec(
     id="orb-slam2",
@@ -42,10 +46,22 @@ SPEC = TrackerSpec(
     citation="Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017",
     assumptions=(
         "no loop closing unless asked for (backend.loop_closing.enabled), and no global bundle adjustment",
-        "features spread by the cells of a grid, not by a quadtree",
-        "relocalisation and matching without a bag of words",
-        "mapping in step with tracking, in one thread",
-        "the rolling shutter of a camera whose readout is known is undone, which ORB-SLAM2 does not do",
+        *SHARED,
     ),
     remarks="the identity filter on our own back end, not the ORB-SLAM2 program",
 )
+
+MONOCULAR_SPEC = replace(
+    SPEC,
+    id="orb-slam2-mono",
+    label="ORB-SLAM2 style, monocular (our back end)",
+    settings=UnfilteredMonocularSettings,
+    summary="the shared back end without depth and without dynamic handling",
+    sensors="rgb",
+    published_as=(),
+    citation=(
+        "Mur-Artal, Montiel and Tardos, ORB-SLAM, IEEE T-RO 2015; Mur-Artal and Tardos, ORB-SLAM2, IEEE T-RO 2017"
+    ),
+    assumptions=(BACKEND, *SHARED),
+)
+SPECS = [SPEC, MONOCULAR_SPEC]

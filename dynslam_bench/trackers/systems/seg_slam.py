@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import ClassRuleSettings
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_dilation,
+    describe_masks,
+    describe_matches,
+)
 
 
 class SegSlamSettings(SemanticSystemSettings):
@@ -21,12 +21,7 @@ class SegSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: SegSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B1 and B15."""
-    from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
-
-    return compose(settings, context, [ClassRuleFilter(settings.class_rule, settings.segmentation)], settings.flow)
-
+build = composed(("class_rule:ClassRuleFilter", "class_rule", "segmentation"))
 
 SPEC = TrackerSpec(
     id="seg-slam",
@@ -39,9 +34,9 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Cong et al., SEG-SLAM, Sensors 24(7) 2102, 2024",
     assumptions=(
-        masks_in_words(SegSlamSettings().segmentation),
-        matches_in_words(SegSlamSettings().flow, SegSlamSettings().class_rule.unmatched),
-        grown_in_words(SegSlamSettings().segmentation),
+        describe_masks(SegSlamSettings().segmentation),
+        describe_matches(SegSlamSettings().flow, SegSlamSettings().class_rule.unmatched),
+        describe_dilation(SegSlamSettings().segmentation),
         "0.3 m, 1 px (RANSAC 1 px, 0.99, refitted to its inliers), 30 % of an object's points",
     ),
 )

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.box_epipolar_settings import BoxEpipolarSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, masks_in_words, matches_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import BoxEpipolarSettings
+from dynslam_bench.trackers.systems.composition import (
+    ObjectSettings,
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_masks,
+    describe_matches,
+)
 
 
 class SgcSlamSettings(SemanticSystemSettings):
@@ -22,12 +22,7 @@ class SgcSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: SgcSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B3 with F from outside the boxes."""
-    from dynslam_bench.culling.blocks.box_epipolar import BoxEpipolarFilter
-
-    return compose(settings, context, [BoxEpipolarFilter(settings.box_epipolar, settings.segmentation)], settings.flow)
-
+build = composed(("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"))
 
 SPEC = TrackerSpec(
     id="sgc-slam",
@@ -40,8 +35,8 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Yang et al., SGC-VSLAM, Sensors 2020",
     assumptions=(
-        masks_in_words(SgcSlamSettings().segmentation, boxes=True),
-        matches_in_words(SgcSlamSettings().flow, SgcSlamSettings().box_epipolar.unmatched),
+        describe_masks(SgcSlamSettings().segmentation, boxes=True),
+        describe_matches(SgcSlamSettings().flow, SgcSlamSettings().box_epipolar.unmatched),
         "RANSAC 1 px, 0.99, refitted to its inliers; distance 1 px",
         "with fewer than 20 matches outside the boxes F is fitted to all kept ones",
         "its improved quadtree of features is left out",

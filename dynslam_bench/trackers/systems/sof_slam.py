@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.class_rule_settings import ClassRuleSettings
-
-from .composition import SemanticSystemSettings, compose
-from .published import PublishedFlowSettings, grown_in_words, masks_in_words, matches_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import ClassRuleSettings
+from dynslam_bench.trackers.systems.composition import (
+    PublishedFlowSettings,
+    SemanticSystemSettings,
+    composed,
+    describe_dilation,
+    describe_masks,
+    describe_matches,
+)
 
 
 class SofSlamSettings(SemanticSystemSettings):
@@ -21,12 +21,7 @@ class SofSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-def build(settings: SofSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B1 on people, B3 on movable things with F from the rest."""
-    from dynslam_bench.culling.blocks.class_rule import ClassRuleFilter
-
-    return compose(settings, context, [ClassRuleFilter(settings.class_rule, settings.segmentation)], settings.flow)
-
+build = composed(("class_rule:ClassRuleFilter", "class_rule", "segmentation"))
 
 SPEC = TrackerSpec(
     id="sof-slam",
@@ -39,9 +34,9 @@ SPEC = TrackerSpec(
     license="MIT (re-implemented from the description)",
     citation="Cui and Ma, SOF-SLAM, IEEE Access 2019",
     assumptions=(
-        masks_in_words(SofSlamSettings().segmentation),
-        matches_in_words(SofSlamSettings().flow, SofSlamSettings().class_rule.unmatched),
-        grown_in_words(SofSlamSettings().segmentation),
+        describe_masks(SofSlamSettings().segmentation),
+        describe_matches(SofSlamSettings().flow, SofSlamSettings().class_rule.unmatched),
+        describe_dilation(SofSlamSettings().segmentation),
         "potentially dynamic are chairs and monitors (the class list is not public)",
         "RANSAC 1 px, 0.99, refitted to its inliers; distance 1 px",
     ),

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dynslam_bench.contracts.tracker import TrackerContext, TrackerSpec
-from dynslam_bench.culling.blocks.depth_ransac_settings import DepthRansacSettings
-
-from .composition import ObjectSettings, SemanticSystemSettings, compose
-from .published import masks_in_words
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.culling.settings import DepthRansacSettings
+from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks
 
 
 class YoloSlamSettings(SemanticSystemSettings):
@@ -21,12 +14,7 @@ class YoloSlamSettings(SemanticSystemSettings):
     depth_ransac: DepthRansacSettings = DepthRansacSettings()
 
 
-def build(settings: YoloSlamSettings, context: TrackerContext) -> SlamPipeline:
-    """B2 with B6: the largest set of like depth in a box is the person."""
-    from dynslam_bench.culling.blocks.depth_ransac import DepthRansacFilter
-
-    return compose(settings, context, [DepthRansacFilter(settings.depth_ransac, settings.segmentation)])
-
+build = composed(("depth_ransac:DepthRansacFilter", "depth_ransac", "segmentation"))
 
 SPEC = TrackerSpec(
     id="yolo-slam",
@@ -43,6 +31,6 @@ SPEC = TrackerSpec(
         "the set grows by the nearest depth first (order not stated); 0.43 is taken in square metres",
         "features of a box without depth go with the person",
         "RANSAC draws at most 50 pairs for a probability of 0.99; a box with fewer than three depths keeps all",
-        masks_in_words(YoloSlamSettings().segmentation, boxes=True),
+        describe_masks(YoloSlamSettings().segmentation, boxes=True),
     ),
 )

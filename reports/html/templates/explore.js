@@ -121,7 +121,7 @@ class Explore {
 
   base(sequence, metric) {
     const cell = this.data.reference === null ? null : this.cells.get(`${this.data.reference},${sequence.at}`);
-    return cell ? cell.medians[metric.at] : this.data.reference === null && metric.kind === "ate" ? this.data.still[sequence.at] : null;
+    return cell ? cell.medians[metric.at] : this.data.reference === null && metric.kind === "ate" ? this.data.static[sequence.at] : null;
   }
 
   cell(tracker, sequence, metric, ratio, best) {

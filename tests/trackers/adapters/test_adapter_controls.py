@@ -8,7 +8,7 @@ from dynslam_bench.core.errors import PluginError, SettingsError, TrajectoryErro
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.tum_file import write_tum
+from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.testing import CornerSequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, build_tracker
 from dynslam_bench.trackers.registry import resolve_settings
@@ -72,16 +72,6 @@ def test_constant_velocity_repeats_the_measured_motion():
         assert np.allclose(tracker.track(frame).T_world_cam, pose, atol=1e-6)
 
 
-def test_constant_velocity_again_after_reset():
-    sequence = CornerSequence(8)
-    tracker = build_tracker("constant-velocity")
-    runs = []
-    for _ in range(2):
-        reset(tracker, sequence.camera)
-        runs.append(np.stack([tracker.track(sequence[i]).T_world_cam for i in range(8)]))
-    assert np.array_equal(*runs)
-
-
 def test_replay_gives_the_files_poses(trajectory):
     path, stamps, poses = trajectory
     tracker = reset(build_tracker(f"replay:{path}"))
@@ -90,15 +80,6 @@ def test_replay_gives_the_files_poses(trajectory):
         assert result.state == "ok"
         assert np.allclose(result.T_world_cam, pose, atol=1e-8)
         assert result.stats["stamp_gap_s"] == pytest.approx(0.009, abs=2e-6)
-
-
-def test_replay_loses_frames_without_a_pose(trajectory):
-    path, stamps, _ = trajectory
-    tracker = reset(build_tracker(f"replay:{path}", {"tolerance_s": 0.005}))
-    for stamp in (stamps[0] - 10, stamps[3] + 0.0061, stamps[-1] + 0.0061):
-        result = tracker.track(blank(0, stamp))
-        assert result.state == "lost" and result.T_world_cam is None
-    assert tracker.track(blank(0, stamps[3] + 0.0049)).state == "ok"
 
 
 def test_replay_skips_a_hole(trajectory, tmp_path):
@@ -134,7 +115,7 @@ def test_names_with_a_colon_still_load_specs(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text(
         "from dynslam_bench.trackers import TrackerSpec\n"
-        "SPEC = TrackerSpec('mine', 'dynslam_bench.trackers.adapters.never_move:NeverMove', 'mine')\n"
+        "SPEC = TrackerSpec('mine', 'dynslam_bench.trackers.adapters.controls:NeverMove', 'mine')\n"
     )
     assert TRACKERS.get(f"{file}:SPEC").id == "mine"
     assert TRACKERS.get("dynslam_bench.trackers.adapters.specs:NEVER_MOVE").id == "never-move"
@@ -156,25 +137,3 @@ def test_replay_faults(tmp_path, trajectory):
         build_tracker(f"replay:{empty}")
     with pytest.raises(SettingsError, match="tolerance_s"):
         build_tracker(f"replay:{path}", {"tolerance_s": 0})
-
-
-def test_a_trackers_own_trajectory_replays_exactly(tmp_path):
-    """What one tracker gives, written and replayed, is the same trajectory."""
-    sequence = CornerSequence(6)
-    source = reset(build_tracker("constant-velocity"), sequence.camera)
-    poses = np.stack([source.track(sequence[i]).T_world_cam for i in range(6)])
-    path = tmp_path / "out.txt"
-    write_tum(path, Trajectory(sequence.timestamps, poses))
-    tracker = reset(build_tracker(f"replay:{path}"), sequence.camera)
-    again = np.stack([tracker.track(sequence[i]).T_world_cam for i in range(6)])
-    assert np.allclose(again, poses, atol=1e-8)
-
-
-def test_specs_are_light():
-    import subprocess
-    import sys
-
-    heavy = "{'cv2', 'torch', 'open3d', 'pyorbslam3'}"
-    code = f"import sys, dynslam_bench.trackers.adapters.specs; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"

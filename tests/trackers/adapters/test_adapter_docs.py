@@ -1,7 +1,6 @@
 """The examples of docs/plugins.md are run as they stand."""
 
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,10 @@ import pytest
 
 from dynslam_bench.core.errors import SegmentationError, SequenceError, SettingsError
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, load_object
-from dynslam_bench.flow.build_flow import build_flow
-from dynslam_bench.flow.registry import FLOWS
+from dynslam_bench.flow.registry import FLOWS, build_flow
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.segmentation.registry import SEGMENTERS
-from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.published.datasets import DATASETS
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
+from dynslam_bench.sequences.catalogue import DATASETS, open_sequence
 from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.systems.composition import SystemSettings, compose
@@ -61,11 +58,6 @@ def test_tracker(example):
     sequence = CornerSequence(4)
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     assert [tracker.track(sequence[i]).T_world_cam[2, 3] for i in range(4)] == pytest.approx([0, 0.02, 0.04, 0.06])
-
-
-def test_program(example):
-    path = example("still.py")
-    check_tracker(f"subprocess:{sys.executable} {path}", frames=3)
 
 
 def test_data_set(example, plugged, tmp_path):
@@ -133,17 +125,3 @@ def test_a_filter_that_needs_masks_without_the_group_is_told_how_to_get_it(examp
     carried = load_object(f"{path}:CarriedFilter")(load_object(f"{path}:CarriedSettings")())
     with pytest.raises(SegmentationError, match=r"'carried' needs masks.*SemanticSystemSettings"):
         compose(SystemSettings(), TrackerContext(), [carried])
-
-
-def test_the_shell_lines_name_verbs_that_exist():
-    from typer.main import get_command
-
-    from dynslam_bench.cli.app import app
-
-    root = get_command(app)
-    lines = re.findall(r"^dynslam-bench (\S+)(?: (\S+))?", PAGE.read_text(), re.MULTILINE)
-    assert len(lines) >= 6
-    for verb, second in lines:
-        command = root.commands[verb]
-        if hasattr(command, "commands"):
-            assert second in command.commands, (verb, second)

@@ -16,8 +16,8 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TRACKERS, build_tracker
-from dynslam_bench.trackers.adapters import opencv_odometry
-from dynslam_bench.trackers.adapters.frame_to_frame import FrameToFrame, undistortion_maps
+from dynslam_bench.trackers.adapters import odometry as opencv_odometry
+from dynslam_bench.trackers.adapters.odometry import FrameToFrame, undistortion_maps
 
 XYZ = Path(__file__).resolve().parents[4] / "shared" / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
 needs_data = pytest.mark.skipif(not XYZ.is_dir(), reason="no TUM excerpt beside the checkout")
@@ -67,14 +67,6 @@ def test_without_the_api_it_is_listed_and_says_what_to_install(monkeypatch):
         build_tracker("opencv-odometry")
 
 
-def test_open3d_is_listed_without_open3d(monkeypatch):
-    known = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "open3d" else known(name, *a))
-    assert TRACKERS.get("open3d-odometry").missing() == ["pip install '.[open3d]' in the checkout of dynslam-bench"]
-    with pytest.raises(TrackerError, match="dynslam-bench"):
-        build_tracker("open3d-odometry")
-
-
 class Scripted(FrameToFrame):
     """Frames carry their number in a pixel; a motion of 1 along x each, or none where the script says so."""
 
@@ -102,11 +94,6 @@ def run_scripted(failing, count, blind=()):
         depth = np.full((48, 64), 0.0 if index in blind else 1.0, np.float32)
         results.append(tracker.track(Frame(index, float(index), np.full((48, 64, 3), index, np.uint8), depth)))
     return tracker, results
-
-
-def test_chain_of_motions():
-    _, results = run_scripted((), 4)
-    assert [result.T_world_cam[0, 3] for result in results] == [0, 1, 2, 3]
 
 
 def test_a_lost_frame_is_bridged_from_the_last_good_one():

@@ -15,10 +15,9 @@ import pytest
 from dynslam_bench.core.errors import SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
-from dynslam_bench.trackers.adapters.orbslam3 import check_camera, settings_yaml
-from dynslam_bench.trackers.adapters.settings import OrbSlam3Settings
-from dynslam_bench.trackers.adapters.vocabulary import find_vocabulary
+from dynslam_bench.trackers import TrackerContext, build_tracker
+from dynslam_bench.trackers.adapters.orbslam3 import check_camera, find_vocabulary, settings_yaml
+from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 PACKED = SHARED / "weights" / "orb_vocabulary_small.txt.xz"
@@ -52,23 +51,6 @@ def toy_vocabulary(branching=3, levels=2):
                 lines.append(f"{parent} {int(leaf)} {words}  {0.5 if leaf else 0}")
         parents = children
     return "\n".join(lines) + "\n"
-
-
-def test_spec_says_what_it_is():
-    spec = TRACKERS.get("orbslam3")
-    assert "marks nothing as lost on dynamic scenes" in spec.remarks
-    assert not spec.deterministic and spec.provenance == "external" and "GPL-3.0" in spec.license
-    assert "Campos" in spec.citation
-
-
-def test_without_the_extra_it_is_listed_and_says_what_to_install(monkeypatch):
-    known = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "pyorbslam3" else known(name, *a))
-    assert "orbslam3" in [found.spec.id for found in TRACKERS.all()]
-    (hint,) = TRACKERS.get("orbslam3").missing()
-    assert hint.startswith("pip install '.[orbslam3]' in the checkout") and "Linux x86-64" in hint
-    with pytest.raises(TrackerError, match=r"not installed \(pip install '.\[orbslam3\]'"):
-        build_tracker("orbslam3", {"vocabulary": "x.txt"})
 
 
 def test_settings_file_holds_our_camera(tmp_path):

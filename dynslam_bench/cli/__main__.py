@@ -1,5 +1,0 @@
-"""``python -m dynslam_bench.cli``."""
-
-from . import main
-
-main()

@@ -1,0 +1,176 @@
+"""``eval``, ``protocols list|compare``, ``import`` and ``export``: trajectory files, scored and exchanged."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+import typer
+
+from dynslam_bench.cli.options import (
+    MEASURE,
+    TRAJECTORY_FORMATS,
+    AsJson,
+    Camera,
+    DataRoot,
+    Frames,
+    ProtocolId,
+    Results,
+    Stride,
+    Timestamps,
+    complete_formats,
+)
+from dynslam_bench.cli.output import SOME_RUNS_FAILED, present, warn, write, write_table
+from dynslam_bench.cli.runs import show_runs
+
+protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
+Estimate = Annotated[
+    Path,
+    typer.Argument(help="A trajectory: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps."),
+]
+GroundTruth = Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.")]
+
+
+def add(app: typer.Typer) -> None:
+    """Add the verbs."""
+    app.command("eval", rich_help_panel=MEASURE)(evaluate)
+    app.add_typer(protocols, name="protocols", rich_help_panel=MEASURE)
+    app.command("import", rich_help_panel=MEASURE)(import_)
+    app.command("export", rich_help_panel=MEASURE)(export)
+
+
+def evaluate(
+    estimate: Estimate,
+    ground_truth: GroundTruth,
+    protocol: ProtocolId = "tum-rgbd/v1",
+    timestamps: Timestamps = None,
+    as_json: AsJson = False,
+) -> None:
+    """Evaluate a trajectory file against a ground-truth file."""
+    from dynslam_bench.evaluation import get_protocol, hints
+    from dynslam_bench.evaluation.evaluate import evaluate_loaded
+    from dynslam_bench.evaluation.prepare import truth_of_file
+    from dynslam_bench.runs import read_trajectory
+
+    loaded, truth = (read_trajectory(path, timestamps) for path in (estimate, ground_truth))
+    result = evaluate_loaded(loaded, truth, protocol)
+    prepared = truth_of_file(truth.trajectory, get_protocol(protocol))
+    likely = hints(loaded.trajectory, prepared, protocol, notes=loaded.notes)
+
+    def show() -> None:
+        write(result.summary())
+        write(result.protocol)
+        write_table(("metric", "value"), list(result.metrics.items()))
+        for line in (*result.diagnostics, *(f"hint: {hint}" for hint in likely)):
+            write(line)
+
+    present(result.model_dump(mode="json") | {"hints": [asdict(hint) for hint in likely]}, show)
+
+
+@protocols.command("list")
+def list_(as_json: AsJson = False) -> None:
+    """List the protocols."""
+    from dynslam_bench.evaluation import PROTOCOLS
+
+    entries = [{"digest": protocol.digest(), **protocol.model_dump(mode="json")} for protocol in PROTOCOLS.values()]
+    rows = [(protocol.id, protocol.digest(), protocol.describe()) for protocol in PROTOCOLS.values()]
+    present(entries, lambda: write_table(("id", "digest", "meaning"), rows))
+
+
+@protocols.command()
+def compare(
+    estimate: Estimate, ground_truth: GroundTruth, timestamps: Timestamps = None, as_json: AsJson = False
+) -> None:
+    """Show how one trajectory scores under every protocol of the field."""
+    from dynslam_bench.evaluation import compare_protocols
+    from dynslam_bench.runs import read_trajectory
+
+    loaded = [read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth)]
+    scores = compare_protocols(loaded[0], loaded[1], of_file=True)
+    rows = [(score.metric, score.label, score.rmse_m, score.pairs, score.note) for score in scores]
+    columns = ("metric", "protocol", "rmse (m)", "pairs", "note")
+    present([asdict(score) for score in scores], lambda: write_table(columns, rows))
+
+
+def import_(
+    trajectory: Annotated[Path, typer.Argument(help=f"A trajectory: {TRAJECTORY_FORMATS}.")],
+    tracker: Annotated[str, typer.Option(help="Name of the system that made it.")],
+    sequence: Annotated[str, typer.Option(help="Id or folder of the sequence that it was made on.")],
+    label: Annotated[str, typer.Option(help="Name for tables.")] = "",
+    provenance: Annotated[
+        str, typer.Option(help="Where it comes from, e.g. a URL; an export's own provenance.json says it, too.")
+    ] = "",
+    online: Annotated[
+        bool, typer.Option("--online/--final", help="Causal poses, or those after optimisation.")
+    ] = False,
+    results: Results = Path("results"),
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    frames: Frames = None,
+    stride: Stride = 1,
+    protocol: ProtocolId = "tum-rgbd/v1",
+    timestamps: Timestamps = None,
+    topic: Annotated[Optional[str], typer.Option(help="Of a bag: the topic of the poses.")] = None,  # noqa: UP045
+    as_json: AsJson = False,
+) -> None:
+    """Put a trajectory from elsewhere beside our own runs."""
+    from dynslam_bench.runs import RunStore, import_trajectory
+
+    store = RunStore(results)
+    record = import_trajectory(
+        trajectory,
+        tracker,
+        sequence,
+        results=store,
+        label=label,
+        provenance=provenance,
+        which="online" if online else "final",
+        frames=frames,
+        stride=stride,
+        data_root=data_root,
+        camera=camera,
+        timestamps=timestamps,
+        topic=topic,
+    )
+    show_runs([record], store, protocol)
+    if record.status == "lost":
+        raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def export(
+    form: Annotated[
+        str,
+        typer.Argument(
+            metavar="FORMAT",
+            help="tum, kitti, euroc, vslam-lab, colmap, mcap or rrd (rerun).",
+            autocompletion=complete_formats,
+        ),
+    ],
+    run: Annotated[str, typer.Argument(help="The run's id, its first digits, or latest.")] = "latest",
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--output", "-o", help="Folder to write; default exports/RUN/FORMAT of the results folder."),
+    ] = None,
+    online: Annotated[
+        Optional[bool],  # noqa: UP045
+        typer.Option("--online/--final", help="Which trajectory; default the final one, else the online one."),
+    ] = None,
+    results: Results = Path("results"),
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a stored run in a format of other tools, with its provenance beside it."""
+    from dynslam_bench.runs import export_run
+
+    which: Literal["online", "final"] | None = None if online is None else ("online" if online else "final")
+    done = export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
+
+    def show() -> None:
+        for name in done.files:
+            write(str(done.folder / name))
+        for line in done.notes:
+            warn(line)
+
+    present({"folder": done.folder, "files": done.files, "which": done.which, "notes": done.notes}, show)

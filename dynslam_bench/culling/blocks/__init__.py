@@ -1,1 +1,0 @@
-"""The rejection rules of the published systems, one file a rule."""

@@ -1,0 +1,221 @@
+"""B7: Dai et al. 2020: a Delaunay graph of point correlations, of which the largest rigid component is static."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, Delaunay, QhullError
+from scipy.stats import chi2
+
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import Rule
+from dynslam_bench.culling.ego_motion import depth_sigma
+from dynslam_bench.culling.matches import link_to_previous
+from dynslam_bench.culling.settings import CorrelationSettings
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+
+Numbers = NDArray[np.floating]
+
+MIN_POINTS = 20
+_NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+_WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
+
+
+class CorrelationFilter(Rule[CorrelationSettings]):
+    """Drops the points outside the largest rigid component of a Delaunay graph.
+
+    An edge compares the vector between its two points now with that in the oldest frame, at most `window` frames ago,
+    in which both were observed; it is cut where the Mahalanobis distance of the difference exceeds the chi-square
+    quantile. Vectors are compared in the world frame: only the rotations of the poses matter.
+
+    Components are formed by settled points only, those observed over at least `settled` frames: a younger edge shows
+    too little motion and could connect two bodies. A younger point is static if it agrees with at least as many of its
+    settled neighbours as it contradicts. A point that continues a keypoint of the last frame takes over its
+    observations; any other point was at the end of its flow, at the depth that the last frame has there.
+
+    Stats: ``dropped``, ``tracked`` (points judged), ``settled``, ``edges``, ``cut``, ``components`` (of the settled).
+    """
+
+    name = "correlation"
+    needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
+    provenance: Provenance = "inspired"
+    stats_names = ("dropped", "tracked", "settled", "edges", "cut", "components")
+
+    def __init__(self, settings: CorrelationSettings) -> None:
+        super().__init__(settings)
+        self.reset()
+
+    def reset(self, camera: Camera | None = None) -> None:
+        """Forget all tracks."""
+        self._past = np.zeros((0, 0, 12))  # [frames ago - 1, point of the previous frame, position and covariance]
+        self._last: NDArray[np.float64] | None = None  # the previous frame's points in its camera
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Build the graph over the points that have been observed before."""
+        keep = np.ones(len(frame), dtype=bool)
+        stats = dict.fromkeys(("tracked", "settled", "edges", "cut", "components"), 0.0)
+        local = self._observe(frame.xy, frame.keypoints.xy, frame.z, frame.depth, state.camera)
+        past = self._past_observations(frame, state)
+        self._past, self._last = past, local
+        if state.T_world_pred is None or not len(past):
+            return FilterResult.of(keep, stats)
+        now = _in_world(local, state.T_world_pred)
+        observed = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1))
+        rows = np.flatnonzero(observed.any(axis=0))
+        if len(rows) < MIN_POINTS:
+            return FilterResult.of(keep, stats)
+        age = len(past) - observed[::-1, rows].argmax(axis=0)
+        settled = age >= min(self.settings.settled, len(past))
+        now, past, observed, xy = now[rows], past[:, rows], observed[:, rows], frame.xy[rows]
+        static, cut, total = np.ones(len(rows), dtype=bool), 0, 0
+        old = np.flatnonzero(settled)
+        stats |= {"tracked": float(len(rows)), "settled": float(len(old))}
+        if len(old) < MIN_POINTS:
+            return FilterResult.of(keep, stats)
+        edges = _delaunay_edges(xy[old])
+        uncut = self._agree(now[old], past[:, old], observed[:, old], edges)
+        static[old], stats["components"] = self._static_component(edges[uncut], now[old, :3])
+        total, cut = len(edges), int(np.count_nonzero(~uncut))
+        if len(old) < len(rows):
+            edges = _delaunay_edges(xy)
+            edges = edges[settled[edges].sum(axis=1) == 1]
+            edges = np.where(settled[edges[:, :1]], edges[:, ::-1], edges)  # the younger point first
+            uncut = self._agree(now, past, observed, edges)
+            total, cut = total + len(edges), cut + int(np.count_nonzero(~uncut))
+            vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
+            static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
+        stats |= {"edges": float(total), "cut": float(cut)}
+        keep[rows[~static]] = False
+        return FilterResult.of(keep, stats)
+
+    def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
+        """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
+        previous, pose, flow = state.previous, state.T_world_prev, state.flow
+        if previous is None or pose is None or flow is None or self._last is None or len(self._last) != len(previous):
+            return np.zeros((0, len(frame), 12))
+        link = link_to_previous(frame, state)
+        before = np.concatenate([_in_world(self._last, pose)[None], self._past])[: self.settings.window]
+        past = np.full((len(before), len(frame), 12), np.nan)
+        past[:, link >= 0] = before[:, link[link >= 0]]
+        loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
+        if len(loose):
+            raw = flow.xy[loose]
+            height, width = previous.depth.shape
+            column, row = np.rint(raw).astype(np.intp).T
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            z = np.where(inside, previous.depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
+            observations = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
+            past[0, loose] = _in_world(observations, pose)
+        return past
+
+    def _observe(
+        self, xy: Numbers, raw: Numbers, z: Numbers, depth: NDArray[np.float32], camera: Camera
+    ) -> NDArray[np.float64]:
+        """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
+        points = np.full((len(xy), 12), np.nan)
+        valid = np.isfinite(z) & (z > 0)
+        if valid.any():
+            points[valid, :3] = camera.unproject(xy[valid], z[valid])
+            variance = depth_variance(depth, raw[valid])
+            covariance = point_covariance(
+                np.asarray(xy[valid], np.float64), z[valid], variance, camera, self.settings.pixel_sigma
+            )
+            points[valid, 3:] = covariance.reshape(-1, 9)
+        return points
+
+    def _agree(
+        self, now: NDArray[np.float64], past: NDArray[np.float64], observed: NDArray[np.bool_], edges: NDArray[np.intp]
+    ) -> NDArray[np.bool_]:
+        """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed."""
+        both = observed[:, edges[:, 0]] & observed[:, edges[:, 1]]
+        oldest = len(past) - 1 - both[::-1].argmax(axis=0)
+        first, second = edges.T
+        then = past[oldest, first], past[oldest, second]
+        change = now[first, :3] - now[second, :3] - then[0][:, :3] + then[1][:, :3]
+        total = (now[first, 3:] + now[second, 3:] + then[0][:, 3:] + then[1][:, 3:]).reshape(-1, 3, 3)
+        comparable = both.any(axis=0)
+        distance = np.zeros(len(edges))
+        solved = np.linalg.solve(total[comparable], change[comparable, :, None])[:, :, 0]
+        distance[comparable] = (change[comparable] * solved).sum(axis=1)
+        return np.asarray(distance <= chi2.ppf(self.settings.quantile, 3))
+
+    def _static_component(
+        self, edges: NDArray[np.intp], points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], float]:
+        count = len(points)
+        graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+        _, label = connected_components(graph, directed=False)
+        size = np.bincount(label)
+        if self.settings.largest == "count":
+            measure = size.astype(np.float64)
+        else:
+            measure = np.array([_volume(points[label == body]) for body in range(len(size))])
+        static = int(np.lexsort((size, measure))[-1])  # with equal volumes the one with more points
+        return np.asarray(label == static), float(len(size))
+
+
+def _in_world(local: NDArray[np.float64], T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points and covariances ``[N, 3 + 9]`` of a camera's frame in the world's."""
+    R = T_world_cam[:3, :3]
+    covariance = R @ local[:, 3:].reshape(-1, 3, 3) @ R.T
+    return np.column_stack([se3.transform(T_world_cam, local[:, :3]), covariance.reshape(-1, 9)])
+
+
+def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Unique undirected edges ``[E, 2]`` of the Delaunay triangulation of pixels ``[N, 2]``."""
+    try:
+        simplices = Delaunay(xy, qhull_options="QJ").simplices
+    except QhullError:
+        return np.zeros((0, 2), np.intp)
+    pairs = np.sort(np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]]), axis=1)
+    return np.asarray(np.unique(pairs, axis=0), dtype=np.intp)
+
+
+def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Variance of the depth at raw pixels ``[N, 2]``, m^2: a Gaussian mixture over the 3x3 neighbourhood.
+
+    The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its components' variances
+    those of the sensor. Depth edges thus get a large variance.
+    """
+    height, width = depth.shape
+    column, row = np.rint(xy).astype(np.intp).T
+    columns = (column[:, None] + _NEAR[:, 0]).clip(0, width - 1)
+    rows = (row[:, None] + _NEAR[:, 1]).clip(0, height - 1)
+    z = np.nan_to_num(depth[rows, columns].astype(np.float64), posinf=0.0, neginf=0.0)
+    weight = np.where(z > 0, _WEIGHT, 0.0)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+    mean = (weight * z).sum(axis=1)
+    return np.asarray((weight * (np.square(depth_sigma(z)) + np.square(z - mean[:, None]))).sum(axis=1))
+
+
+def point_covariance(
+    xy: NDArray[np.float64], z: NDArray[np.floating], variance: NDArray[np.float64], camera: Camera, pixel_sigma: float
+) -> NDArray[np.float64]:
+    """Covariances ``[N, 3, 3]`` of unprojected points in the camera frame, m^2.
+
+    Args:
+        xy: Undistorted pixels ``[N, 2]``.
+        z: Depths ``[N]``, metres.
+        variance: Variances of the depths ``[N]``, m^2.
+        camera: Intrinsics.
+        pixel_sigma: Standard deviation of a pixel coordinate.
+    """
+    depth = np.asarray(z, dtype=np.float64)
+    jacobian = np.zeros((len(depth), 3, 3))
+    jacobian[:, 0, 0], jacobian[:, 1, 1] = depth / camera.fx, depth / camera.fy
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = ((xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
+    jacobian[:, 2, 2] = 1.0
+    noise = np.column_stack([np.full((len(depth), 2), pixel_sigma**2), np.maximum(variance, 1e-12)])
+    return np.asarray((jacobian * noise[:, None]) @ jacobian.transpose(0, 2, 1))
+
+
+def _volume(points: NDArray[np.float64]) -> float:
+    if len(points) < 4:
+        return 0.0
+    try:
+        return float(ConvexHull(points, qhull_options="QJ").volume)
+    except QhullError:
+        return 0.0

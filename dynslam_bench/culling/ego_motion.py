@@ -1,0 +1,210 @@
+"""The camera's motion since the previous frame from optical flow and depth, and what motion tests share."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FilterState, FrameBundle
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+
+MIN_POINTS = 12
+TURN_PX = (12.0, 6.0, 4.0)
+"""Scale of the redescending kernel in the first Gauss-Newton steps, which change the rotation only."""
+KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
+"""The same in the later steps; narrow, since the flow is exact and moving points must not influence the fit."""
+ROLLING_SHUTTER_SHARE = 0.05
+"""Added to the scale, as a share of a point's flow: a rolling shutter distorts fast motion."""
+CELL = 32
+"""Side of the cells of `static_share`, pixels."""
+COHERENCE_CELL = 16
+COHERENCE_CELLS = 5
+"""Side of the neighbourhood of `coherent` in cells: 5 x 16 px."""
+MIN_FAILING = 3
+"""Fewest failing points of a moving region."""
+CORRELATION = 100.0
+"""Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
+(the back end inflates the covariance of its poses for the same reason)."""
+
+
+def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Standard deviation of a structured-light depth camera at depth z, metres (Nguyen et al. 2012, axial noise)."""
+    return np.asarray(0.0012 + 0.0019 * np.square(np.maximum(z, 0.4) - 0.4), dtype=np.float64)
+
+
+def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Share of static keypoints around each point's origin in the previous frame.
+
+    Args:
+        frame: The current frame.
+        state: With the previous frame and which of its keypoints were kept.
+        before: Raw pixels of the points in the previous image, ``[N, 2]``; not finite gives 1.
+
+    Returns:
+        Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there were none.
+    """
+    ones = np.ones(len(before))
+    if state.previous is None or state.previous_keep is None or not len(state.previous):
+        return ones
+    previous_cell, grid = cell_index(state.previous.keypoints.xy, CELL, frame.gray.shape)
+    count = np.bincount(previous_cell, minlength=grid[0] * grid[1])
+    kept = np.bincount(previous_cell, weights=state.previous_keep, minlength=grid[0] * grid[1])
+    share = np.where(count > 0, kept / np.maximum(count, 1), 1.0)
+    cell, _ = cell_index(np.nan_to_num(before), CELL, frame.gray.shape)
+    return np.where(np.isfinite(before).all(axis=1), share[cell], ones)
+
+
+def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
+    """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
+    rows, columns = -(-shape[0] // size), -(-shape[1] // size)
+    cell = np.floor(xy / size).astype(np.intp)
+    return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
+
+
+def rigid_flow(
+    frame: FrameBundle, state: FilterState, rows: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where points would have been in the previous frame if only the camera moved.
+
+    Args:
+        frame: The current frame.
+        state: With the previous and the predicted pose.
+        rows: bool ``[N]``, K points, all with depth.
+
+    Returns:
+        Points ``[K, 3]`` in the previous camera's frame, metres, and their undistorted pixels ``[K, 2]``.
+    """
+    assert state.T_world_prev is not None and state.T_world_pred is not None
+    T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
+    moved = se3.transform(T_prev_cur, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+    return moved, state.camera.project(moved)
+
+
+def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.float64] | None:
+    """The pose predicted for this frame, refined by the flow to the previous image.
+
+    Iteratively reweighted Gauss-Newton on the reprojection error of the current points in the previous image, with a
+    redescending (Geman-McClure) kernel. It starts at the motion model's prediction, which is also the prior (maximum a
+    posteriori). Without the prior a person nearby would bias the estimate even where most points are static: a far
+    background of one depth hardly separates rotation from sideways translation, so that near points determine the
+    translation. For the same reason the first steps, with a wide kernel, change the rotation only.
+
+    Args:
+        frame: The current frame.
+        state: With flow, the previous pose and, if known, the predicted one.
+
+    Returns:
+        Camera-to-world pose ``[4, 4]``; the unrefined prediction (or None) with too few points.
+    """
+    flow = state.flow
+    if flow is None or state.previous is None or state.T_world_prev is None:
+        return state.T_world_pred
+    use = flow.valid & state.keep & (frame.z > 0)
+    if np.count_nonzero(use) < MIN_POINTS:
+        return state.T_world_pred
+    start = np.eye(4) if state.T_world_pred is None else se3.inverse(state.T_world_prev) @ state.T_world_pred
+    points = state.camera.unproject(frame.xy[use], frame.z[use])
+    before = state.camera.undistort_points(flow.xy[use])
+    prior = None if state.T_world_pred is None else prior_information(state, start)
+    T_prev_cur = _align(points, before, state.camera, start, static_share(frame, state, flow.xy[use]), prior)
+    return state.T_world_pred if T_prev_cur is None else state.T_world_prev @ T_prev_cur
+
+
+def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Information of the motion model on the motion since the previous frame.
+
+    Args:
+        state: With the covariance of the predicted motion.
+        T_prev_cur: The predicted motion.
+
+    Returns:
+        Information ``[6, 6]`` of (translation, rotation), both in the previous camera's frame, times `CORRELATION`;
+        None without a covariance of the motion model.
+    """
+    if state.motion_covariance is None or state.T_world_prev is None:
+        return None
+    rotation = np.zeros((6, 6))
+    rotation[:3, :3] = state.T_world_prev[:3, :3].T
+    rotation[3:, 3:] = T_prev_cur[:3, :3]
+    covariance = rotation @ state.motion_covariance @ rotation.T + 1e-12 * np.eye(6)
+    return np.asarray(CORRELATION * np.linalg.inv(covariance))
+
+
+def _align(
+    points: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    camera: Camera,
+    start: NDArray[np.float64],
+    prior_weight: NDArray[np.float64],
+    information: NDArray[np.float64] | None,
+) -> NDArray[np.float64] | None:
+    """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``; None if too few points agree.
+
+    `information` ``[6, 6]`` is that of the prior, the start pose.
+    """
+    pose = start
+    inverse_start = se3.inverse(start)
+    weight = prior_weight
+    rolling_shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
+    for number, scale in enumerate(TURN_PX + KERNEL_PX):
+        moved = se3.transform(pose, points)
+        z = np.maximum(moved[:, 2], 0.05)
+        error = camera.project(moved) - pixels
+        error = np.where(moved[:, 2:3] > 0.05, np.nan_to_num(error, posinf=1e4, neginf=-1e4), 1e4)
+        weight = prior_weight / np.square(1 + (error**2).sum(axis=1) / (scale**2 + rolling_shutter))
+        x, y = moved[:, 0] / z, moved[:, 1] / z
+        zero = np.zeros_like(x)
+        # derivative of the pixel by a left perturbation exp(rho, phi) of the pose
+        du = camera.fx * np.stack([1 / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=1)
+        dv = camera.fy * np.stack([zero, 1 / z, -y / z, -1 - y * y, x * y, x], axis=1)
+        hessian = (du * weight[:, None]).T @ du + (dv * weight[:, None]).T @ dv
+        gradient = du.T @ (weight * error[:, 0]) + dv.T @ (weight * error[:, 1])
+        if information is not None:
+            hessian += information
+            gradient += information @ se3.log(pose @ inverse_start)
+        if number < len(TURN_PX):
+            hessian[:3], hessian[:, :3], gradient[:3] = 0.0, 0.0, 0.0
+            hessian[:3, :3] = np.trace(hessian) * np.eye(3)
+        try:
+            step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), -gradient)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(step).all() or np.linalg.norm(step[3:]) > 1.0:
+            return None
+        pose = se3.exp(step) @ pose
+    return pose if weight.sum() >= 0.5 * MIN_POINTS else None
+
+
+def coherent(
+    failing: NDArray[np.bool_],
+    tested: NDArray[np.bool_],
+    xy: NDArray[np.floating],
+    share: float,
+    size: tuple[int, ...],
+) -> NDArray[np.bool_]:
+    """The failing points of whose tested neighbours enough fail too: a lone failure is noise.
+
+    Args:
+        failing: bool ``[N]``, points that failed a test.
+        tested: bool ``[N]``, points that were tested.
+        xy: Raw pixels ``[N, 2]``.
+        share: Share of the tested points in the neighbourhood (80 px wide) that must fail; 0 keeps all failures.
+        size: Image height and width.
+
+    Returns:
+        Bool ``[N]``, a subset of `failing`.
+    """
+    if share <= 0 or not failing.any():
+        return failing
+    index, grid = cell_index(xy, COHERENCE_CELL, size)
+    neighbourhood = (COHERENCE_CELLS, COHERENCE_CELLS)
+
+    def around(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
+        counts = np.bincount(index, weights=flags, minlength=grid[0] * grid[1]).reshape(grid)
+        total = cv2.boxFilter(counts, -1, neighbourhood, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(total, np.float64).ravel()
+
+    failures, tests = around(failing & tested), around(tested)
+    return np.asarray(failing & (failures[index] >= MIN_FAILING) & (failures[index] >= share * tests[index]))

@@ -1,0 +1,105 @@
+"""B3 and B11 as in DS-SLAM's code: one moving corner near a person drops the features of all people."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling.matches import Estimator, Matches, f_stats
+from dynslam_bench.culling.settings import MovingVoteSettings
+from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.segmentation.postprocess import select
+
+BORDER_PX = 5
+HARRIS_K = 0.04
+"""Of the corner measure that the authors' code chooses (Harris, blocks of 3 px)."""
+LEVELS = 5
+ESTIMATOR = Estimator(max_draws=1000, min_matches=8, refits=0)
+"""Eight matches suffice and RANSAC's own F is taken, as in the authors' code."""
+WINDOW = (22, 22)
+
+
+class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
+    """DS-SLAM's moving consistency check: corners of its own, pyramidal Lucas-Kanade, F by RANSAC, one global vote.
+
+    It has no degeneracy guard; the published system fails on `walking_rpy` without one.
+    Stats: ``dropped``, ``corners`` (tracked), ``moving`` (off their line), ``votes`` (of those, near a person).
+    """
+
+    name = "moving_vote"
+    needs: frozenset[Need] = frozenset({"masks", "previous"})
+    provenance: Provenance = "faithful-code"
+    stats_names = ("dropped", "corners", "moving", "votes", "f_judged", "f_asked")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Vote, and drop the points on people if enough moving corners lie near them."""
+        keep = np.ones(len(frame), dtype=bool)
+        stats = dict.fromkeys(("corners", "moving", "votes"), 0.0) | f_stats(asked=state.previous is not None)
+        if state.previous is None or frame.instances is None:
+            return FilterResult.of(keep, stats)
+        people = select(frame.instances, self.segmentation).union()
+        moving, stats["corners"], estimated = self._moving_corners(state.previous.gray, frame.gray, state.camera)
+        stats |= f_stats(asked=True, judged=estimated)
+        stats["moving"] = float(len(moving))
+        side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
+        near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
+        votes = np.count_nonzero(inside(near_people, moving))
+        stats["votes"] = float(votes)
+        if votes < self.settings.min_votes:
+            return FilterResult.of(keep, stats)
+        return FilterResult.of(~inside(people, frame.keypoints.xy), stats, people)
+
+    def _moving_corners(
+        self, previous: NDArray[np.uint8], current: NDArray[np.uint8], camera: Camera
+    ) -> tuple[NDArray[np.float32], float, bool]:
+        """Pixels ``[M, 2]`` of the corners off their line, the number of tracked corners, whether F was estimated."""
+        no_corners = np.zeros((0, 2), np.float32)
+        corners = cv2.goodFeaturesToTrack(
+            previous, self.settings.corners, 0.01, 8, blockSize=3, useHarrisDetector=True, k=HARRIS_K
+        )
+        if corners is None or len(corners) < ESTIMATOR.min_matches:
+            return no_corners, 0.0, False
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
+        corners = cv2.cornerSubPix(previous, corners, (10, 10), (-1, -1), criteria)
+        tracked, status, _ = cv2.calcOpticalFlowPyrLK(
+            previous,
+            current,
+            corners,
+            corners.copy(),
+            winSize=WINDOW,
+            maxLevel=LEVELS,
+            criteria=(criteria[0], 20, 0.01),
+        )
+        before, after = corners.reshape(-1, 2), tracked.reshape(-1, 2)
+        height, width = current.shape
+        low, high = np.array([BORDER_PX, BORDER_PX]), np.array([width - BORDER_PX - 1, height - BORDER_PX - 1])
+        good = status.ravel().astype(bool)
+        for xy in (before, after):
+            good &= (xy >= low).all(axis=1) & (xy <= high).all(axis=1)
+        good[good] = _patch_difference(previous, current, before[good], after[good]) <= self.settings.sad_limit
+        before, after = before[good], after[good]
+        if len(before) < ESTIMATOR.min_matches:
+            return no_corners, float(len(before)), False
+        all_corners = np.ones(len(before), dtype=bool)
+        matches = Matches(camera.undistort_points(before), camera.undistort_points(after))
+        distance = matches.distances(all_corners, all_corners, replace(ESTIMATOR, inlier_px=self.settings.inlier_px))
+        if distance is None:
+            return no_corners, float(len(before)), False
+        return after[distance > self.settings.threshold_px], float(len(before)), True
+
+
+def _patch_difference(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], xy1: NDArray[np.float32], xy2: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
+    offsets = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+    a = xy1[:, None].astype(np.intp) + offsets
+    b = xy2[:, None].astype(np.intp) + offsets
+    return np.asarray(
+        np.abs(first[a[..., 1], a[..., 0]].astype(np.int64) - second[b[..., 1], b[..., 0]].astype(np.int64)).sum(axis=1)
+    )

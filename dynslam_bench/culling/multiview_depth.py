@@ -1,0 +1,302 @@
+"""B4 and B5: DynaSLAM's multi-view geometry: an object that hides points of earlier keyframes is dynamic."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
+from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.core.compiled import kernel
+from dynslam_bench.culling import Rule
+from dynslam_bench.culling.ego_motion import refine_prediction
+from dynslam_bench.culling.settings import MultiViewSettings
+from dynslam_bench.features.matching import CellGrid, as_words, search_in_radius
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.segmentation.postprocess import dilate
+
+MAX_REFERENCE_DEPTH_M = 6.0
+MAX_PROJECTED_DEPTH_M = 7.0
+MAX_DEPTH_M = 40.0
+"""Measured depth beyond this counts as missing, as in the back end."""
+GROW_M = 0.2
+"""Largest depth difference to the mean of a region (our assumption)."""
+MARGIN_PX = 20
+"""Half side of the window around a projected point; points nearer to the image's border are not tested."""
+
+
+class MultiViewFilter(Rule[MultiViewSettings]):
+    """Drops the features on objects that hide points which earlier keyframes observed.
+
+    A region of similar depth grows around every hidden point; features on it and within `border_px` of it are dropped.
+    Difference from the authors' code: the parallax angle is taken between the camera centres (the code uses a
+    translation in the wrong frame). Stats: ``dropped``, ``references``, ``seeds`` (hidden points), ``mask_fraction``.
+    """
+
+    name = "multiview"
+    needs: frozenset[Need] = frozenset({"keyframes", "prediction", "depth"})
+    provenance: Provenance = "faithful-code"
+    stats_names = ("dropped", "references", "seeds", "mask_fraction")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Project the references' points into the frame and find the objects that hide them."""
+        keep = np.ones(len(frame), dtype=bool)
+        stats = {"references": 0.0, "seeds": 0.0, "mask_fraction": 0.0}
+        if state.T_world_pred is None or len(state.keyframes) < self.settings.min_keyframes:
+            return FilterResult.of(keep, stats)
+        pose = refine_by_matches(frame, state)
+        assert pose is not None
+        references = self._choose(state.keyframes, pose)
+        depth = np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0)
+        depth = np.ascontiguousarray(np.where((depth > 0) & (depth < MAX_DEPTH_M), depth, 0), dtype=np.float32)
+        seeds = self._seeds(references, depth, pose, state.camera)
+        stats |= {"references": float(len(references)), "seeds": float(len(seeds))}
+        if not len(seeds):
+            return FilterResult.of(keep, stats)
+        mask = self._region(seeds, depth)
+        stats["mask_fraction"] = float(mask.mean())
+        dropped = inside(dilate(mask, self.settings.border_px), frame.keypoints.xy)
+        return FilterResult.of(~dropped, stats, mask)
+
+    def _choose(self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]) -> list[KeyframeView]:
+        """At most `references` keyframes by 0.7 normalised distance + 0.3 normalised rotation."""
+        relative = np.stack([se3.inverse(view.T_world_cam) @ pose for view in views])
+        distance = np.linalg.norm(relative[:, :3, 3], axis=1)
+        angle = se3.rotation_angle(relative)
+        score = 0.7 * distance / max(distance.max(), 1e-9) + 0.3 * angle / max(angle.max(), 1e-9)
+        ranked = np.argsort(score if self.settings.order == "nearest" else -score, kind="stable")
+        return [views[i] for i in ranked[: self.settings.references]]
+
+    def _seeds(
+        self, views: list[KeyframeView], depth: NDArray[np.float32], pose: NDArray[np.float64], camera: Camera
+    ) -> NDArray[np.int64]:
+        """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
+        world, from_reference = [], []
+        for view in views:
+            usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
+            world.append(se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable])))
+            from_reference.append(world[-1] - view.T_world_cam[:3, 3])
+        points = np.concatenate(world)
+        from_frame = points - pose[:3, 3]
+        cosine = _cosine(np.concatenate(from_reference), from_frame)
+        local = from_frame @ pose[:3, :3]
+        pixels = np.full((len(local), 2), -1.0)
+        ahead = local[:, 2] > 0.1
+        pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
+        visible = ahead & (cosine > np.cos(np.deg2rad(self.settings.max_parallax_deg)))
+        visible &= local[:, 2] < MAX_PROJECTED_DEPTH_M
+        size = (camera.width - MARGIN_PX - 2, camera.height - MARGIN_PX - 2)
+        visible &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
+        if not visible.any():
+            return np.zeros((0, 2), np.int64)
+        centre = np.ceil(pixels[visible]).astype(np.int64)
+        seeds = centre[hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)]
+        return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
+
+    def _region(self, seeds: NDArray[np.int64], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        if self.settings.grow:
+            mask = grow(depth, np.ascontiguousarray(seeds), GROW_M, BIN_M)
+        else:
+            mask = np.zeros(depth.shape, np.uint8)
+        mask[seeds[:, 1], seeds[:, 0]] = 1
+        return dilate(mask.astype(bool), self.settings.dilation_px)
+
+
+def _cosine(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cosines ``[N]`` of the angles between vectors ``[N, 3]``."""
+    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    return np.asarray((first * second).sum(axis=1) / np.maximum(norms, 1e-12))
+
+
+def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Variance ``[N]`` of the depth in the 41x41 neighbourhoods of pixels ``[N, 2]``, m^2.
+
+    Missing depth counts as 0, as in the authors' code: no seed lies beside missing depth.
+    """
+    if not len(xy):
+        return np.zeros(0)
+    height, width = depth.shape
+    total, squares = cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    (x0, y0), (x1, y1) = (xy - MARGIN_PX).clip(0).T, np.minimum(xy + MARGIN_PX + 1, (width, height)).T
+
+    def within(table: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+        return np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64)
+
+    n = (x1 - x0) * (y1 - y0)
+    return np.asarray(within(squares) / n - np.square(within(total) / n))
+
+
+# Compiled loops of DynaSLAM's multi-view geometry: which projected points are hidden, and what hides them.
+
+BIN_M = 0.005
+"""Depth resolution at which the next pixel of a region is chosen: the one nearest to the region's mean comes first."""
+
+
+@kernel
+def hidden(
+    depth: NDArray[np.float32], centre: NDArray[np.int64], expected: NDArray[np.float64], tau: float, radius: int
+) -> NDArray[np.bool_]:
+    """Which points are hidden by a nearer object, robustly against small projection errors.
+
+    A point is compared with the depth in the window that is nearest to the expected depth, among those in front of it:
+    a point beside an object is not hidden, only one well inside its outline is.
+
+    Args:
+        depth: float32 ``[H, W]`` metres, 0 missing.
+        centre: int64 ``[N, 2]`` pixels (column, row) of the projected points, at least `radius` from the border.
+        expected: float64 ``[N]`` depth at which the points should be seen, metres.
+        tau: Least distance of all nearer depths in front of the point, metres.
+        radius: Half side of the window, pixels.
+
+    Returns:
+        Bool ``[N]``; False also where the point's own pixel has no depth, or nothing in the window is nearer.
+    """
+    is_hidden = np.zeros(len(centre), np.bool_)
+    for i in range(len(centre)):
+        column, row = centre[i]
+        if not depth[row, column] > 0:
+            continue
+        nearer, all_far = False, True
+        for y in range(row - radius, row + radius + 1):
+            for x in range(column - radius, column + radius + 1):
+                z = depth[y, x]
+                if 0 < z < expected[i]:
+                    nearer = True
+                    if expected[i] - z <= tau:
+                        all_far = False
+                        break
+            if not all_far:
+                break
+        is_hidden[i] = nearer and all_far
+    return is_hidden
+
+
+@kernel
+def grow(depth: NDArray[np.float32], seeds: NDArray[np.int64], step: float, bin_m: float) -> NDArray[np.uint8]:
+    """Regions of similar depth around seeds: neighbours join while they are within `step` of the region's mean.
+
+    Of all neighbours of a region the one nearest to its mean joins next (to `bin_m`), and the mean is updated. Pixels
+    without depth never join. A seed within an earlier region starts no new region.
+
+    Args:
+        depth: float32 ``[H, W]`` metres, 0 missing, at most a few ten metres.
+        seeds: int64 ``[N, 2]`` pixels (column, row).
+        step: Largest distance to the mean, metres.
+        bin_m: Resolution of the order, metres.
+
+    Returns:
+        uint8 ``[H, W]``, 1 in a region.
+    """
+    height, width = depth.shape
+    mask = np.zeros((height, width), np.uint8)
+    visited = np.zeros(height * width, np.int32)  # number of the region that last touched the pixel
+    following = np.empty(height * width, np.int64)
+    bins = int(np.ceil(depth.max() / bin_m)) + 2
+    head = np.full(bins, -1, np.int64)
+    reach = int(np.ceil(step / bin_m)) + 1
+    flat, out = depth.ravel(), mask.ravel()
+    for k in range(len(seeds)):
+        start = seeds[k, 1] * width + seeds[k, 0]
+        if out[start] or not flat[start] > 0:
+            continue
+        head[:] = -1
+        mean, size, pixel = 0.0, 0, start
+        visited[start] = k + 1
+        while pixel >= 0:
+            out[pixel] = 1
+            mean = (mean * size + flat[pixel]) / (size + 1)
+            size += 1
+            row, column = pixel // width, pixel % width
+            for side in range(4):
+                r = row + (side == 0) - (side == 1)
+                c = column + (side == 2) - (side == 3)
+                if 0 <= r < height and 0 <= c < width:
+                    other = r * width + c
+                    if visited[other] != k + 1 and flat[other] > 0:
+                        visited[other] = k + 1
+                        b = int(flat[other] / bin_m)
+                        following[other] = head[b]
+                        head[b] = other
+            pixel = -1
+            middle = int(mean / bin_m)
+            for away in range(reach + 1):
+                for b in (middle - away, middle + away):
+                    if 0 <= b < bins and head[b] >= 0 and abs(flat[head[b]] - mean) < step:
+                        pixel = head[b]
+                        head[b] = following[pixel]
+                        break
+                if pixel >= 0:
+                    break
+    return mask
+
+
+# DynaSLAM's low-cost tracking: a pose for the geometric test before the frame is really tracked.
+
+MIN_MATCHES = 20
+"""With fewer matches the search is repeated with twice the radius; after that the prediction is not refined."""
+MAX_DISTANCE = 100
+"""Largest Hamming distance of a match."""
+
+
+def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float = 15.0) -> NDArray[np.float64] | None:
+    """DynaSLAM's low-cost tracking: the predicted pose, refined on matches of features that earlier filters kept.
+
+    The previous frame's features are projected under constant velocity and matched by descriptor within `radius_px`.
+    The authors match the local map instead of the last frame.
+
+    Args:
+        frame: The current frame.
+        state: With the previous frame, its pose and the predicted one.
+        radius_px: Half side of the search windows (DynaSLAM: 15, doubled with too few matches).
+
+    Returns:
+        Camera-to-world pose ``[4, 4]``; the prediction itself (or None) where there are fewer than 20 matches, or
+        where an optical flow has refined it already.
+    """
+    previous = state.previous
+    if state.flow is not None or previous is None or state.T_world_prev is None or state.T_world_pred is None:
+        return state.T_world_pred
+    trusted = np.ones(len(previous), dtype=bool) if state.previous_keep is None else state.previous_keep
+    rows = np.flatnonzero(trusted & (previous.z > 0))
+    if len(rows) < MIN_MATCHES or np.count_nonzero(state.keep) < MIN_MATCHES:
+        return state.T_world_pred
+    T_cur_prev = se3.inverse(state.T_world_pred) @ state.T_world_prev
+    points = se3.transform(T_cur_prev, state.camera.unproject(previous.xy[rows], previous.z[rows]))
+    rows, points = rows[points[:, 2] > 0.1], points[points[:, 2] > 0.1]
+    expected = np.asarray(state.camera.project(points), dtype=np.float64)
+    for radius in (radius_px, 2 * radius_px):
+        match = _match(frame, state, rows, expected, radius)
+        matched = match >= 0
+        if np.count_nonzero(matched) >= MIN_MATCHES:
+            xy = np.full((len(frame), 2), np.nan, np.float32)
+            valid = np.zeros(len(frame), dtype=bool)
+            xy[match[matched]] = previous.keypoints.xy[rows[matched]]
+            valid[match[matched]] = True
+            matches = FlowResult(xy, valid, np.zeros(len(frame), np.float32))
+            return refine_prediction(frame, replace(state, flow=matches))
+    return state.T_world_pred
+
+
+def _match(
+    frame: FrameBundle, state: FilterState, rows: NDArray[np.intp], expected: NDArray[np.float64], radius: float
+) -> NDArray[np.int64]:
+    """The current keypoint of each of the previous frame's `rows`, ``[M]``; -1 for none."""
+    assert state.previous is not None
+    xy = np.ascontiguousarray(frame.xy, dtype=np.float64)
+    octave = frame.keypoints.octave.astype(np.int64)
+    unknown = np.full(len(frame), np.nan)
+    before = state.previous.keypoints.octave[rows].astype(np.int64)
+    match, _ = search_in_radius(
+        CellGrid.of(xy, state.camera.width, state.camera.height),
+        (xy, unknown, octave, as_words(frame.keypoints.descriptors)),
+        state.keep,
+        (expected, np.full(len(rows), np.nan), np.full(len(rows), radius)),
+        (before - 1, before + 1),
+        as_words(state.previous.keypoints.descriptors[rows]),
+        max_distance=MAX_DISTANCE,
+    )
+    return match

@@ -1,0 +1,81 @@
+"""B12: extract more features than are used, so that culling leaves enough static ones (NGD-SLAM, Crowd-SLAM)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import Rule
+from dynslam_bench.culling.settings import ReseedingSettings
+from dynslam_bench.features.orb import EDGE, level_quotas, spread
+from dynslam_bench.features.settings import FeatureSettings
+
+ORIGIN = EDGE - 3
+"""Where the extractor's cells begin, in pixels of a level."""
+
+
+class ReseedingFilter(Rule[ReseedingSettings]):
+    """Uses the best `budget` of the features that earlier filters kept.
+
+    The extractor finds more features than the budget (x1.5 in NGD-SLAM). The budget is divided among pyramid levels and
+    image cells as in the extractor. A frame without dynamic objects thus gives exactly the features of an extractor
+    with ``n_features = budget``, those of the other systems.
+
+    It must be the last filter. The features that it drops are surplus, not dynamic.
+    Stats: ``dropped`` (the surplus), ``static`` (kept by earlier filters), ``reseeded`` (used features that replace
+    dynamic ones), ``missing`` (unused part of the budget).
+
+    Args:
+        settings: The budget.
+        features: The extractor's settings: levels, scale and cells.
+    """
+
+    name = "reseeding"
+    needs: frozenset[Need] = frozenset()
+    provenance: Provenance = "inspired"
+    stats_names = ("dropped", "static", "reseeded", "missing")
+
+    def __init__(self, settings: ReseedingSettings, features: FeatureSettings) -> None:
+        super().__init__(settings)
+        self._features = features
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Choose the features that are used."""
+        static = state.keep
+        used = self._choose(frame, static)
+        usual = self._choose(frame, np.ones(len(frame), dtype=bool))
+        stats = {
+            "static": float(np.count_nonzero(static)),
+            "reseeded": float(np.count_nonzero(used & ~usual)),
+            "missing": float(max(self.settings.budget - int(np.count_nonzero(used)), 0)),
+            "dropped": float(np.count_nonzero(static & ~used)),
+        }
+        keep = used | ~static  # features that earlier filters dropped are not judged again
+        return FilterResult(keep, keep.astype(np.float32), stats)
+
+    def _choose(self, frame: FrameBundle, allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """At most `budget` of the allowed features, bool ``[N]``, shared among levels and cells."""
+        if np.count_nonzero(allowed) <= self.settings.budget:
+            return allowed.copy()
+        chosen = np.zeros(len(frame), dtype=bool)
+        octave = frame.keypoints.octave
+        levels = max(self._features.levels, int(octave.max()) + 1)
+        quotas = level_quotas(self.settings.budget, levels, self._features.scale_factor)
+        missing = 0
+        for level in range(levels - 1, -1, -1):
+            rows = np.flatnonzero((octave == level) & allowed)
+            quota = quotas[level] + missing
+            picked = rows[self._spread(frame, rows, level, quota)]
+            missing = quota - len(picked)  # a coarse level's missing features are added to the next finer level
+            chosen[picked] = True
+        return chosen
+
+    def _spread(self, frame: FrameBundle, rows: NDArray[np.intp], level: int, quota: int) -> NDArray[np.int64]:
+        """Indices into `rows`, the strongest of every cell first."""
+        xy = np.rint(frame.keypoints.xy[rows] / self._features.scale_factor**level - ORIGIN).clip(0)
+        cell = (xy / self._features.cell_px).astype(np.int64)
+        # ranks of the responses, so that equal ones stay equal and keep their order
+        strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(np.int16)
+        cell_index = cell[:, 1] * (1 << 20) + cell[:, 0]
+        return spread(cell_index, strength, np.ones(len(rows), dtype=bool), quota)

@@ -1,0 +1,107 @@
+"""B14: image clusters with a high warped residual move, with a higher prior for people (DGS-SLAM of Yan 2022)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling.settings import ResidualSettings
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import inside
+from dynslam_bench.segmentation.postprocess import select
+
+STEP = 8
+"""The image is sampled on every eighth pixel."""
+RATIO = 4.0
+"""A moving cluster's residual is expected to be this many times the static ones'."""
+STATIC_PRIOR = 0.05
+"""Prior probability that a cluster without people moves."""
+
+
+class ResidualFilter(ObjectRule[ResidualSettings]):
+    """Drops the features on clusters that the camera's motion does not explain.
+
+    The residual of a sample is ``|I - I'| / 255 + weight |Z - Z'| / Z`` after warping by the predicted motion; a
+    cluster's mean residual is judged by a two-component exponential mixture with a semantic prior.
+    Stats: ``dropped``, ``clusters``, ``moving``, ``mask_fraction``.
+    """
+
+    name = "residual"
+    needs: frozenset[Need] = frozenset({"depth", "previous", "prediction", "masks"})
+    provenance: Provenance = "inspired"
+    stats_names = ("dropped", "clusters", "moving", "mask_fraction")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Cluster the image, warp it, classify the clusters."""
+        keep = np.ones(len(frame), dtype=bool)
+        stats = dict.fromkeys(("clusters", "moving", "mask_fraction"), 0.0)
+        if state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
+            return FilterResult.of(keep, stats)
+        rows, columns = np.mgrid[STEP // 2 : frame.depth.shape[0] : STEP, STEP // 2 : frame.depth.shape[1] : STEP]
+        z = np.nan_to_num(frame.depth[rows, columns]).ravel()
+        valid = z > 0
+        if np.count_nonzero(valid) < 4 * self.settings.clusters:
+            return FilterResult.of(keep, stats)
+        xy = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)[valid]
+        residual = self._residual(frame, state, xy, z[valid])
+        label = self._cluster(xy, z[valid], state.seed)
+        people = np.zeros(len(xy), bool)
+        if frame.instances is not None:
+            people = inside(select(frame.instances, self.segmentation).union(), xy)
+        moving = self._moving_clusters(residual, label, people)
+        sampled = np.zeros(rows.size, dtype=np.uint8)
+        sampled[valid] = moving[label]
+        size = (frame.depth.shape[1], frame.depth.shape[0])
+        mask = cv2.resize(sampled.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+        stats |= {"clusters": float(len(moving)), "moving": float(np.count_nonzero(moving))}
+        stats["mask_fraction"] = float(mask.mean())
+        return FilterResult.of(~inside(mask, frame.keypoints.xy), stats, mask)
+
+    def _residual(
+        self, frame: FrameBundle, state: FilterState, xy: NDArray[np.float64], z: NDArray[np.floating]
+    ) -> NDArray[np.float64]:
+        """Residuals ``[N]`` of raw pixels ``[N, 2]`` against the previous frame; NaN where they leave it."""
+        assert state.previous is not None and state.T_world_prev is not None and state.T_world_pred is not None
+        T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
+        points = se3.transform(T_prev_cur, state.camera.unproject(state.camera.undistort_points(xy), z))
+        pixels = state.camera.distort_points(state.camera.project(points))
+        height, width = frame.gray.shape
+        column, row = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0).clip(-1, 1e5)).astype(np.intp).T
+        visible = (points[:, 2] > 0.1) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column, row = column.clip(0, width - 1), row.clip(0, height - 1)
+        x, y = xy.astype(np.intp).T
+        colour = np.abs(frame.gray[y, x].astype(np.float64) - state.previous.gray[row, column]) / 255
+        before = np.nan_to_num(state.previous.depth[row, column])
+        depth = np.where(before > 0, np.abs(points[:, 2] - before) / np.maximum(z, 0.1), 0.0)
+        return np.where(visible, colour + self.settings.depth_weight * depth, np.nan)
+
+    def _cluster(self, xy: NDArray[np.float64], z: NDArray[np.floating], seed: int) -> NDArray[np.intp]:
+        features = np.column_stack([xy / 160.0, np.asarray(z) / 0.5]).astype(np.float32)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.05)
+        centres = stream(seed, self.name).choice(len(features), self.settings.clusters, replace=False)
+        distance = ((features[:, None] - features[None, centres]) ** 2).sum(axis=2)
+        start = distance.argmin(axis=1).astype(np.int32)[:, None]
+        _, label, _ = cv2.kmeans(features, self.settings.clusters, start, criteria, 1, cv2.KMEANS_USE_INITIAL_LABELS)
+        return np.asarray(label.ravel(), dtype=np.intp)
+
+    def _moving_clusters(
+        self, residual: NDArray[np.float64], label: NDArray[np.intp], people: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Which clusters move, ``[K]``: posterior of the two-component mixture above the threshold."""
+        count = self.settings.clusters
+        measured = np.isfinite(residual)
+        members = np.bincount(label[measured], minlength=count)
+        mean = np.bincount(label[measured], weights=residual[measured], minlength=count) / np.maximum(members, 1)
+        if not measured.any() or not (members > 0).any():
+            return np.zeros(count, dtype=bool)
+        static = max(float(np.median(mean[members > 0])), 1e-4)
+        share = np.bincount(label, weights=people, minlength=count) / np.maximum(np.bincount(label, minlength=count), 1)
+        prior = STATIC_PRIOR + (self.settings.prior - STATIC_PRIOR) * share
+        likelihood = np.exp(-mean / (RATIO * static)) / RATIO
+        other = np.exp(-mean / static)
+        posterior = prior * likelihood / (prior * likelihood + (1 - prior) * other)
+        return np.asarray((posterior > self.settings.threshold) & (members > 0))

@@ -1,0 +1,87 @@
+"""B13: inside boxes, keep the patches that match where the camera's motion predicts them (DynaTM-SLAM)."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
+from dynslam_bench.culling.settings import TemplateSettings
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.settings import SegmentationSettings
+
+
+class TemplateFilter(ObjectRule[TemplateSettings]):
+    """Drops features in dynamic boxes whose patch does not match at its predicted place in the latest frames.
+
+    Stats: ``dropped``, ``in_boxes``, ``tested``, ``median_zncc``.
+    """
+
+    name = "template"
+    needs: frozenset[Need] = frozenset({"boxes", "depth", "prediction", "previous"})
+    provenance: Provenance = "inspired"
+    stats_names = ("dropped", "in_boxes", "tested", "median_zncc")
+
+    def __init__(self, settings: TemplateSettings, segmentation: SegmentationSettings) -> None:
+        super().__init__(settings, segmentation)
+        self._window: deque[tuple[NDArray[np.uint8], NDArray[np.float64]]] = deque()
+
+    def reset(self, camera: Camera) -> None:
+        """Forget the window."""
+        self._window.clear()
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Compare patches; features in boxes without depth or history are dropped."""
+        if state.previous is not None and state.T_world_prev is not None:
+            self._window.appendleft((state.previous.gray, state.T_world_prev))
+        while len(self._window) > self.settings.window:
+            self._window.pop()
+        boxed = in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
+        keep = np.asarray(~boxed)
+        rows = np.flatnonzero(boxed & (frame.z > 0))
+        stats = {"in_boxes": float(np.count_nonzero(boxed)), "tested": 0.0, "median_zncc": 0.0}
+        if state.T_world_pred is None or not self._window or not len(rows):
+            return FilterResult.of(keep, stats)
+        world = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+        current = patches(frame.gray, frame.keypoints.xy[rows].astype(np.float64), self.settings.patch_px)
+        scores = np.full((len(self._window), len(rows)), np.nan)
+        for number, (gray, pose) in enumerate(self._window):
+            local = se3.transform(se3.inverse(pose), world)
+            ahead = local[:, 2] > 0.1
+            pixels = np.full((len(rows), 2), -1e3)
+            pixels[ahead] = state.camera.distort_points(state.camera.project(local[ahead]))
+            scores[number] = zncc(current, patches(gray, pixels, self.settings.patch_px))
+        tested = np.isfinite(scores).any(axis=0)
+        median = np.full(len(rows), -1.0)
+        median[tested] = np.nanmedian(scores[:, tested], axis=0)
+        keep[rows] = median >= self.settings.zncc
+        stats["tested"] = float(np.count_nonzero(tested))
+        stats["median_zncc"] = float(np.median(median[tested])) if tested.any() else 0.0
+        return FilterResult.of(keep, stats)
+
+
+def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Square patches ``[N, size * size]`` around rounded pixels ``[N, 2]``; NaN where they leave the image."""
+    half = size // 2
+    height, width = gray.shape
+    centre = np.rint(xy.clip(-1e6, 1e6)).astype(np.intp)
+    fits = ((centre >= half) & (centre < (width - half, height - half))).all(axis=1)
+    span = np.arange(-half, half + 1)
+    columns = centre[:, 0, None, None].clip(half, width - half - 1) + span[None, None, :]
+    rows = centre[:, 1, None, None].clip(half, height - half - 1) + span[None, :, None]
+    cut = gray[rows, columns].reshape(len(xy), -1).astype(np.float64)
+    cut[~fits] = np.nan
+    return np.asarray(cut)
+
+
+def zncc(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Zero-mean normalised cross-correlation ``[N]`` of patches ``[N, M]``; NaN where a patch is flat or missing."""
+    a, b = (patch - patch.mean(axis=1, keepdims=True) for patch in (first, second))
+    norm = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(norm > 1e-6, (a * b).sum(axis=1) / norm, np.nan))

@@ -1,1 +1,0 @@
-"""What several rejection rules share."""

@@ -1,1 +1,0 @@
-"""DAISY Filter Flow at sparse points: maps, descriptor, matching cost, refinement."""

@@ -1,1 +1,0 @@
-"""Dense DAISY Filter Flow: superpixel labels, guided filter, winner takes all."""

@@ -1,1 +1,0 @@
-"""How the flow's kernels are compiled, and the values they compute with."""

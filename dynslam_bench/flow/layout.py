@@ -1,0 +1,124 @@
+"""The DAISY descriptor's sampling pattern for every quantised label, and the arrangement of the orientation maps.
+
+The layout is DAISY Filter Flow's: radius 16 px, two rings of eight histograms around a centre, eight bins each:
+(2 * 8 + 1) * 8 = 136 numbers. The Gaussian of ring r has sigma (r + 1) * 16 / 4 = 4, 8 px; the centre shares ring 0's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+RINGS = 2
+ANGLES = 8
+BINS = 8
+HISTOGRAMS = RINGS * ANGLES + 1
+LENGTH = HISTOGRAMS * BINS
+RING_RADII = (8.0, 16.0)
+RING_SIGMAS = (4.0, 8.0)
+
+SCALE_STEP_OCTAVES = 0.25
+SCALE_LOW, SCALE_HIGH = -4, 5
+"""Scale indices: s = 2 ** (k / 4) for k in -4..5, that is 0.5 to 2.38."""
+ANGLE_STEP_DEG = 7.5
+ANGLE_LOW, ANGLE_HIGH = -6, 6
+"""Rotation indices: 7.5 degrees each, -45 to 45."""
+SCALES = SCALE_HIGH - SCALE_LOW + 1
+ROTATIONS = ANGLE_HIGH - ANGLE_LOW + 1
+
+LEVEL_SIGMAS = (2.0, 2.0 * 2**0.5, 4.0, 4.0 * 2**0.5, 8.0, 8.0 * 2**0.5, 16.0)
+"""Gaussian sigmas of the orientation maps, px of the full image."""
+LEVEL_STEPS = (2, 2, 2, 4, 4, 4, 4)
+"""Full-image pixels per map pixel of each level."""
+LEVEL_BLURS = ((5, 1), (5, 1), (3, 2), (5, 1), (3, 2), (5, 2), (3, 4))
+"""Each level's blur of the one before: taps of a binomial and their distance in map pixels.
+
+Its variance is ``(taps - 1) / 4 * distance ** 2``: 1, 1, 2 at half resolution, that is sigmas of 2, 2.83 and 4 px; the
+mean of 2 x 2 brings 4.12 px, and 1, 2, 4, 8 at quarter resolution make 5.7, 8.1, 11.4 and 16.1.
+"""
+MARGIN = 48
+"""Empty border around each map in full-image pixels: the outermost sample lies 16 * 2.38 = 38 px from the centre."""
+
+SUBPIXEL = 4
+"""Positions are quantised to a quarter of a pixel before the map is indexed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingTable:
+    """Integer sampling pattern of all quantised labels.
+
+    Attributes:
+        offsets: int32 ``[SCALES, ROTATIONS, HISTOGRAMS, 2]``, displacement (x, y) from the centre in quarter pixels.
+        ring_level: int32 ``[SCALES, RINGS]``, map level of each ring at each scale.
+    """
+
+    offsets: NDArray[np.int32]
+    ring_level: NDArray[np.int32]
+
+
+def unit_pattern() -> NDArray[np.float64]:
+    """The 17 sampling points of the unscaled, unrotated descriptor, ``[HISTOGRAMS, 2]`` px: centre, ring 0, ring 1."""
+    angles = np.arange(ANGLES) * (2 * np.pi / ANGLES)
+    rings = [np.stack([np.cos(angles), np.sin(angles)], axis=1) * radius for radius in RING_RADII]
+    return np.concatenate([np.zeros((1, 2)), *rings])
+
+
+def level_of(sigma: float) -> int:
+    """The map level whose Gaussian is closest to `sigma` in ratio."""
+    return int(np.argmin(np.abs(np.log(np.asarray(LEVEL_SIGMAS)) - np.log(sigma))))
+
+
+def sampling_table() -> SamplingTable:
+    """The pattern for every scale and rotation index: ``s * R(theta) * g_k`` (Eq. 1's D_{s,theta})."""
+    pattern = unit_pattern()
+    scales = 2.0 ** (np.arange(SCALE_LOW, SCALE_HIGH + 1) * SCALE_STEP_OCTAVES)
+    theta = np.deg2rad(np.arange(ANGLE_LOW, ANGLE_HIGH + 1) * ANGLE_STEP_DEG)
+    c, s = np.cos(theta), np.sin(theta)
+    rotation = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    points = np.einsum("s,rij,kj->srki", scales, rotation, pattern)
+    levels = [[level_of(scale * sigma) for sigma in RING_SIGMAS] for scale in scales]
+    return SamplingTable(np.rint(points * SUBPIXEL).astype(np.int32), np.asarray(levels, dtype=np.int32))
+
+
+class MapGeometry(NamedTuple):
+    """Where each level lies in the flat histogram array.
+
+    Attributes:
+        base: int64 ``[LEVELS]``, index of each level's first histogram (the corner of its margin).
+        stride: int64 ``[LEVELS]``, histograms a row, margins included.
+        shift: int64 ``[LEVELS]``, quarter pixels to map pixels: ``index = (position + bias) >> shift``.
+        bias: int64 ``[LEVELS]``, rounding and margin.
+        total: Number of histograms.
+    """
+
+    base: NDArray[np.int64]
+    stride: NDArray[np.int64]
+    shift: NDArray[np.int64]
+    bias: NDArray[np.int64]
+    total: int
+
+
+def level_shape(height: int, width: int, step: int) -> tuple[int, int]:
+    """Rows and columns of a level with `step` full-image pixels a map pixel; an odd last row or column is dropped."""
+    for _ in range(int(np.log2(step))):
+        height, width = max(1, height // 2), max(1, width // 2)
+    return height, width
+
+
+@lru_cache(maxsize=16)
+def map_geometry(height: int, width: int) -> MapGeometry:
+    """The arrangement of the seven levels for an image size in pixels."""
+    levels, total = [], 0
+    for step in LEVEL_STEPS:
+        rows, columns = level_shape(height, width, step)
+        margin = MARGIN // step
+        # full-image x (pixel centres at integers) lies in map pixel floor((x + 0.5) / step)
+        shift, bias = int(np.log2(step * SUBPIXEL)), SUBPIXEL // 2 + margin * step * SUBPIXEL
+        levels.append((total, columns + 2 * margin, shift, bias))
+        total += (rows + 2 * margin) * (columns + 2 * margin)
+    table = np.array(levels, dtype=np.int64).T.copy()
+    return MapGeometry(table[0], table[1], table[2], table[3], total)

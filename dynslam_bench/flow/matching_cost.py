@@ -1,0 +1,354 @@
+"""The matching cost (Eq. 1) of labels at sparse points, for the processor.
+
+A label is ``(u, v, s, theta)``: displacement in pixels, log2 scale, rotation in radians. It maps the neighbourhood of a
+point p by ``p' = p + (u, v) + 2**s R(theta) (q - p)``. The target is sampled at the label's scale and rotation; the
+rotation of the *bins* is applied to the reference descriptor, once for each of the 13 quantised angles.
+
+Costs are whole numbers (255 = Euclidean length of a histogram), so that they do not depend on summation order,
+vector width or device.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+from dynslam_bench.flow import layout
+from dynslam_bench.flow.layout import map_geometry
+from dynslam_bench.flow.orientation_maps import OrientationMaps
+from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.simd import Bytes, Floats, Ints, Longs, descriptor_sum
+
+Term = tuple[float, float]
+"""Weight and limit of a term of Eq. 1."""
+
+OUTSIDE = 1 << 20
+"""Cost of a label that leaves the target image."""
+MAX_COST = 0.75
+"""Share of the largest cost above which a point is not valid."""
+TRUNCATION = 0.882
+"""t of Eq. 1: largest L1 distance of one histogram of unit norm (not stated in the paper)."""
+INTENSITY: Term = (55.0, 7 / 255)
+"""alpha and t1 of Eq. 1, for images in [0, 1] (not stated in the paper)."""
+GRADIENT: Term = (190.0, 2 / 255)
+"""beta and t2 of Eq. 1, likewise."""
+
+
+class CostTables(NamedTuple):
+    """Tables of the cost that depend on the image size and the weights only.
+
+    Attributes:
+        samples: int32 ``[SCALES, ROTATIONS, 4, 17]``, byte offset of each histogram from the centre's cell, for the
+            four half-cell positions (2 * lower half + right half) of the centre within its cell.
+        ring0: int64 ``[SCALES, 4]``, base, stride, shift, bias of the centre's and first ring's level.
+        ring1: int64 ``[SCALES, 4]``, of the second ring's level.
+        truncation: Largest cost of one histogram (t of Eq. 1, times 255).
+        intensity: int32 ``[256]``, cost of an absolute grey-level difference: ``alpha * min(d, t1)``.
+        gradient: int32 ``[256]``, cost of an absolute difference of gradient magnitudes: ``beta * min(d, t2)``.
+        appearance: Whether either of the two is not zero.
+        support: int64 ``[S, 2]``, points around p over which the cost is summed, pixels.
+        ceiling: Largest cost of a label inside the image.
+    """
+
+    samples: NDArray[np.int32]
+    ring0: NDArray[np.int64]
+    ring1: NDArray[np.int64]
+    truncation: int
+    intensity: NDArray[np.int32]
+    gradient: NDArray[np.int32]
+    appearance: bool
+    support: NDArray[np.int64]
+    ceiling: int
+
+
+class Side(NamedTuple):
+    """One image as the kernels see it: flat histogram bytes and grey levels."""
+
+    histograms: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
+
+
+class Reference(NamedTuple):
+    """The points as the kernels see them.
+
+    Attributes:
+        points: float32 ``[N, 2]``.
+        descriptors: uint8, flat ``[N, S, ROTATIONS, 136]`` of `describe`.
+        appearance: int32 ``[N, S, 2]``, grey level and gradient magnitude at the support.
+    """
+
+    points: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    appearance: NDArray[np.int32]
+
+
+class MatchingCosts(NamedTuple):
+    """Arguments of the cost: points, target image, tables."""
+
+    reference: Reference
+    target: Side
+    tables: CostTables
+
+
+def side(maps: OrientationMaps) -> Side:
+    """The kernels' view of a prepared image."""
+    return Side(maps.histograms.reshape(-1), maps.gray)
+
+
+def tables_for(shape: tuple[int, ...], settings: FlowSettings) -> CostTables:
+    """The tables of an image's shape ``(H, W)`` under the settings' terms and support of Eq. 1."""
+    terms = (INTENSITY, GRADIENT) if settings.terms == 3 else ((0.0, 0.0), (0.0, 0.0))
+    return cost_tables(shape[0], shape[1], *terms, settings.support, settings.support_spacing_px)
+
+
+@lru_cache(maxsize=32)
+def cost_tables(
+    height: int, width: int, grey_level: Term, slope: Term, support: int = 1, spacing: int = 4
+) -> CostTables:
+    """Tables for an image size and the weights of Eq. 1.
+
+    Args:
+        height: Image height in pixels.
+        width: Image width in pixels.
+        grey_level: alpha and t1 (grey levels) of the grey-level term, for images in [0, 1].
+        slope: beta and t2 (grey levels a pixel) of the gradient term, likewise.
+        support: Number of points around p (1, 5 for a cross, 9 for a square).
+        spacing: Their distance in pixels.
+    """
+    (alpha, intensity_limit), (beta, gradient_limit) = grey_level, slope
+    pattern = layout.sampling_table()
+    geometry = map_geometry(height, width)
+    per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
+    level = np.repeat(pattern.ring_level, (9, 8), axis=1)  # [SCALES, 17]
+    steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
+    half_cell = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])[None, None, :, None, :]
+    cells = np.floor(half_cell + pattern.offsets[:, :, None] / (layout.SUBPIXEL * steps)).astype(np.int64)
+    samples = 8 * (cells[..., 1] * geometry.stride[level][:, None, None, :] + cells[..., 0])
+    grey = np.arange(256) / 255.0
+    square = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)][:support]
+    intensity = np.rint(255 * alpha * np.minimum(grey, intensity_limit)).astype(np.int32)
+    gradient = np.rint(255 * beta * np.minimum(grey, gradient_limit)).astype(np.int32)
+    limit = round(TRUNCATION * 255)
+    return CostTables(
+        samples.astype(np.int32),
+        np.ascontiguousarray(per_level[pattern.ring_level[:, 0]]),
+        np.ascontiguousarray(per_level[pattern.ring_level[:, 1]]),
+        limit,
+        intensity,
+        gradient,
+        bool(intensity.any() or gradient.any()),
+        np.asarray(square, dtype=np.int64) * spacing,
+        support * (layout.HISTOGRAMS * limit + int(intensity.max()) + int(gradient.max())),
+    )
+
+
+@inlined
+def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
+    """Byte offset of the map cell that holds a full-image position, and the quarter of the cell it lies in."""
+    xq = np.int64(x * np.float32(4) + np.float32(0.5)) + level[3]
+    yq = np.int64(y * np.float32(4) + np.float32(0.5)) + level[3]
+    finer = level[2] - 1
+    xh, yh = xq >> finer, yq >> finer
+    return 8 * (level[0] + (yh >> 1) * level[1] + (xh >> 1)), 2 * (yh & 1) + (xh & 1)
+
+
+@kernel
+def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTables, out: Bytes) -> None:
+    """Reference descriptors of points, with their bins rotated by each quantised angle.
+
+    Args:
+        start: First point.
+        stop: One past the last point.
+        points: float32 ``[N, 2]``.
+        image: `Side` of the reference.
+        tables: `CostTables`.
+        out: uint8, flat ``[N, S, ROTATIONS, 17 * 8]``.
+    """
+    height, width = image.gray.shape
+    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
+    turned = np.empty((4, 136), dtype=np.int32)  # bins shifted by -1, 0, 1, 2
+    supports = len(tables.support)
+    for i in range(start, stop):
+        for q in range(supports):
+            x = min(max(points[i, 0] + np.float32(tables.support[q, 0]), np.float32(0)), np.float32(width - 1))
+            y = min(max(points[i, 1] + np.float32(tables.support[q, 1]), np.float32(0)), np.float32(height - 1))
+            cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
+            cell1, phase1 = cell_of(x, y, tables.ring1[neutral])
+            for k in range(17):
+                if k < 9:
+                    cell = cell0 + tables.samples[neutral, straight, phase0, k]
+                else:
+                    cell = cell1 + tables.samples[neutral, straight, phase1, k]
+                for b in range(8):
+                    value = np.int32(image.histograms[cell + b])
+                    for turn in range(4):
+                        turned[turn, 8 * k + ((b + turn - 1) & 7)] = value
+            for a in range(13):
+                # bin b of the histogram rotated by theta is the unrotated one's at b - theta / 45 degrees
+                sixths = a - 6
+                whole = sixths // 6
+                far_weight = np.int32((sixths - 6 * whole) * 171)  # 1026 / 6
+                near_weight = np.int32(1026) - far_weight
+                near, far = turned[whole + 1], turned[whole + 2]
+                first = ((i * supports + q) * 13 + a) * 136
+                rotated = out[first : first + 136]
+                for b in range(136):
+                    rotated[b] = np.uint8((near_weight * near[b] + far_weight * far[b] + np.int32(512)) >> 10)
+
+
+@inlined
+def describe_once(x: Scalar, y: Scalar, a: int, image: Side, tables: CostTables, out: Bytes, first: int) -> None:
+    """The descriptor of one position for rotation index `a`, without support: 136 bytes of `out` from `first` on."""
+    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
+    cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
+    cell1, phase1 = cell_of(x, y, tables.ring1[neutral])
+    sixths = a - 6
+    whole = sixths // 6
+    far_weight = np.int32((sixths - 6 * whole) * 171)
+    near_weight = np.int32(1026) - far_weight
+    for k in range(17):
+        cell = cell0 + tables.samples[neutral, straight, phase0, k]
+        if k >= 9:
+            cell = cell1 + tables.samples[neutral, straight, phase1, k]
+        rotated = out[first + 8 * k : first + 8 * k + 8]
+        if a == 6:
+            for b in range(8):
+                rotated[b] = image.histograms[cell + b]
+            continue
+        for b in range(8):
+            near = np.int32(image.histograms[cell + ((b - whole) & 7)])
+            far = np.int32(image.histograms[cell + ((b - whole - 1) & 7)])
+            rotated[b] = np.uint8((near_weight * near + far_weight * far + np.int32(512)) >> 10)
+
+
+@inlined
+def descriptor_distance(
+    x: Scalar, y: Scalar, si: int, ti: int, mine: int, descriptor: Bytes, target: Side, tables: CostTables
+) -> Scalar:
+    """First term of Eq. 1: truncated distance of 136 bytes at `mine` to the target at (x, y), scale si, rotation ti."""
+    near, near_phase = cell_of(x, y, tables.ring0[si])
+    far, far_phase = cell_of(x, y, tables.ring1[si])
+    row = 4 * (si * layout.ROTATIONS + ti)
+    theirs, near_row, far_row = target.histograms, row + near_phase, row + far_phase
+    return descriptor_sum(theirs, tables.samples, near_row, far_row, near, far, descriptor, mine, tables.truncation)
+
+
+@inlined
+def quantised(s: Scalar, theta: Scalar) -> tuple[Scalar, Scalar]:
+    """Scale and rotation index of a label."""
+    si = np.int64(np.floor(s * np.float32(4) + np.float32(0.5))) - layout.SCALE_LOW
+    ti = np.int64(np.floor(theta * np.float32(7.639437268410976) + np.float32(0.5))) - layout.ANGLE_LOW
+    return min(max(si, 0), 9), min(max(ti, 0), 12)
+
+
+@inlined
+def label_cost(
+    i: int, u: Scalar, v: Scalar, s: Scalar, theta: Scalar, reference: Reference, target: Side, tables: CostTables,
+    bound: Scalar,
+) -> Scalar:  # fmt: skip
+    """Eq. 1 of one label at point i, summed over the support; may stop early once `bound` is reached.
+
+    Args:
+        i: Index of the point.
+        u: Displacement, pixels.
+        v: Displacement, pixels.
+        s: Log2 of the scale.
+        theta: Rotation, radians.
+        reference: `Reference`.
+        target: `Side` of the target.
+        tables: `CostTables`.
+        bound: A cost from which on the exact value does not matter.
+    """
+    height, width = target.gray.shape
+    cx, cy = reference.points[i, 0] + u, reference.points[i, 1] + v
+    if not (cx >= 0 and cy >= 0 and cx <= width - 1 and cy <= height - 1):
+        return np.int64(OUTSIDE)
+    si, ti = quantised(s, theta)
+    supports = len(tables.support)
+    total = np.int64(0)
+    for q in range(supports):
+        tx, ty = cx, cy
+        if q > 0:
+            scale = np.float32(np.exp2(s))
+            c, n = np.cos(theta) * scale, np.sin(theta) * scale
+            dx, dy = np.float32(tables.support[q, 0]), np.float32(tables.support[q, 1])
+            tx = min(max(cx + c * dx - n * dy, np.float32(0)), np.float32(width - 1))
+            ty = min(max(cy + n * dx + c * dy, np.float32(0)), np.float32(height - 1))
+        mine = ((i * supports + q) * 13 + ti) * 136
+        total += descriptor_distance(tx, ty, si, ti, mine, reference.descriptors, target, tables)
+        if tables.appearance:
+            gray, gradient = appearance(target.gray, tx, ty)
+            total += tables.intensity[abs(gray - reference.appearance[i, q, 0])]
+            total += tables.gradient[min(abs(gradient - reference.appearance[i, q, 1]), 255)]
+        if total >= bound:
+            return total
+    return total
+
+
+@inlined
+def appearance(gray: Bytes, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
+    """Grey level and gradient magnitude (central differences) at the pixel nearest to a position."""
+    height, width = gray.shape
+    column = min(max(np.int64(x + np.float32(0.5)), 0), width - 1)
+    row = min(max(np.int64(y + np.float32(0.5)), 0), height - 1)
+    gx = np.int64(gray[row, min(column + 1, width - 1)]) - np.int64(gray[row, max(column - 1, 0)])
+    gy = np.int64(gray[min(row + 1, height - 1), column]) - np.int64(gray[max(row - 1, 0), column])
+    magnitude = np.int64(np.sqrt(np.float32(gx * gx + gy * gy)) * np.float32(0.5) + np.float32(0.5))
+    return np.int64(gray[row, column]), magnitude
+
+
+@kernel
+def reference_appearance(points: Floats, image: Side, tables: CostTables, out: Ints) -> None:
+    """Fill int32 ``[N, S, 2]`` with the reference's grey levels and gradient magnitudes at the support."""
+    for i in range(len(points)):
+        for q in range(len(tables.support)):
+            gray, gradient = appearance(
+                image.gray,
+                points[i, 0] + np.float32(tables.support[q, 0]),
+                points[i, 1] + np.float32(tables.support[q, 1]),
+            )
+            out[i, q, 0] = gray
+            out[i, q, 1] = gradient
+
+
+@kernel
+def parabola(
+    start: int, stop: int, labels: Floats, step: float, reference: Reference, target: Side, tables: CostTables,
+    used: Longs,
+) -> None:  # fmt: skip
+    """Move each label to the vertex of the parabolas through its cost and those `step` pixels beside it.
+
+    Args:
+        start: First point.
+        stop: One past the last.
+        labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
+        step: Pixels.
+        reference: `matching_cost.Reference`.
+        target: `matching_cost.Side`.
+        tables: `matching_cost.CostTables`.
+        used: int64 ``[N]``, cost evaluations, counted on.
+    """
+    far = np.int64(1 << 40)
+    for i in range(start, stop):
+        u, v, s, theta = labels[i, 0], labels[i, 1], labels[i, 2], labels[i, 3]
+        middle = label_cost(i, u, v, s, theta, reference, target, tables, far)
+        left = label_cost(i, u - step, v, s, theta, reference, target, tables, far)
+        right = label_cost(i, u + step, v, s, theta, reference, target, tables, far)
+        up = label_cost(i, u, v - step, s, theta, reference, target, tables, far)
+        down = label_cost(i, u, v + step, s, theta, reference, target, tables, far)
+        used[i] += 5
+        labels[i, 0] = u + step * vertex(left, middle, right)
+        labels[i, 1] = v + step * vertex(up, middle, down)
+
+
+@inlined
+def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
+    """Position of the minimum of a parabola through values at -1, 0, 1, within these; 0 if it is not convex."""
+    curvature = before + after - 2 * middle
+    if curvature <= 0:
+        return np.float32(0)
+    return min(max(np.float32(before - after) / np.float32(2 * curvature), np.float32(-1)), np.float32(1))

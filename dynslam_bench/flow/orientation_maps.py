@@ -1,0 +1,314 @@
+"""Convolved orientation maps for the processor: what DAISY needs of one image, computed once a frame.
+
+Eight rectified directional derivatives are blurred in a cascade of seven Gaussians. Maps of small Gaussians are stored
+at half, of large ones at quarter resolution. Each histogram is normalised on its own (partial normalisation) and stored
+as eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `tests/flow/daisy_reference.py` follows
+the definition.
+
+A Gaussian is replaced by the binomial of equal variance, made of rounded means: ``[1 4 6 4 1] / 16`` has variance 1 and
+``[1 2 1] / 4`` one half, times the square of the taps' distance (which may exceed one where the rows are smooth enough
+already). Rows move through short rings of lines that stay in the cache; neighbouring stripes compute the few lines that
+they share twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import inlined, kernel
+from dynslam_bench.flow import layout
+from dynslam_bench.flow.layout import MapGeometry, level_shape, map_geometry
+from dynslam_bench.flow.refinement import BORDER, pad_image
+from dynslam_bench.flow.simd import (
+    Bytes,
+    Halves,
+    Longs,
+    average,
+    average_of_pairs,
+    derivatives,
+    load_uint16,
+    store_normalised,
+    store_uint16,
+)
+from dynslam_bench.flow.workers import BufferPool, Workers
+
+NORM_FLOOR = 0.01 * 255.0
+"""Added to a histogram's norm before dividing, so that flat regions stay near zero (0.01 for images in [0, 1])."""
+FIXED_POINT = 256
+"""Units a grey level in the blurred derivatives."""
+RING = 16
+"""Lines stored of each level; a power of two above twice the farthest tap."""
+SPILL = 64
+"""Numbers that vector code may access beyond a line's end."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrientationMaps:
+    """One prepared image.
+
+    Attributes:
+        gray: uint8 ``[H, W]``, the image.
+        framed: uint8 ``[H + 96, W + 96]``, the image with its edges repeated (`refinement.BORDER`).
+        framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, likewise.
+        histograms: uint8 ``[total, 8]``, all levels; a unit-norm histogram has Euclidean length 255.
+        geometry: How to index them.
+    """
+
+    gray: NDArray[np.uint8]
+    framed: NDArray[np.uint8]
+    framed_half: NDArray[np.uint8]
+    histograms: NDArray[np.uint8]
+    geometry: MapGeometry
+
+
+def orientation_maps(
+    gray: NDArray[np.uint8], workers: Workers | None = None, buffers: BufferPool | None = None
+) -> OrientationMaps:
+    """Compute the maps of a uint8 ``[H, W]`` image; the result does not depend on the number of threads.
+
+    Args:
+        gray: The image.
+        workers: Threads over which rows are divided; None for the calling thread alone.
+        buffers: Reuses the memory of maps that are no longer referenced; None allocates.
+    """
+    workers, buffers = workers or Workers(), buffers or BufferPool()
+    gray = np.ascontiguousarray(gray)
+    height, width = gray.shape
+    geometry = map_geometry(height, width)
+    (rows, columns), (quarter_rows, quarter_columns) = level_shape(height, width, 2), level_shape(height, width, 4)
+    histograms, whole, half = buffers.take(
+        (geometry.total, layout.BINS),
+        (height + 2 * BORDER, width + 2 * BORDER),
+        (rows + 2 * BORDER, columns + 2 * BORDER),
+    )
+    coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
+    floor = np.float32(NORM_FLOOR * FIXED_POINT)
+    blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)
+    fine = layout.LEVEL_STEPS.count(2)
+    cells = histograms.reshape(-1)
+    workers.run(fine_levels, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
+    workers.run(coarse_levels, quarter_rows, coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells)
+    pad_image(half[BORDER : BORDER + rows, BORDER : BORDER + columns], BORDER, half)
+    pad_image(gray, BORDER, whole)
+    return OrientationMaps(gray, whole, half, histograms, geometry)
+
+
+@inlined
+def blur(
+    source: Halves, middle: int, near: tuple[int, int], far: tuple[int, int], taps: int, out: Halves, out_at: int,
+    length: int,
+) -> None:  # fmt: skip
+    """A binomial blur of 3 or 5 taps, which begin at the given indices of the flat source."""
+    for i in range(0, length, 32):
+        centre = load_uint16(source, middle + i)
+        beside = average(load_uint16(source, near[0] + i), load_uint16(source, near[1] + i))
+        if taps == 3:
+            store_uint16(out, out_at + i, average(centre, beside))
+        else:
+            beyond = average(load_uint16(source, far[0] + i), load_uint16(source, far[1] + i))
+            store_uint16(out, out_at + i, average(beside, average(centre, average(centre, beyond))))
+
+
+@inlined
+def smooth_line(
+    ring: Halves, pitch: int, row: int, rows: int, columns: int, taps: int, distance: int, line: Halves, out: Halves,
+    out_at: int,
+) -> None:  # fmt: skip
+    """One row of a separable binomial blur, edges repeated.
+
+    Args:
+        ring: uint16, flat ``[RING, pitch]``, source rows; row y lies at ``y % RING``.
+        pitch: Numbers a line.
+        row: The row.
+        rows: Rows of the source image.
+        columns: Its columns.
+        taps: 3 or 5.
+        distance: Between taps, pixels.
+        line: uint16, scratch.
+        out: uint16, flat, receives the row ...
+        out_at: ... from this index on.
+    """
+    length, pad = 8 * columns, 16 * distance
+    last, wrap = rows - 1, RING - 1
+    above, below = (max(row - distance, 0) & wrap) * pitch, (min(row + distance, last) & wrap) * pitch
+    far = (max(row - 2 * distance, 0) & wrap) * pitch, (min(row + 2 * distance, last) & wrap) * pitch
+    blur(ring, (row & wrap) * pitch, (above, below), far, taps, line, pad, length)
+    for t in range(0, pad, 8):
+        for k in range(8):
+            line[t + k] = line[pad + k]
+            line[pad + length + t + k] = line[pad + length - 8 + k]
+    step = 8 * distance
+    blur(line, pad, (pad - step, pad + step), (pad - 2 * step, pad + 2 * step), taps, out, out_at, length)
+
+
+@inlined
+def normalise_line(line: Halves, at: int, columns: int, floor: float, cells: Bytes, first: int) -> None:
+    """Partially normalised bytes of one row; bytes that the last vector writes into the margin are cleared."""
+    length = 8 * columns
+    for i in range(0, length, 32):
+        store_normalised(cells, first + i, load_uint16(line, at + i), floor)
+    for i in range(length, 32 * ((length + 31) // 32)):
+        cells[first + i] = 0
+
+
+@inlined
+def sum_line(gray: Bytes, row: int, sums: Halves, at: int, columns: int) -> None:
+    """Sums over 2 x 2 pixels of one half-resolution row, with one repeated number on either side."""
+    height, width = gray.shape
+    upper, lower = gray[min(2 * row, height - 1)], gray[min(2 * row + 1, height - 1)]
+    for x in range(min(columns, width // 2)):
+        sums[at + x] = np.uint16(
+            (np.uint16(upper[2 * x]) + np.uint16(upper[2 * x + 1]))
+            + (np.uint16(lower[2 * x]) + np.uint16(lower[2 * x + 1]))
+        )
+    if width == 1:
+        sums[at] = np.uint16(2 * (np.uint16(upper[0]) + np.uint16(lower[0])))
+    sums[at - 1], sums[at + columns] = sums[at], sums[at + columns - 1]
+
+
+@inlined
+def quarter_line(rows: Halves, upper: int, lower: int, columns: int, target: Halves) -> None:
+    """Means of 2 x 2 histograms of the rows that begin at `upper` and `lower`; a single column is its own neighbour."""
+    for k in range(8):
+        for row in (lower, upper):
+            rows[row + 8 * columns + k] = rows[row + 8 * columns - 8 + k]
+    for i in range(0, len(target) - 31, 32):
+        left = average(load_uint16(rows, upper + 2 * i), load_uint16(rows, lower + 2 * i))
+        right = average(load_uint16(rows, upper + 2 * i + 32), load_uint16(rows, lower + 2 * i + 32))
+        store_uint16(target, i, average_of_pairs(left, right))
+
+
+@inlined
+def level_reach(blurs: Longs) -> Longs:
+    """Rows beyond a stripe that each level must compute for the levels after it, int64 ``[L + 1]``."""
+    reach = np.zeros(len(blurs) + 1, dtype=np.int64)
+    for level in range(len(blurs) - 1, -1, -1):
+        reach[level] = reach[level + 1] + (blurs[level, 0] // 2) * blurs[level, 1]
+    return reach
+
+
+@inlined
+def blur_cascade(
+    rings: Halves, pitch: int, row: int, rows: int, columns: int, top: int, bottom: int, blurs: Longs, reach: Longs,
+    first_level: int, geometry: MapGeometry, margin: int, floor: float, cells: Bytes, line: Halves,
+) -> int:  # fmt: skip
+    """Compute the rows of all levels that the newest source row completes; returns the last level's row.
+
+    Args:
+        rings: uint16 ``[L + 1, RING * pitch]``, the lines of the source and of each level.
+        pitch: Numbers a line.
+        row: The newest source row.
+        rows: Rows of the levels.
+        columns: Their columns.
+        top: First row of the stripe.
+        bottom: One past its last row.
+        blurs: int64 ``[L, 2]``, taps and distance of each level.
+        reach: Of `level_reach`.
+        first_level: Number of the first of these levels.
+        geometry: `layout.MapGeometry`.
+        margin: Empty histograms around the maps.
+        floor: Added to norms.
+        cells: uint8, flat, all levels' histograms.
+        line: uint16, scratch.
+    """
+    y = row
+    for level in range(len(blurs)):
+        taps, distance = blurs[level, 0], blurs[level, 1]
+        y -= (taps // 2) * distance
+        if not (max(top - reach[level + 1], 0) <= y < min(bottom + reach[level + 1], rows)):
+            continue
+        at = (y & (RING - 1)) * pitch
+        smooth_line(rings[level], pitch, y, rows, columns, taps, distance, line, rings[level + 1], at)
+        if top <= y < bottom:
+            number = first_level + level
+            cell = geometry.base[number] + (margin + y) * geometry.stride[number] + margin
+            normalise_line(rings[level + 1], at, columns, floor, cells, 8 * cell)
+    return y
+
+
+@kernel
+def fine_levels(
+    start: int, stop: int, gray: Bytes, half: Bytes, blurs: Longs, geometry: MapGeometry, floor: float, cells: Bytes,
+    coarse: Halves,
+) -> None:  # fmt: skip
+    """The half-resolution levels, and the means of the last one at quarter resolution.
+
+    Args:
+        start: First pair of half-resolution rows.
+        stop: One past the last pair.
+        gray: uint8 ``[H, W]``.
+        half: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, receives the rounded mean over 2 x 2 pixels.
+        blurs: int64 ``[L, 2]``, taps and distance of each level.
+        geometry: `layout.MapGeometry`.
+        floor: Added to norms.
+        cells: uint8, flat, all levels' histograms.
+        coarse: uint16 ``[quarter rows, >= 8 quarter columns]``, receives the means of 2 x 2 histograms.
+    """
+    rows, columns = half.shape[0] - 2 * BORDER, half.shape[1] - 2 * BORDER
+    levels, length = len(blurs), 32 * ((8 * columns + 31) // 32)
+    pitch, sum_pitch = length + SPILL, columns + 2 + SPILL
+    rings = np.zeros((levels + 1, RING * pitch), dtype=np.uint16)
+    line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
+    sums = np.zeros(4 * sum_pitch, dtype=np.uint16)
+    top, bottom = 2 * start, min(2 * stop, rows)
+    reach = level_reach(blurs)
+    first, summed = max(top - reach[0], 0), max(top - reach[0] - 1, 0)
+    for row in range(first, bottom + reach[0]):
+        if row < min(bottom + reach[0], rows):
+            while summed <= min(row + 1, rows - 1):
+                at = (summed & 3) * sum_pitch + 1
+                sum_line(gray, summed, sums, at, columns)
+                if top <= summed < bottom:
+                    target = half[BORDER + summed]
+                    for x in range(columns):
+                        target[BORDER + x] = np.uint8((sums[at + x] + np.uint16(2)) >> np.uint16(2))
+                summed += 1
+            here = (row & 3) * sum_pitch + 1
+            above, below = (max(row - 1, 0) & 3) * sum_pitch + 1, (min(row + 1, rows - 1) & 3) * sum_pitch + 1
+            at = (row & (RING - 1)) * pitch
+            for x in range(0, columns, 4):
+                store_uint16(rings[0], at + 8 * x, derivatives(sums, here + x, above + x, below + x))
+        y = blur_cascade(
+            rings, pitch, row, rows, columns, top, bottom, blurs, reach, 0, geometry, layout.MARGIN // 2, floor, cells,
+            line,
+        )  # fmt: skip
+        if top <= y < bottom and (y & 1 or rows == 1) and y // 2 < len(coarse):
+            upper, lower = ((y & ~1) & (RING - 1)) * pitch, (y & (RING - 1)) * pitch
+            quarter_line(rings[levels], upper, lower, columns, coarse[y // 2])
+
+
+@kernel
+def coarse_levels(
+    start: int, stop: int, coarse: Halves, columns: int, blurs: Longs, first_level: int, geometry: MapGeometry,
+    floor: float, cells: Bytes,
+) -> None:  # fmt: skip
+    """The quarter-resolution levels of rows start..stop.
+
+    Args:
+        start: First row.
+        stop: One past the last.
+        coarse: uint16 ``[rows, >= 8 columns]`` of `fine_levels`.
+        columns: Pixels a row.
+        blurs: int64 ``[L, 2]``, taps and distance of each level.
+        first_level: Number of the first of these levels.
+        geometry: `layout.MapGeometry`.
+        floor: Added to norms.
+        cells: uint8, flat, all levels' histograms.
+    """
+    rows, length = len(coarse), 32 * ((8 * columns + 31) // 32)
+    pitch = length + SPILL
+    rings = np.zeros((len(blurs) + 1, RING * pitch), dtype=np.uint16)
+    line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
+    reach = level_reach(blurs)
+    for row in range(max(start - reach[0], 0), stop + reach[0]):
+        if row < rows:
+            source, at = coarse[row], (row & (RING - 1)) * pitch
+            for i in range(0, length, 32):
+                store_uint16(rings[0], at + i, load_uint16(source, i))
+        blur_cascade(
+            rings, pitch, row, rows, columns, start, stop, blurs, reach, first_level, geometry, layout.MARGIN // 4,
+            floor, cells, line,
+        )  # fmt: skip

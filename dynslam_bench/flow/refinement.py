@@ -1,0 +1,297 @@
+"""Photometric refinement of labels: Lucas-Kanade with four degrees of freedom.
+
+Inverse compositional (Baker and Matthews 2004): template gradients and Hessian are computed once a point, the label's
+warp is updated until it converges. Patch means are removed, so that a change of brightness has no influence.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dynslam_bench.core.compiled import Scalar, inlined, kernel
+from dynslam_bench.flow.simd import Bytes, Doubles, Floats, Ints, load, load_bytes, sample, spread, store, total
+
+BORDER = 48
+"""Pixels repeated around the images that are refined on."""
+FLAT_VARIANCE = 1.0
+"""Below this variance, in squared grey levels, a window is flat."""
+FLAT_GRADIENT = 4.0 * 0.05
+"""Smallest mean squared gradient along the worse direction: 0.05 squared levels a pixel, differences over two."""
+SIMILARITY_DAMPING = 0.1
+"""Prior on the change of scale and rotation, relative to the translation's information at the window's edge."""
+
+
+class Window(NamedTuple):
+    """The square window that is aligned, and when to stop.
+
+    Attributes:
+        step: Full-image pixels a pixel of the images.
+        radius: In pixels of the images.
+        margin: Largest translation within one warp, in their pixels, at least 1.
+        warps: Times the target is warped, at most.
+        iterations: Translations a warp, at most.
+        tolerance: Stop below this change, in their pixels.
+    """
+
+    step: int
+    radius: int
+    margin: int
+    warps: int
+    iterations: int
+    tolerance: np.float32
+
+
+def pad_image(image: Bytes, margin: int, out: Bytes) -> None:
+    """Copy a uint8 image into the middle of `out`, unless it lies there, and repeat its edges over `margin` pixels."""
+    rows = out[margin:-margin]
+    rows[:, margin:-margin] = image
+    rows[:, :margin], rows[:, -margin:] = image[:, :1], image[:, -1:]
+    out[:margin], out[-margin:] = rows[0], rows[-1]
+
+
+@inlined
+def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: Floats) -> None:
+    """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on."""
+    flat, stride = image.reshape(-1), np.int64(image.shape[1])
+    column, row = np.int64(x), np.int64(y)
+    right, lower = spread(x - np.float32(column)), spread(y - np.float32(row))
+    for block in range((pitch + 15) // 16):
+        first = min(16 * block, max(pitch - 16, 0))
+        at = row * stride + column + first
+        before = load_bytes(flat, at)
+        before = before + right * (load_bytes(flat, at + 1) - before)
+        for r in range(rows):
+            at += stride
+            after = load_bytes(flat, at)
+            after = after + right * (load_bytes(flat, at + 1) - after)
+            store(out, r * pitch + first, before + lower * (after - before))
+            before = after
+
+
+@inlined
+def warp_patch(
+    image: Bytes, x: Scalar, y: Scalar, a: Scalar, b: Scalar, reach: int, columns: Ints, rows: Ints, out: Floats
+) -> None:
+    """Samples of a square patch of radius `reach` under the similarity ``[[a, -b], [b, a]]`` around (x, y)."""
+    one, far = np.float32(65536), np.float32(reach)
+    column, row = np.int32((x - a * far + b * far) * one), np.int32((y - b * far - a * far) * one)
+    step_x, step_y = np.int32(a * one), np.int32(b * one)
+    flat, stride = image.reshape(-1), np.int32(image.shape[1])
+    for k in range(0, len(columns), 16):
+        store(out, k, sample(flat, stride, columns, rows, k, column, row, step_x, step_y))
+
+
+@kernel
+def similarity_lucas_kanade(
+    start: int, stop: int, points: Floats, labels: Floats, template_image: Bytes, target_image: Bytes, window: Window,
+    correlation: Floats,
+) -> None:  # fmt: skip
+    """Refine labels by photometric alignment of a square window.
+
+    The target is warped by the label into the template's frame. Within that patch only the translation changes (cheap);
+    between two warps scale and rotation are corrected as well. A label changes only if the windows'
+    correlation grows.
+
+    All windows are flat arrays at the patch's pitch, so that a shift by whole pixels is an offset. Elements outside the
+    window have zero gradients and mask.
+
+    Args:
+        start: First point.
+        stop: One past the last.
+        points: float32 ``[N, 2]``, full-image pixels of the template image.
+        labels: float32 ``[N, 4]``, changed in place.
+        template_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, at 1 / `step` of the full resolution, edges repeated.
+        target_image: Likewise.
+        window: `Window`, and when to stop.
+        correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1 if flat or outside.
+    """
+    step, radius, margin, warps, iterations, tolerance = window
+    border = BORDER
+    side, reach = 2 * radius + 1, radius + margin
+    pitch = 2 * reach + 1
+    length = 16 * ((side * pitch + 15) // 16)
+    slack = 2 * pitch + 32
+    patch = np.zeros(16 * ((pitch * pitch + 15) // 16) + slack, dtype=np.float32)
+    grid_columns, grid_rows = np.zeros(len(patch) - slack, dtype=np.int32), np.zeros(len(patch) - slack, dtype=np.int32)
+    for k in range(pitch * pitch):
+        grid_columns[k], grid_rows[k] = k % pitch, k // pitch
+    frame = np.zeros((side + 2) * pitch + slack, dtype=np.float32)
+    template, mask = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
+    gradient_x, gradient_y = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
+    right, down = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
+    for y in range(side):
+        for x in range(side):
+            k = y * pitch + x
+            mask[k], right[k], down[k] = np.float32(1), np.float32(x - radius), np.float32(y - radius)
+    h = np.empty((4, 4), dtype=np.float64)
+    rows, columns = target_image.shape
+    n = np.float64(side * side)
+    half, zero = np.float32(0.5), spread(np.float32(0))
+    scale_down = np.float32(1) / np.float32(step)
+    limit = np.float32(margin) - np.float32(0.01)
+    room = np.float32(radius + 2)
+    for i in range(start, stop):
+        correlation[i] = np.float32(-1)
+        px = (points[i, 0] + half) * scale_down - half + border
+        py = (points[i, 1] + half) * scale_down - half + border
+        if not (px >= room and py >= room and px < columns - room - 17 and py < rows - room - 2):
+            continue
+        read_frame(template_image, px - np.float32(radius + 1), py - np.float32(radius + 1), side + 2, pitch, frame)
+        sum_t, sum_x, sum_y, xx, xy, yy = zero, zero, zero, zero, zero, zero
+        for k in range(0, length, 16):
+            inside = load(mask, k)
+            gx = inside * (load(frame, k + pitch + 2) - load(frame, k + pitch))
+            gy = inside * (load(frame, k + 2 * pitch + 1) - load(frame, k + 1))
+            sum_t = sum_t + inside * load(frame, k + pitch + 1)
+            sum_x, sum_y = sum_x + gx, sum_y + gy
+            xx, xy, yy = xx + gx * gx, xy + gx * gy, yy + gy * gy
+            store(gradient_x, k, gx)
+            store(gradient_y, k, gy)
+        j0, j1 = np.float64(total(sum_x)), np.float64(total(sum_y))
+        # differences over two pixels
+        h00, h01, h11 = total(xx) - j0 * j0 / n, total(xy) - j0 * j1 / n, total(yy) - j1 * j1 / n
+        trace, determinant = h00 + h11, h00 * h11 - h01 * h01
+        smaller = 0.5 * (trace - np.sqrt(max(trace * trace - 4 * determinant, 0.0)))
+        if not smaller >= n * FLAT_GRADIENT:
+            continue
+        mean_t = spread(np.float32(total(sum_t) / n))
+        tt, xt, yt = zero, zero, zero
+        for k in range(0, length, 16):
+            t = load(mask, k) * (load(frame, k + pitch + 1) - mean_t)
+            tt, xt, yt = tt + t * t, xt + t * load(gradient_x, k), yt + t * load(gradient_y, k)
+            store(template, k, t)
+        energy, rest0, rest1 = np.float64(total(tt)), np.float64(total(xt)), np.float64(total(yt))
+        if energy < n * FLAT_VARIANCE:
+            continue
+        j2 = j3 = rest2 = rest3 = 0.0
+        factored = False
+        scale = np.float32(np.exp2(labels[i, 2]))
+        a, b = scale * np.float32(np.cos(labels[i, 3])), scale * np.float32(np.sin(labels[i, 3]))
+        tx = (points[i, 0] + labels[i, 0] + half) * scale_down - half + border
+        ty = (points[i, 1] + labels[i, 1] + half) * scale_down - half + border
+        first, best = np.float32(-1), np.float32(-1)
+        best_a, best_b, best_x, best_y = a, b, tx, ty
+        for warp in range(warps):
+            span = (abs(a) + abs(b)) * np.float32(reach) + np.float32(2)
+            if not (tx >= span and ty >= span and tx < columns - span and ty < rows - span):
+                break
+            if not (tx >= border and ty >= border and tx <= columns - border - 1 and ty <= rows - border - 1):
+                break
+            warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, patch)
+            ox = oy = np.float32(0)
+            g0 = g1 = mean = 0.0
+            at, w00, w01, w10, w11 = np.int64(0), zero, zero, zero, zero
+            for iteration in range(iterations + 1):
+                left, top = ox + np.float32(margin), oy + np.float32(margin)
+                column, row = np.int64(left), np.int64(top)
+                fx, fy = left - np.float32(column), top - np.float32(row)
+                at, w11 = row * pitch + column, spread(fx * fy)
+                w01, w10 = spread(fx - fx * fy), spread(fy - fx * fy)
+                w00 = spread(np.float32(1) - fx - fy + fx * fy)
+                sum_w, ww, wt, wx, wy = zero, zero, zero, zero, zero
+                for k in range(0, length, 16):
+                    j = at + k
+                    w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
+                    w = load(mask, k) * (w + w11 * load(patch, j + pitch + 1) - mean_t)
+                    sum_w, ww, wt = sum_w + w, ww + w * w, wt + w * load(template, k)
+                    wx, wy = wx + w * load(gradient_x, k), wy + w * load(gradient_y, k)
+                sum_of_w = np.float64(total(sum_w))
+                mean = sum_of_w / n
+                variance = total(ww) - mean * sum_of_w
+                score = np.float32(-1)  # a flat target looks like anything
+                if variance >= n * FLAT_VARIANCE:
+                    score = np.float32(total(wt) / np.sqrt(variance * energy))
+                if warp == 0 and iteration == 0:
+                    first = score
+                if score > best:
+                    best, best_a, best_b = score, a, b
+                    best_x, best_y = tx + a * ox - b * oy, ty + b * ox + a * oy
+                g0, g1 = total(wx) - mean * j0 - rest0, total(wy) - mean * j1 - rest1
+                if iteration == iterations:
+                    break
+                d0 = np.float32(2 * (h11 * g0 - h01 * g1) / determinant)
+                d1 = np.float32(2 * (h00 * g1 - h01 * g0) / determinant)
+                ox, oy = ox - d0, oy - d1
+                if not (abs(ox) < limit and abs(oy) < limit):
+                    ox, oy = min(max(ox, -limit), limit), min(max(oy, -limit), limit)
+                    break
+                if d0 * d0 + d1 * d1 < tolerance * tolerance:
+                    break
+            mx, my = a * ox - b * oy, b * ox + a * oy
+            tx, ty = tx + mx, ty + my
+            if warp == warps - 1:
+                break
+            if not factored:
+                sum_s, sum_r, sx, sy, rx, ry = zero, zero, zero, zero, zero, zero
+                ss, rr, rs, st, rt = zero, zero, zero, zero, zero
+                for k in range(0, length, 16):
+                    gx, gy, dx, dy = load(gradient_x, k), load(gradient_y, k), load(right, k), load(down, k)
+                    swell, turn, t = gx * dx + gy * dy, gy * dx - gx * dy, load(template, k)
+                    sum_s, sum_r = sum_s + swell, sum_r + turn
+                    sx, sy, rx, ry = sx + swell * gx, sy + swell * gy, rx + turn * gx, ry + turn * gy
+                    ss, rr, rs = ss + swell * swell, rr + turn * turn, rs + turn * swell
+                    st, rt = st + swell * t, rt + turn * t
+                j2, j3 = np.float64(total(sum_s)), np.float64(total(sum_r))
+                rest2, rest3 = np.float64(total(st)), np.float64(total(rt))
+                h[0, 0], h[1, 0], h[1, 1] = h00, h01, h11
+                h[2, 0], h[2, 1] = total(sx) - j2 * j0 / n, total(sy) - j2 * j1 / n
+                h[3, 0], h[3, 1] = total(rx) - j3 * j0 / n, total(ry) - j3 * j1 / n
+                damping = SIMILARITY_DAMPING * trace * (radius * radius)
+                h[2, 2], h[3, 3] = total(ss) - j2 * j2 / n + damping, total(rr) - j3 * j3 / n + damping
+                h[3, 2] = total(rs) - j3 * j2 / n
+                if not cholesky4(h):
+                    break
+                factored = True
+            ws, wr = zero, zero
+            for k in range(0, length, 16):
+                j = at + k
+                w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
+                w = w + w11 * load(patch, j + pitch + 1) - mean_t
+                gx, gy, dx, dy = load(gradient_x, k), load(gradient_y, k), load(right, k), load(down, k)
+                ws, wr = ws + w * (gx * dx + gy * dy), wr + w * (gy * dx - gx * dy)
+            g2, g3 = total(ws) - mean * j2 - rest2, total(wr) - mean * j3 - rest3
+            d0, d1, d2, d3 = solve4(h, g0, g1, g2, g3)
+            da, db = np.float32(1) + 2 * d2, 2 * d3
+            size = da * da + db * db
+            if not 0.25 < size < 4:
+                break
+            # compose with the inverse of the increment: A (I + dA)^-1
+            a, b = (a * da + b * db) / size, (b * da - a * db) / size
+        correlation[i] = best
+        if best > first:
+            labels[i, 0] = (best_x - border + half) * np.float32(step) - half - points[i, 0]
+            labels[i, 1] = (best_y - border + half) * np.float32(step) - half - points[i, 1]
+            labels[i, 2] = half * np.float32(np.log2(best_a * best_a + best_b * best_b))
+            labels[i, 3] = np.float32(np.arctan2(best_b, best_a))
+
+
+@inlined
+def cholesky4(h: Doubles) -> bool:
+    """Lower Cholesky factor of a 4 x 4 matrix, in place; False if it is not positive definite."""
+    for j in range(4):
+        for k in range(j):
+            h[j, j] -= h[j, k] * h[j, k]
+        if not h[j, j] > 1e-9:
+            return False
+        h[j, j] = np.sqrt(h[j, j])
+        for r in range(j + 1, 4):
+            for k in range(j):
+                h[r, j] -= h[r, k] * h[j, k]
+            h[r, j] /= h[j, j]
+    return True
+
+
+@inlined
+def solve4(h: Doubles, g0: Scalar, g1: Scalar, g2: Scalar, g3: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Solve with the factor of `cholesky4`."""
+    y0 = g0 / h[0, 0]
+    y1 = (g1 - h[1, 0] * y0) / h[1, 1]
+    y2 = (g2 - h[2, 0] * y0 - h[2, 1] * y1) / h[2, 2]
+    y3 = (g3 - h[3, 0] * y0 - h[3, 1] * y1 - h[3, 2] * y2) / h[3, 3]
+    x3 = y3 / h[3, 3]
+    x2 = (y2 - h[3, 2] * x3) / h[2, 2]
+    x1 = (y1 - h[2, 1] * x2 - h[3, 1] * x3) / h[1, 1]
+    x0 = (y0 - h[1, 0] * x1 - h[2, 0] * x2 - h[3, 0] * x3) / h[0, 0]
+    return np.float32(x0), np.float32(x1), np.float32(x2), np.float32(x3)

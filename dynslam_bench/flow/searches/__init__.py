@@ -1,1 +1,0 @@
-"""Label searches: one interface, budgets counted in cost evaluations, anytime and monotone."""

@@ -1,0 +1,340 @@
+"""Trajectory files of the TUM RGB-D benchmark: ``timestamp tx ty tz qx qy qz qw``, one pose a line.
+
+Reading follows the benchmark's own tools: ``#`` begins a comment, commas and tabs separate like spaces, lines with NaN
+or with an all-zero quaternion are skipped, quaternions are normalised, lines may come in any order, and of several
+lines with one stamp the last holds. Whatever is not taken as it stands is counted in `FileNotes`.
+"""
+
+from __future__ import annotations
+
+import io
+from array import array
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import TrajectoryError
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.reading import RECORD_BYTES, read_lines
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
+from dynslam_bench.geometry.trajectory import Trajectory
+
+_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+MOST_LINES = 4_000_000
+"""More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
+_ZERO_NORM = 1e-8
+_UNIT_TOLERANCE = 0.01
+_LATEST_S = 9e9
+"""Seconds, the year 2255: larger stamps are nanoseconds or something else, and 64 bits of nanoseconds end there."""
+
+
+@dataclass(frozen=True)
+class FileNotes:
+    """What a file held that was not taken as it stands.
+
+    Attributes:
+        lines: Lines with a pose, skipped ones included.
+        not_finite: Lines skipped for NaN or infinity.
+        zero_quaternions: Lines skipped for an all-zero quaternion.
+        duplicates: Lines replaced by a later line with the same stamp.
+        out_of_order: Lines whose stamp is before the previous line's; they were sorted.
+        renormalised: Quaternions whose norm was off by more than 1 %.
+        back_s: Longest step back in time from one line to the next, seconds.
+    """
+
+    lines: int = 0
+    not_finite: int = 0
+    zero_quaternions: int = 0
+    duplicates: int = 0
+    out_of_order: int = 0
+    renormalised: int = 0
+    back_s: float = 0.0
+
+    def describe(self) -> list[str]:
+        """One phrase for every count that is not zero, e.g. ``3 of 800 lines skipped: not finite``."""
+        of = f"of {self.lines} lines"
+        phrases = [
+            (self.not_finite, f"{self.not_finite} {of} skipped: not finite"),
+            (self.zero_quaternions, f"{self.zero_quaternions} {of} skipped: all-zero quaternion"),
+            (self.duplicates, f"{self.duplicates} {of} replaced by a later line with the same stamp"),
+            (self.out_of_order, f"{self.out_of_order} {of} out of order, sorted"),
+            (self.renormalised, f"{self.renormalised} {of} with a quaternion far from unit norm, normalised"),
+        ]
+        return [phrase for count, phrase in phrases if count]
+
+
+@dataclass(frozen=True, eq=False)
+class TumFile:
+    """A trajectory and the notes on the file it came from."""
+
+    trajectory: Trajectory
+    notes: FileNotes
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
+
+    Raises:
+        TrajectoryError: The file is missing, is no text, has a malformed line (named by its number), two stamps that
+            differ by less than 1 us, or no valid pose.
+    """
+    return load_tum(path).trajectory
+
+
+def load_tum(path: str | Path) -> TumFile:
+    """Read a TUM trajectory file together with the counts of skipped, sorted and replaced lines.
+
+    Raises:
+        TrajectoryError: As `read_tum`.
+    """
+    path = Path(path)
+    values, texts = _read_table(path, 8, _COLUMNS)
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
+    norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
+    valid = finite & (norm >= _ZERO_NORM)
+    counted = {
+        "lines": len(values),
+        "not_finite": int((~finite).sum()),
+        "zero_quaternions": int((finite & (norm < _ZERO_NORM)).sum()),
+        "renormalised": int((np.abs(norm[valid] - 1) > _UNIT_TOLERANCE).sum()),
+    }
+    if not valid.any():
+        raise TrajectoryError(f"{path} holds no valid pose", "; ".join(FileNotes(**counted).describe()))
+    kept = values[valid]
+    if (latest := float(np.abs(kept[:, 0]).max())) > _LATEST_S:
+        raise TrajectoryError(
+            f"{path} has stamps up to {latest:.4g}, which are no seconds",
+            "nanoseconds? EuRoC's tables are read by `eval` and `import` where their heading is left in",
+        )
+    ns = np.array([parse_ns(texts[row]) for row in np.flatnonzero(valid)], dtype=np.int64)
+    order = np.argsort(ns, kind="stable")
+    refuse_close(ns[order], str(path), TrajectoryError, lambda stamp: _line_of(path, stamp))
+    last_of_stamp = np.append(np.diff(ns[order]) > 0, True)
+    chosen, exact = kept[order][last_of_stamp], ns[order][last_of_stamp]
+    notes = FileNotes(
+        **counted,
+        duplicates=int((~last_of_stamp).sum()),
+        out_of_order=int((np.diff(ns) < 0).sum()),
+        back_s=float(-np.diff(ns).min(initial=0)) / 1e9,
+    )
+    poses = se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8])
+    return TumFile(Trajectory(to_seconds(exact), poses, exact), notes)
+
+
+def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") -> None:
+    """Write a trajectory with stamps to the nanosecond; the file appears whole or not at all.
+
+    Args:
+        path: Target file.
+        trajectory: Camera-to-world poses; may be empty.
+        comment: Written behind ``#`` above the header, line by line.
+
+    Raises:
+        DynslamError: The file cannot be written.
+    """
+    write_atomic(Path(path), format_tum(trajectory, comment=comment))
+
+
+def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
+    """The text of a TUM trajectory file: nine decimals for stamps (seconds) and all other numbers."""
+    stamps = [format_ns(ns) for ns in trajectory.timestamps_ns.tolist()]
+    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
+    rows = np.concatenate([position, quaternion], axis=1).tolist()
+    lines = [f"# {line}" for line in comment.splitlines()] + [f"# {_COLUMNS}"]
+    for stamp, row in zip(stamps, rows, strict=True):
+        lines.append(f"{stamp} " + " ".join(f"{value:.9f}" for value in row))
+    return "\n".join(lines) + "\n"
+
+
+def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
+    """Numbers ``[N, columns]`` of a text file; comments and blank lines are left out.
+
+    Raises:
+        TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns` numbers.
+    """
+    return _read_table(path, columns, meaning)[0]
+
+
+def read_stamped_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A table as `read_table` reads it, and its first column, seconds, in nanoseconds ``[N]``.
+
+    Raises:
+        TrajectoryError: As `read_table`; or a stamp is not finite or beyond the range of 64 bits.
+    """
+    values, texts = _read_table(path, columns, meaning)
+    try:
+        return values, np.array([parse_ns(text) for text in texts], dtype=np.int64)
+    except ValueError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+
+
+def read_stamps(path: Path) -> NDArray[np.int64]:
+    """The first numbers of all lines, seconds, in nanoseconds ``[N]``; comments and blank lines are left out.
+
+    Raises:
+        TrajectoryError: The file cannot be read, or a line does not begin with a stamp.
+    """
+    stamps = []
+    for number, parts in _lines(path):
+        try:
+            stamps.append(parse_ns(parts[0]))
+        except ValueError:
+            raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds") from None
+    return np.array(stamps, dtype=np.int64)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number and parts of all lines that hold anything.
+
+    Raises:
+        TrajectoryError: The file cannot be read or is too long.
+    """
+    for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
+        if number > MOST_LINES:
+            raise TrajectoryError(f"{path} has more than {MOST_LINES} lines, too many for a trajectory")
+        parts = _parts(line)
+        if parts:
+            yield number, parts
+
+
+def _parts(line: str) -> list[str]:
+    return line.partition("#")[0].replace(",", " ").split()
+
+
+def _line_of(path: Path, ns: int) -> int | None:
+    """The last line that begins with a stamp."""
+    last = None
+    for number, parts in _lines(path):
+        with suppress(ValueError):
+            last = number if parse_ns(parts[0]) == ns else last
+    return last
+
+
+def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], list[str]]:
+    """The numbers of a table, and the texts of its first column."""
+    whole = _plain_table(path, columns)
+    if whole is not None:
+        return whole
+    values, texts = array("d"), []
+    for number, parts in _lines(path):
+        texts.append(parts[0])
+        if len(parts) != columns:
+            raise TrajectoryError(
+                f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(parts)
+            )
+        try:
+            values.extend(map(float, parts))
+        except ValueError:
+            bad = next(part for part in parts if not is_number(part))
+            raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
+    if not values:
+        raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
+    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns), texts
+
+
+def _plain_table(path: Path, columns: int) -> tuple[NDArray[np.float64], list[str]] | None:
+    """The numbers of a file of a usual size and without any fault, read at once; None for every other one."""
+    with suppress(OSError, ValueError):  # whatever it is, reading line by line says it
+        if 0 < path.stat().st_size <= RECORD_BYTES:
+            text = path.read_text(encoding="utf-8-sig").replace(",", " ")
+            texts = [parts[0] for line in text.splitlines() if (parts := line.partition("#")[0].split(None, 1))]
+            if texts:  # numpy warns of a table of nothing
+                table = np.loadtxt(io.StringIO(text), ndmin=2)
+                if table.shape == (len(texts), columns):
+                    return table, texts
+    return None
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a number, as tables of numbers are read."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _hint(parts: list[str]) -> str:
+    if len(parts) == 12:
+        return "12 values a line are KITTI's format: give their stamps with --timestamps FILE"
+    if len(parts) == 2 and is_number(parts[0]) and not is_number(parts[1]):
+        return "this looks like a list of images"
+    return ""
+
+
+# Trajectory files of the KITTI odometry benchmark: the 3x4 matrix ``[R|t]`` in row order, twelve numbers a line.
+
+_MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
+
+
+def read_kitti(path: str | Path, times: str | Path | None = None, *, fps: float = 10.0) -> Trajectory:
+    """Read a KITTI pose file.
+
+    Args:
+        path: The poses.
+        times: A file whose lines begin with the stamps in seconds, one a pose; None for ``i / fps``.
+        fps: Frame rate in Hz where there is no `times` (KITTI's is 10).
+
+    Returns:
+        Camera-to-world poses; rotations are made orthonormal exactly (files hold about seven digits).
+
+    Raises:
+        TrajectoryError: A file cannot be read, a line is malformed or no rigid pose, or the stamps do not fit.
+    """
+    rows = read_table(Path(path), 12, _MEANING)
+    poses = np.zeros((len(rows), 4, 4))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    poses[:, 3, 3] = 1.0
+    for index, pose in enumerate(poses):
+        if not se3.is_pose(pose, tolerance=1e-3):
+            raise TrajectoryError(f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING)
+    u, _, vt = np.linalg.svd(poses[:, :3, :3])
+    poses[:, :3, :3] = u @ vt
+    if times is not None:
+        ns = read_stamps(Path(times))
+        if len(ns) != len(poses):
+            raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
+        return Trajectory(to_seconds(ns), poses, ns)
+    if not (np.isfinite(fps) and fps > 0):
+        raise TrajectoryError(f"the frame rate is {fps!r}, not a positive number of Hz")
+    return Trajectory(np.arange(len(poses)) / fps, poses)
+
+
+def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | None = None) -> None:
+    """Write poses in KITTI's format and, if `times` is given, their stamps beside them (nine decimals).
+
+    Raises:
+        DynslamError: A file cannot be written.
+    """
+    rows = trajectory.T_world_cam[:, :3].reshape(-1, 12).tolist()
+    write_atomic(Path(path), "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows))
+    if times is not None:
+        write_atomic(Path(times), "".join(f"{format_ns(ns)}\n" for ns in trajectory.timestamps_ns.tolist()))
+
+
+# Trajectory files of either format: TUM's, which carry their stamps, and KITTI's, whose stamps lie in another file.
+
+KITTI_VALUES = 12
+
+
+def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> TumFile:
+    """Read a trajectory with the counts of what was not taken as it stands.
+
+    Args:
+        path: Lines of 8 values (TUM) or, where `timestamps` is given, of 12 (KITTI).
+        timestamps: A file whose lines begin with a stamp in seconds each: a ``times.txt``, or a list such as
+            ``rgb.txt``; used for lines of 12 values only.
+
+    Raises:
+        TrajectoryError: A file cannot be read, is malformed, or the stamps do not fit the poses.
+    """
+    path = Path(path)
+    if timestamps is None or len(next(_lines(path), (0, []))[1]) != KITTI_VALUES:
+        return load_tum(path)
+    trajectory = read_kitti(path, timestamps)
+    return TumFile(trajectory, FileNotes(lines=len(trajectory)))

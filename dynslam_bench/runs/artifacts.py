@@ -1,0 +1,311 @@
+"""What a run leaves beside its trajectory: snapshots of frames, the map, the sheet, the video."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
+from dynslam_bench.core.errors import RunError, TrackerError
+from dynslam_bench.core.reading import read_npz
+from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.evaluation.online import OnlineError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.runs.spec import RunSpec
+from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_ply
+from dynslam_bench.slam.sheet import draw_sheet, write_sheet
+
+if TYPE_CHECKING:
+    from dynslam_bench.envs.episode import FrameOutcome
+
+
+SNAPSHOTS_FILE = "snapshots.npz"
+SPREAD = 24
+"""Frames that are kept evenly spread over a run."""
+MOST_FRAMES = 1000
+"""Of a file that is read."""
+WORST = 6
+"""Frames that are kept besides, those with the largest frame-to-frame error."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """One frame as the tracker saw it.
+
+    Attributes:
+        index: Index of the frame in the run's part of the sequence.
+        points: int16 ``[N, 2]``, pixels of the features.
+        kept: bool ``[N]``, which of them were kept.
+        packed: uint8 ``[H, ceil(W / 8)]``, eight pixels of the mask a byte; None where the tracker gave no mask.
+        width: W, pixels of a line of the mask.
+    """
+
+    index: int
+    points: NDArray[np.int16]
+    kept: NDArray[np.bool_]
+    packed: NDArray[np.uint8] | None
+    width: int
+
+    @property
+    def mask(self) -> NDArray[np.bool_] | None:
+        """Pixels held for dynamic, bool ``[H, W]``; None where the tracker gave no mask."""
+        return None if self.packed is None else np.unpackbits(self.packed, axis=1, count=self.width).view(np.bool_)
+
+
+def spread(frames: int, count: int = SPREAD) -> list[int]:
+    """At most `count` frames evenly spread over so many, the first and the last among them."""
+    return sorted({int(index) for index in np.linspace(0, max(frames - 1, 0), min(count, frames)).round()})
+
+
+class SnapshotWriter:
+    """Collects snapshots while a run goes on; nothing is written for trackers that show neither features nor masks.
+
+    Args:
+        folder: The run's.
+        frames: Frames of the run's part of the sequence.
+    """
+
+    def __init__(self, folder: Path, frames: int) -> None:
+        self._path, self._spread = folder / SNAPSHOTS_FILE, set(spread(frames))
+        self._even: list[Snapshot] = []
+        self._worst: list[tuple[float, Snapshot]] = []
+        self._size = (0, 0)
+
+    def add(self, outcome: FrameOutcome, shape: tuple[int, ...], result: TrackResult) -> None:
+        """Keep the frame if it is one of those spread over the run, or among the worst so far."""
+        if result.keypoints_xy is None and result.dynamic_mask is None:
+            return
+        self._size = (shape[0], shape[1])
+        error = None if outcome.error is None else outcome.error.frame_trans_m
+        if outcome.index in self._spread:
+            self._even.append(snapshot_of(outcome.index, result))
+        elif error is not None and (len(self._worst) < WORST or error > self._worst[-1][0]):
+            self._worst.append((error, snapshot_of(outcome.index, result)))
+            self._worst = sorted(self._worst, key=lambda pair: -pair[0])[:WORST]
+
+    def write(self) -> None:
+        """Write what was kept."""
+        shots = sorted([*self._even, *(shot for _, shot in self._worst)], key=lambda shot: shot.index)
+        if not shots:
+            return
+        empty = np.zeros((self._size[0], -(-self._size[1] // 8)), np.uint8)
+        np.savez_compressed(
+            self._path,
+            index=np.array([shot.index for shot in shots], np.int32),
+            count=np.array([len(shot.points) for shot in shots], np.int32),
+            points=np.concatenate([shot.points for shot in shots]),
+            kept=np.concatenate([shot.kept for shot in shots]),
+            size=np.array(self._size, np.int32),
+            masked=np.array([shot.packed is not None for shot in shots]),
+            masks=np.stack([empty if shot.packed is None else shot.packed for shot in shots]),
+        )
+
+
+def snapshot_of(index: int, result: TrackResult) -> Snapshot:
+    """The snapshot of a frame that was tracked."""
+    points = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy).reshape(-1, 2)
+    kept = result.keypoints_keep
+    mask = result.dynamic_mask
+    return Snapshot(
+        index,
+        np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
+        np.ones(len(points), bool) if kept is None else np.array(kept, dtype=bool),
+        None if mask is None else np.packbits(np.asarray(mask, dtype=bool), axis=1),
+        0 if mask is None else mask.shape[1],
+    )
+
+
+def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
+    """The snapshots of a stored run.
+
+    Args:
+        folder: The run's.
+
+    Returns:
+        Height and width of the images in pixels, and the snapshots in order; none for runs without any (imported, of
+        older versions, of trackers that show neither features nor masks).
+
+    Raises:
+        RunError: The file is damaged.
+    """
+    path = folder / SNAPSHOTS_FILE
+    if not path.is_file():
+        return (0, 0), []
+    arrays = read_npz(path, kind=RunError)
+    try:
+        height, width = map(int, arrays["size"])
+        index, count, points, kept = arrays["index"], arrays["count"], arrays["points"], arrays["kept"]
+        masks, masked = arrays["masks"], arrays["masked"]
+        if masks.dtype != np.uint8 or masks.shape[1:] != (height, -(-width // 8)):
+            raise ValueError(f"masks of {masks.dtype} {masks.shape} do not fit {width} x {height} pixels")
+        if not (
+            len(index) == len(count) == len(masks) == len(masked) <= MOST_FRAMES
+            and (count >= 0).all()
+            and points.shape == (count.sum(), 2)
+            and kept.shape == points.shape[:1]
+            and points.dtype == np.int16
+            and kept.dtype == masked.dtype == np.bool_
+        ):
+            raise ValueError("its arrays do not fit each other")
+        ends = np.cumsum(count)[:-1]
+        parts = zip(np.split(points, ends), np.split(kept, ends), strict=True)
+        shots = [
+            Snapshot(int(index[at]), place, keep, masks[at] if masked[at] else None, width)
+            for at, (place, keep) in enumerate(parts)
+        ]
+    except (LookupError, ValueError, TypeError, ArithmeticError) as error:
+        raise RunError(f"{path} holds no snapshots: {' '.join(str(error).split())[:200]}") from error
+    return (height, width), shots
+
+
+def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> tuple[MapOutputs | None, dict[str, int | None], list[str]]:
+    """Write ``keyframes.csv``, ``map.ply`` and, if it was asked for, ``map.npz``.
+
+    Returns:
+        Keyframes and points, None if the tracker offers none; ``keyframes``, ``map_points`` and ``maps`` for the
+        record, None for what the tracker does not say; and notes for a reader.
+
+    Raises:
+        DynslamError: A file cannot be written.
+    """
+    notes: list[str] = []
+    if spec.save_map:
+        try:
+            env.save_map(folder / MAP_FILE, _origin_of_map(env, spec))
+        except TrackerError as error:
+            notes.append(f"no {MAP_FILE}: {error}")
+    outputs = env.map_outputs()
+    if outputs is None:
+        return None, dict.fromkeys(("keyframes", "map_points", "maps")), notes
+    write_keyframes_csv(folder / "keyframes.csv", outputs, env.exact_stamps)
+    write_ply(folder / "map.ply", outputs)
+    numbers = np.array([keyframe.map for keyframe in outputs.keyframes])
+    maps = len(np.unique(numbers))
+    if maps > 1:
+        notes.append(
+            f"{maps} maps that never met: {np.count_nonzero(numbers)} of {len(numbers)} keyframes lie in others than "
+            "the first, whose place in it is unknown; frames tracked there count as lost, and no points of it are in "
+            "map.ply"
+        )
+    return outputs, {"keyframes": len(numbers), "map_points": len(outputs.positions), "maps": maps}, notes
+
+
+def _origin_of_map(env: SlamEnv, spec: RunSpec) -> str:
+    """Which run made a map, in words."""
+    start, stop = spec.frames_seen or (0, None)
+    asked = spec.settings | {f"degrade.{kind}": strength for kind, strength in spec.degrade.items()}
+    words = [f"{env.tracker_spec.id} on {env.sequence.id}", f"frames {start}:{'' if stop is None else stop}"]
+    words += [f"stride {spec.stride}"] * (spec.stride != 1) + [f"seed {spec.seed}"]
+    return ", ".join([*words, *(f"{name}={value}" for name, value in asked.items())])
+
+
+SHOWN = 9
+"""Frames, and keyframes, on a sheet."""
+SHEET_FILE = "sheet.png"
+FEATURES = (("kept", KEPT), ("culled", CULLED), ("mask", MASK))
+
+
+class SheetWriter:
+    """Input, frames with their features, keyframes, map and track of one run as ``sheet.png``.
+
+    Args:
+        path: Where to write.
+        env: The run's environment.
+    """
+
+    def __init__(self, path: Path, env: SlamEnv) -> None:
+        self._path, self._env = path, env
+        self._canvas = Canvas(env.sequence, env.tracker_spec.label)
+        self._wanted = set(spread(len(env.sequence), SHOWN))
+        self._frames: list[Image] = []
+
+    def add(self) -> None:
+        """Keep the picture of the current frame if it is one of those shown."""
+        if self._env.episode.outcomes[-1].index in self._wanted:
+            self._frames.append(self._canvas.picture(self._env.frame, self._env.result))
+
+    def write(self, outputs: MapOutputs, track: Trajectory) -> None:
+        """Draw and write the sheet.
+
+        Args:
+            outputs: Keyframes and map points.
+            track: The run's final trajectory, or the online one.
+        """
+        sequence = self._env.sequence
+        own = [record.frame for record in outputs.keyframes if record.frame >= 0]  # others are of an earlier run
+        shown = [own[row] for row in spread(len(own), SHOWN)]
+        title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
+        keyframes = [sequence[index].rgb for index in shown]
+        truth, ate_m = aligned_truth(sequence.ground_truth, track)
+        sheet = draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES)
+        write_sheet(self._path, sheet)
+
+
+VIDEO_FILE = "video.webm"
+
+
+class VideoWriter:
+    """Writes the rendered frames of an environment as `VIDEO_FILE`; a run that ends early leaves what it has.
+
+    Args:
+        folder: Where to write.
+        env: The run's environment, in render mode ``rgb_array``.
+    """
+
+    def __init__(self, folder: Path, env: SlamEnv) -> None:
+        self._path, self._env = folder / VIDEO_FILE, env
+        self._writer: Any = None
+
+    def add(self) -> None:
+        """Append the picture of the current frame.
+
+        Raises:
+            RunError: This OpenCV cannot write such a video.
+        """
+        import cv2
+
+        image = self._env.render()
+        assert image is not None
+        if self._writer is None:
+            size = (image.shape[1], image.shape[0])
+            code = cv2.VideoWriter.fourcc(*"VP90")
+            self._writer = cv2.VideoWriter(str(self._path), code, self._env.sequence.fps, size)
+            if not self._writer.isOpened():
+                raise RunError(
+                    f"OpenCV {cv2.__version__} cannot write VP9 video",
+                    "pip install opencv-python-headless, or no --video",
+                )
+        self._writer.write(np.ascontiguousarray(image[:, :, ::-1]))
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.release()
+
+
+def aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajectory | None, float | None]:
+    """The ground truth at the track's stamps, moved onto the track by least squares, and what is left in metres (RMSE).
+
+    Both are None without enough of it.
+    """
+    if truth is None:
+        return None, None
+    errors = OnlineError(truth)
+    poses = [errors.truth_at(float(stamp)) for stamp in track.timestamps]
+    rows = [row for row, pose in enumerate(poses) if pose is not None]
+    if len(rows) < 3:
+        return None, None
+    true = np.array([poses[row] for row in rows])
+    fit = align(track.T_world_cam[rows], true, "se3")
+    move = np.eye(4)
+    move[:3, :3], move[:3, 3] = fit.rotation, fit.translation
+    moved = Trajectory(track.timestamps[rows], se3.inverse(move) @ true)
+    left = moved.positions - track.positions[rows]
+    return moved, float(np.sqrt(np.square(left).sum(axis=1).mean()))

@@ -1,0 +1,305 @@
+"""Trajectories in the formats of others: EuRoC, VSLAM-LAB, COLMAP and bags of ROS 2 (MCAP); the file shows which."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import RunError, TrajectoryError
+from dynslam_bench.core.files import temporary_folder, write_atomic
+from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core.version import install_hint
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import FileNotes, TumFile, is_number, load_trajectory
+from dynslam_bench.sequences.bags import read_bag_poses
+from dynslam_bench.sequences.readers.layouts import is_bag
+from dynslam_bench.sequences.readers.lists import read_image_list
+from dynslam_bench.sequences.readers.tables import camera_truth, column, floats, nanoseconds, read_rows
+from dynslam_bench.sequences.readers.vslam_lab import POSE
+from dynslam_bench.slam.map_files import Cloud
+
+
+def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topic: str | None = None) -> TumFile:
+    """Read a trajectory with the counts of what was not taken as it stands.
+
+    Args:
+        path: A file in TUM's or KITTI's format, a table of EuRoC or VSLAM-LAB, a folder of COLMAP's text files (or its
+            ``images.txt``), or a bag.
+        timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one each, for COLMAP a
+            list of stamps and images such as ``rgb.txt``.
+        topic: Of a bag with several topics of poses, the one to take.
+
+    Raises:
+        DynslamError: A file cannot be read, is malformed, or stamps are missing.
+    """
+    path = Path(path).expanduser()
+    if path.name == IMAGES or (path / IMAGES).is_file():
+        return _whole(read_colmap(path, None if timestamps is None else _stamps_by_name(Path(timestamps))))
+    if is_bag(path):
+        return _whole(read_bag_trajectory(path, topic))
+    if path.is_dir():
+        raise TrajectoryError(f"the folder {path} holds neither {IMAGES} of COLMAP nor a bag of ROS 2")
+    if is_pose_table(path):
+        return _whole(read_pose_table(path))
+    return load_trajectory(path, timestamps)
+
+
+def _whole(trajectory: Trajectory) -> TumFile:
+    return TumFile(trajectory, FileNotes(lines=len(trajectory)))
+
+
+def _stamps_by_name(path: Path) -> dict[str, float]:
+    """The stamp of each image of a list, by the name that the list gives and by the file's own."""
+    images = read_image_list(path.expanduser())
+    stamps = images.stamps.tolist()
+    return {Path(file).name: stamp for file, stamp in zip(images.files, stamps, strict=True)} | dict(
+        zip(images.files, stamps, strict=True)
+    )
+
+
+EUROC_HEADING = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+_EUROC_ORDER = [1, 2, 3, 5, 6, 7, 4]
+_W_FIRST = "w"
+
+
+def is_pose_table(path: Path) -> bool:
+    """Whether a file begins with the heading of such a table.
+
+    Raises:
+        TrajectoryError: It cannot be read.
+    """
+    first = next((line for line in read_lines(path, kind=TrajectoryError) if line.strip()), "").lower()
+    return "," in first and ("timestamp" in first or "(ns)" in first)
+
+
+def read_pose_table(path: Path) -> Trajectory:
+    """The poses of a table of either kind, as the camera's own.
+
+    Raises:
+        DynslamError: A row is malformed, no row holds a pose, or the heading is of neither kind.
+    """
+    heading, rows = read_rows(path)
+    if POSE[0] in heading:
+        order = [column(heading, name, path) for name in POSE]
+    elif len(heading) >= 8 and _W_FIRST in heading[4].lower():
+        order = [0, *_EUROC_ORDER]
+    else:
+        raise TrajectoryError(
+            f"{path} has the columns {', '.join(heading)[:200]}: neither EuRoC's nor VSLAM-LAB's",
+            "EuRoC's fifth is the quaternion's w; VSLAM-LAB's are " + ", ".join(POSE),
+        )
+    picked = [[row[at] for at in order] for row in rows]
+    stamps, values = nanoseconds([row[0] for row in picked], path), floats([row[1:] for row in picked], path)
+    camera_poses = camera_truth(stamps, values, np.eye(4), str(path))
+    if camera_poses is None:
+        raise TrajectoryError(f"none of the {len(rows)} rows of {path} holds a rotation")
+    return camera_poses
+
+
+def write_euroc(path: Path, trajectory: Trajectory) -> None:
+    """Write poses as EuRoC's ground truth is written.
+
+    Raises:
+        DynslamError: The file cannot be written.
+    """
+    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
+    _write(path, EUROC_HEADING, trajectory, [[*p, q[3], *q[:3]] for p, q in zip(position, quaternion, strict=True)])
+
+
+def write_vslam_lab(path: Path, trajectory: Trajectory) -> None:
+    """Write poses as VSLAM-LAB's systems write theirs.
+
+    Raises:
+        DynslamError: The file cannot be written.
+    """
+    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
+    _write(path, ",".join(POSE), trajectory, [[*p, *q] for p, q in zip(position, quaternion, strict=True)])
+
+
+def _write(path: Path, heading: str, trajectory: Trajectory, rows: list[list[float]]) -> None:
+    lines = [
+        f"{ns}," + ",".join(f"{value:.9f}" for value in row)
+        for ns, row in zip(trajectory.timestamps_ns.tolist(), rows, strict=True)
+    ]
+    write_atomic(path, "\n".join([heading, *lines]) + "\n")
+
+
+IMAGES = "images.txt"
+_HALF = 0.5
+
+
+def write_colmap(
+    folder: Path, trajectory: Trajectory, camera: Camera, names: Sequence[str], cloud: Cloud | None = None
+) -> None:
+    """Write a reconstruction.
+
+    Args:
+        folder: Where; it exists.
+        trajectory: Camera-to-world poses, one an image.
+        camera: Of all images.
+        names: The image of each pose, relative to the folder of images.
+        cloud: Map points, written without tracks and with the error 0, neither of which is known; None for none.
+
+    Raises:
+        DynslamError: A file cannot be written.
+    """
+    model, values = _camera_model(camera)
+    numbers = " ".join(f"{value:.12g}" for value in values)
+    write_atomic(folder / "cameras.txt", f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {model} {camera.width} "
+                 f"{camera.height} {numbers}\n")  # fmt: skip
+    position, quaternion = se3.to_quaternion(se3.inverse(trajectory.T_world_cam))
+    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[] (none)"]
+    for number, (t, q, name) in enumerate(zip(position, quaternion, names, strict=True), start=1):
+        pose = " ".join(f"{value:.12f}" for value in (q[3], *q[:3], *t))
+        lines += [f"{number} {pose} 1 {name}", ""]
+    write_atomic(folder / IMAGES, "\n".join(lines) + "\n")
+    points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+    if cloud is not None:
+        rows = zip(cloud.positions.tolist(), cloud.colours.tolist(), strict=True)
+        points += [f"{i} {x:.7g} {y:.7g} {z:.7g} {r} {g} {b} 0" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1)]
+    write_atomic(folder / "points3D.txt", "\n".join(points) + "\n")
+
+
+def _camera_model(camera: Camera) -> tuple[str, list[float]]:
+    """Name and parameters of COLMAP's model that holds the camera exactly."""
+    pinhole = [camera.fx, camera.fy, camera.cx + _HALF, camera.cy + _HALF]
+    k1, k2, p1, p2, k3 = camera.distortion
+    if not camera.is_distorted:
+        return "PINHOLE", pinhole
+    return ("FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]) if k3 else ("OPENCV", [*pinhole, k1, k2, p1, p2])
+
+
+def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Trajectory:
+    """The poses of ``images.txt``, camera to world, in order of their stamps.
+
+    Args:
+        folder: The reconstruction's, or ``images.txt`` itself.
+        stamps: Stamp in seconds of each image by its name; None where the names are the stamps.
+
+    Raises:
+        TrajectoryError: A line is malformed, an image has no stamp, or there is no image.
+    """
+    path = folder / IMAGES if folder.is_dir() else folder
+    poses_by_stamp: dict[float, NDArray[np.float64]] = {}
+    held = False
+    for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
+        if line.startswith("#"):
+            continue
+        held = not held
+        if not held or not line.strip():  # every other line holds the image's points, often none
+            held = held and bool(line.strip())
+            continue
+        parts = line.split(maxsplit=9)
+        if len(parts) != 10 or not all(map(is_number, parts[1:8])):
+            raise TrajectoryError(f"{path} line {number} is no image: expected ID QW QX QY QZ TX TY TZ CAMERA NAME")
+        values = np.array(parts[1:8], dtype=np.float64)
+        if not np.isfinite(values).all() or not np.any(values[:4]):
+            raise TrajectoryError(f"{path} line {number} holds no pose")
+        name = parts[9].strip()
+        poses_by_stamp[_stamp(name, stamps, path)] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
+    if not poses_by_stamp:
+        raise TrajectoryError(f"{path} names no image")
+    order = sorted(poses_by_stamp)
+    return Trajectory(np.array(order), se3.inverse(np.array([poses_by_stamp[stamp] for stamp in order])))
+
+
+def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
+    if stamps is not None:
+        stamp = stamps.get(name, stamps.get(Path(name).name))
+        if stamp is None:
+            raise TrajectoryError(f"{path} names the image '{name[:100]}', which the list of stamps does not")
+        return stamp
+    stem = Path(name).stem
+    if "." not in stem or not is_number(stem) or not np.isfinite(float(stem)):
+        raise TrajectoryError(
+            f"the image '{name[:100]}' of {path} is not named by its stamp in seconds",
+            "give a list of stamps and images such as rgb.txt with --timestamps FILE",
+        )
+    return float(stem)
+
+
+POSE_MESSAGE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
+BAG = "trajectory"
+_BILLION = 1_000_000_000
+
+
+def read_bag_trajectory(path: Path, topic: str | None = None) -> Trajectory:
+    """The poses of a ROS 1 or 2 bag or an MCAP file, taken for the camera's.
+
+    Args:
+        path: The file, or the folder of a ROS 2 bag.
+        topic: Topic of the poses; needed where there are several.
+
+    Raises:
+        DynslamError: `rosbags` is missing, the bag is damaged, or the topic is not the only one and was not named.
+    """
+    stamps, rows = read_bag_poses(path, topic)
+    camera_poses = camera_truth(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
+    if camera_poses is None:
+        raise TrajectoryError(f"{path} holds no pose", "name its topic with --topic")
+    return camera_poses
+
+
+def write_bag(folder: Path, trajectories: Mapping[str, Trajectory], frame_id: str = "world") -> None:
+    """Write trajectories, each on the topics ``/NAME/pose`` and ``/NAME/path``.
+
+    Args:
+        folder: Where, it exists: it becomes a bag of ROS 2, ``trajectory.mcap`` with its ``metadata.yaml``.
+        trajectories: Camera-to-world poses by name.
+        frame_id: Name of the world's frame.
+
+    Raises:
+        DynslamError: `rosbags` is not installed, or the file cannot be written.
+    """
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise RunError("MCAP is written with rosbags, which is not installed", install_hint("bags")) from error
+    store = get_typestore(Stores.LATEST)
+    with temporary_folder(folder / BAG) as work:
+        bag = work / BAG
+        try:
+            with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+                for name, trajectory in trajectories.items():
+                    _write_messages(writer, store, name, trajectory, frame_id)
+            for file in bag.iterdir():
+                file.replace(folder / file.name)
+        except OSError as error:
+            raise RunError(f"cannot write {folder}: {error.strerror}", "check the free space") from error
+
+
+def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory, frame_id: str) -> None:
+    poses = _messages(store.types, trajectory, frame_id)
+    topic = writer.add_connection(f"/{name}/pose", POSE_MESSAGE, typestore=store)
+    for pose in poses:
+        writer.write(topic, _at(pose), store.serialize_cdr(pose, POSE_MESSAGE))
+    if poses:
+        whole = store.types[PATH](header=poses[0].header, poses=poses)
+        topic = writer.add_connection(f"/{name}/path", PATH, typestore=store)
+        writer.write(topic, _at(poses[0]), store.serialize_cdr(whole, PATH))
+
+
+def _at(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec * _BILLION + stamp.nanosec)
+
+
+def _messages(types: Mapping[str, Any], trajectory: Trajectory, frame_id: str) -> list[Any]:
+    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
+    made = []
+    for ns, p, q in zip(trajectory.timestamps_ns.tolist(), position.tolist(), quaternion.tolist(), strict=True):
+        sec, nanosec = divmod(ns, _BILLION)
+        time = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+        header = types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
+        where = types["geometry_msgs/msg/Point"](*p)
+        turned = types["geometry_msgs/msg/Quaternion"](*q)
+        pose = types["geometry_msgs/msg/Pose"](position=where, orientation=turned)
+        made.append(types[POSE_MESSAGE](header=header, pose=pose))
+    return made

@@ -1,0 +1,161 @@
+"""Trajectories from elsewhere as records beside our own runs."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.fingerprint import versions
+from dynslam_bench.core.records import digest
+from dynslam_bench.envs.arguments import Frames, open_frames
+from dynslam_bench.evaluation.prepare import STAMP_TOLERANCE
+from dynslam_bench.geometry.association import associate, nearest_gap
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.runs.exchange.export import digest_of, stated_provenance
+from dynslam_bench.runs.exchange.formats import read_trajectory
+from dynslam_bench.runs.one import judge_coverage, part_digest, sequence_info
+from dynslam_bench.runs.record import RunRecord, TrackerInfo
+from dynslam_bench.runs.spec import place_of
+from dynslam_bench.runs.store import RunStore
+from dynslam_bench.sequences.catalogue import parse_frames
+from dynslam_bench.sequences.view import part_of
+
+_TOLERANCE_S = 0.02
+
+
+def import_trajectory(
+    path: str | Path,
+    tracker: str,
+    sequence: str,
+    *,
+    results: str | Path | RunStore = "results",
+    label: str = "",
+    provenance: str = "",
+    which: Literal["online", "final"] = "final",
+    frames: Frames = None,
+    stride: int = 1,
+    data_root: str | Path | None = None,
+    camera: str | Path | None = None,
+    timestamps: str | Path | None = None,
+    topic: str | None = None,
+) -> RunRecord:
+    """Store an external trajectory as a record of kind ``imported``.
+
+    Args:
+        path: A trajectory in any of the formats that `read_trajectory` knows.
+        tracker: Name of the system that made it.
+        sequence: The sequence that it was made on; its ground truth is needed to score it.
+        results: The results folder, or a store.
+        label: Name for tables; default is ``<tracker> (imported)``.
+        provenance: Where it came from, e.g. a URL; by default what ``provenance.json`` beside it says, else its name.
+        which: Whether its poses are the causal ones or those after the final optimisation.
+        frames: Part of the sequence it covers; None for all.
+        stride: Every so many frames.
+        data_root: Folder of the recorded sequences.
+        camera: Camera of a folder that does not say its own.
+        timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one each, in seconds, for
+            COLMAP a list of stamps and images.
+        topic: Of a bag with several topics of poses, the one to take.
+
+    Returns:
+        The record, ``lost`` by the rule of runs (`judge_coverage`); its notes count poses whose stamps are no frame's.
+
+    Raises:
+        DynslamError: The trajectory cannot be read.
+        RunError: It shares no time with the sequence (with the measured gap), or the name is empty.
+        DynslamError: The sequence cannot be opened, or the store not be written.
+    """
+    if not tracker.strip():
+        raise RunError("an imported trajectory needs the name of its tracker")
+    file = Path(path).expanduser()
+    loaded = read_trajectory(file, timestamps, topic)
+    opened = open_frames(sequence, data_root, camera, frames, stride)
+    covered, odd, last = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
+    notes = loaded.notes.describe()
+    if odd:
+        notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
+    asked = {
+        "tracker": TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
+        **{"frames": _pair(frames), "stride": stride, "place": place_of(sequence)},
+        **{"stamps_match": not odd, "provenance": provenance or stated_provenance(file) or str(file), "notes": notes},
+    }
+    asked["status"], asked["reason"] = judge_coverage(covered, len(opened), len(opened) - 1 - last, len(opened))
+    record = _record(_identity(file, tracker, which, opened, timestamps, topic), opened, covered, asked)
+    _keep(results if isinstance(results, RunStore) else RunStore(results), record, opened, loaded.trajectory, which)
+    return record
+
+
+def _keep(store: RunStore, record: RunRecord, sequence: Sequence, trajectory: Trajectory, which: str) -> None:
+    store.prepare()
+    with store.work_folder(record.run_id) as work:
+        comment = f"imported: {record.tracker.id} on {sequence.id}"
+        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
+        store.add_sequence(record.sequence.part, timestamps_ns(sequence), sequence.ground_truth)
+        store.publish(work, record)
+
+
+def _record(identity: dict[str, Any], sequence: Sequence, covered: int, asked: dict[str, Any]) -> RunRecord:
+    total = len(sequence)
+    return RunRecord(
+        kind="imported",
+        run_id=digest(identity, 16),
+        sequence=sequence_info(sequence, identity["content"], part_digest(identity)),
+        n_frames=total,
+        n_tracked=covered,
+        n_lost=total - covered,
+        coverage=covered / total,
+        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
+        versions=versions(),
+        identity=identity,
+        **asked,
+    ).normalised()
+
+
+def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int, int]:
+    """How many frames a trajectory covers, how many of its poses carry no frame's stamp, and the last frame it covers.
+
+    Raises:
+        RunError: Fewer than two of them are near a frame; `shares` and `name` say whose they are.
+    """
+    exact, _ = associate(stamps, trajectory.timestamps, STAMP_TOLERANCE, strict=False)
+    near, _ = associate(stamps, trajectory.timestamps, _TOLERANCE_S)
+    if len(near) < 2:
+        gap = float(np.min(nearest_gap(trajectory.timestamps, stamps)))
+        raise RunError(
+            f"{shares} {len(near)} stamps with {name}, at least 2 are needed",
+            f"the nearest is {gap:.3f} s off; frames last from {stamps[0]:.6f} to {stamps[-1]:.6f}",
+        )
+    odd = len(trajectory) - len(exact)
+    return (len(near) if odd else len(exact)), odd, int(near[-1])
+
+
+def _identity(
+    file: Path, tracker: str, which: str, sequence: Sequence, timestamps: str | Path | None, topic: str | None
+) -> dict[str, Any]:
+    part = part_of(sequence)
+    return {
+        "kind": "imported",
+        "tracker": tracker,
+        "which": which,
+        "file": digest_of(file),
+        "sequence": part.id,
+        "content": part.content,
+        "frames": [part.start, part.stop],
+        "offset": 0,
+        "stride": part.stride,
+        **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
+        **({} if topic is None else {"topic": topic}),
+    }
+
+
+def _pair(frames: Frames) -> tuple[int, int | None] | None:
+    if frames is None:
+        return None
+    return parse_frames(frames if isinstance(frames, str) else (frames[0] or 0, frames[1]))

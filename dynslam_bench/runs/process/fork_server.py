@@ -1,0 +1,357 @@
+"""The fork server: a process that has imported everything heavy and forks the children of runs in 10 ms each.
+
+The parent asks for a child over a Unix socket: one byte with two file descriptors, the child's end of its connection
+and a pipe. On the pipe the server answers with the child's process id and, later, its exit code, a JSON line each. A
+run's end is reported after all processes that it had started have ended and its temporary files are removed. When the
+socket closes, because the parent has ended, the server kills its children and ends. It has a session of its own, so
+that signals of a terminal do not reach it before.
+
+Where forking is not safe (macOS) the server starts each child in a fresh interpreter instead.
+``multiprocessing``'s own fork server re-imports the caller's main script and may not be used in daemonic processes, see
+``docs/decisions/fork-server.md``.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import json
+import os
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection, Pipe, wait
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from dynslam_bench.core.errors import InfrastructureError
+from dynslam_bench.core.files import sweep
+from dynslam_bench.runs.process.tree import adopt_orphans, end_children, end_processes, end_tree
+
+_CHILD = "dynslam_bench.runs.process.child"
+PRELOADED = (
+    *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium"),
+    *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
+    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.registry"),
+    *("dynslam_bench.segmentation.schedule", _CHILD),
+    *("dynslam_bench.runs.loop", "dynslam_bench.trackers.registry"),
+)
+THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
+"""Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
+START_VARIABLE = "DYNSLAM_BENCH_START"
+"""``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
+_REAP_S = 10.0
+"""How long `Child.close` waits for the report of the child's end."""
+
+
+class ForkServer:
+    """The parent's end; the server is started when first used, and again if it has died.
+
+    Args:
+        start: ``fork`` or ``fresh``.
+    """
+
+    def __init__(self, start: str) -> None:
+        self._start = start
+        self._lock = threading.Lock()
+        self._socket: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._owner = 0
+
+    def spawn(self, child_fd: int) -> int:
+        """Start a child that makes a run over a connection.
+
+        Args:
+            child_fd: The child's end of its connection; the caller closes it afterwards.
+
+        Returns:
+            The read end of the status pipe.
+
+        Raises:
+            InfrastructureError: The server cannot be started.
+        """
+        read_fd, write_fd = os.pipe()
+        try:
+            with self._lock:
+                try:
+                    socket.send_fds(self._connected(), [b"c"], [child_fd, write_fd])
+                except OSError:  # it has just died
+                    self._close()
+                    socket.send_fds(self._connected(), [b"c"], [child_fd, write_fd])
+            return read_fd
+        except BaseException as error:
+            os.close(read_fd)
+            if isinstance(error, OSError):
+                raise InfrastructureError(f"the fork server does not answer: {error}") from error
+            raise
+        finally:
+            os.close(write_fd)
+
+    def close(self) -> None:
+        """Stop the server and every child of it."""
+        with self._lock:
+            self._close()
+
+    def _connected(self) -> socket.socket:
+        if self._owner != os.getpid():  # after a fork the parent's server is not ours
+            self._socket, self._process = None, None
+        if self._socket is not None and self._process is not None and self._process.poll() is None:
+            return self._socket
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", __name__, str(theirs.fileno()), self._start],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                env=child_environment(),
+                start_new_session=True,
+            )
+        except OSError as error:
+            ours.close()
+            raise InfrastructureError(f"cannot start {sys.executable}: {error.strerror}") from error
+        finally:
+            theirs.close()
+        self._socket, self._owner = ours, os.getpid()
+        return ours
+
+    def _close(self) -> None:
+        if self._socket is not None and self._process is not None and self._owner == os.getpid():
+            self._socket.close()
+            try:
+                self._process.wait(timeout=1)
+            except subprocess.TimeoutExpired:  # still importing
+                self._process.kill()
+                self._process.wait()
+        self._socket, self._process = None, None
+
+
+SERVERS = {start: ForkServer(start) for start in ("fork", "fresh")}
+for _server in SERVERS.values():
+    atexit.register(_server.close)
+
+
+def child_environment() -> dict[str, str]:
+    """The environment of a fresh interpreter: BLAS on one thread, and this process's import path."""
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    return environment
+
+
+class Child:
+    """A child of the fork server, which waits for its job.
+
+    Attributes:
+        connection: The parent's end.
+        pid: Its process id, 0 until it is known.
+        members: Its process tree when it was last looked at; for the case that the server is killed.
+        lost: Why nothing is known of its end, if that is so: the server has died.
+
+    Raises:
+        InfrastructureError: The fork server cannot be started.
+    """
+
+    def __init__(self) -> None:
+        start = os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
+        self.connection, theirs = Pipe()
+        try:
+            self.status_fd = SERVERS[start].spawn(theirs.fileno())
+        except BaseException:
+            self.connection.close()
+            raise
+        finally:
+            theirs.close()
+        os.set_blocking(self.status_fd, False)
+        self.pid = 0
+        self.lost = ""
+        self.members: list[psutil.Process] = []
+        self._buffer = b""
+        self._exit: int | None = None
+
+    def poll(self) -> int | None:
+        """Its exit code (minus the signal's number if one ended it), None while it runs."""
+        while self._exit is None:
+            try:
+                data = os.read(self.status_fd, 4096)
+            except BlockingIOError:
+                break
+            if not data:
+                self._exit, self.lost = -signal.SIGKILL, self.lost or "the fork server was ended from outside"
+                break
+            *lines, self._buffer = (self._buffer + data).split(b"\n")
+            for message in map(json.loads, lines):
+                self.pid = message.get("pid", self.pid)
+                self._exit = message.get("exit", self._exit)
+                self.lost = message.get("refused", self.lost)
+        return self._exit
+
+    def kill(self) -> None:
+        """End it, with everything that it started."""
+        if self.pid and self.poll() is None:
+            end_tree(self.pid)
+
+    def close(self) -> None:
+        """Kill it if it still runs, wait until it and all that it started have ended, and release the pipes."""
+        self.kill()
+        self.connection.close()
+        deadline = time.monotonic() + _REAP_S
+        while self.poll() is None and time.monotonic() < deadline:
+            wait([self.status_fd], 0.1)
+        os.close(self.status_fd)
+        if self.lost:
+            end_processes(self.members)
+            sweep()
+
+
+def make_job(work: str, folder: Path | str, **details: Any) -> dict[str, Any]:
+    """A job for a child, as JSON takes it.
+
+    Args:
+        work: ``module:function`` that does it; called with the job, a function that tells the parent something, and
+            one that says whether the parent wants an early end.
+        folder: Where the child's log and what it finds go.
+        details: What `work` wants to know; ``spec`` with the ``threads`` of the run among it.
+
+    Returns:
+        The job; the child does it in this process's working folder, with its environment and import path.
+    """
+    environment = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
+    context = {"environment": environment, "working_folder": str(Path.cwd()), "path": list(sys.path)}
+    return {"work": work, "folder": str(folder), **context, **details}
+
+
+class _Server:
+    """The server's loop: it waits for requests of the parent, for ends of children and for SIGTERM."""
+
+    def __init__(self, control: socket.socket, start: str) -> None:
+        self.control, self.start = control, start
+        self.own = frozenset(child.pid for child in psutil.Process().children())  # helpers of libraries
+        self.runs: dict[int, int] = {}
+        self.ending = False
+        self.wake_read, self.wake_write = os.pipe()
+        for end in (self.wake_read, self.wake_write):
+            os.set_blocking(end, False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.signal(signal.SIGTERM, self._end)
+        signal.set_wakeup_fd(self.wake_write, warn_on_full_buffer=False)
+        self.selector = selectors.DefaultSelector()
+        self.selector.register(control, selectors.EVENT_READ)
+        self.selector.register(self.wake_read, selectors.EVENT_READ)
+
+    def _end(self, *_: object) -> None:
+        self.ending = True
+
+    def run(self) -> None:
+        while not self.ending:
+            for key, _ in self.selector.select():
+                if key.fileobj is self.control:
+                    self._accept()
+                else:
+                    with contextlib.suppress(BlockingIOError):
+                        os.read(self.wake_read, 4096)
+                    self._reap()
+        for pid in self.runs:
+            end_tree(pid)
+        end_children()
+        sweep()
+
+    def _accept(self) -> None:
+        """Start the child that is asked for; the end if the parent has closed the socket."""
+        message, fds, _, _ = socket.recv_fds(self.control, 1, 2)
+        if not message:
+            self.ending = True
+            return
+        connection_fd, status_fd = fds
+        os.set_inheritable(status_fd, False)
+        try:
+            pid = self._fork(connection_fd, status_fd) if self.start == "fork" else _spawn(connection_fd)
+        except OSError as error:
+            _tell(status_fd, {"refused": f"no process can be started: {error.strerror}"})
+            os.close(status_fd)
+        else:
+            _tell(status_fd, {"pid": pid})
+            self.runs[pid] = status_fd
+        os.close(connection_fd)
+
+    def _fork(self, connection_fd: int, status_fd: int) -> int:
+        """Fork a child, which does not return from here."""
+        pid = os.fork()
+        if pid:
+            return pid
+        code = 1
+        try:
+            signal.set_wakeup_fd(-1)
+            for number in (signal.SIGCHLD, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+                signal.signal(number, signal.SIG_DFL)
+            self.selector.close()
+            self.control.close()
+            for inherited in (self.wake_read, self.wake_write, status_fd, *self.runs.values()):
+                os.close(inherited)
+            from dynslam_bench.runs.process.child import main
+
+            code = main(Connection(connection_fd))
+        finally:
+            os._exit(code)
+
+    def _reap(self) -> None:
+        """Reap the runs that have ended, end what they have left behind, then report them."""
+        ended: list[tuple[int, int]] = []
+        for pid in list(self.runs):
+            reaped, status = os.waitpid(pid, os.WNOHANG)
+            if reaped:
+                ended.append((self.runs.pop(pid), status))
+        if ended:
+            end_children({*self.runs, *self.own})
+            sweep()
+        for status_fd, status in ended:
+            _tell(status_fd, {"exit": os.waitstatus_to_exitcode(status)})
+            os.close(status_fd)
+
+
+def _spawn(connection_fd: int) -> int:
+    """Start a child in a fresh interpreter."""
+    os.set_inheritable(connection_fd, True)
+    command = [sys.executable, "-m", _CHILD, str(connection_fd)]
+    return os.posix_spawn(sys.executable, command, os.environ, setsigdef=[signal.SIGINT, signal.SIGHUP])
+
+
+def _tell(fd: int, message: dict[str, Any]) -> None:
+    with contextlib.suppress(OSError):  # the parent may have closed its end
+        os.write(fd, json.dumps(message).encode() + b"\n")
+
+
+def serve(fd: int, start: str) -> None:
+    """Serve until the socket `fd` closes or SIGTERM comes."""
+    control = socket.socket(fileno=fd)
+    for ignored in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(ignored, signal.SIG_IGN)
+    for name in PRELOADED if start == "fork" else ():
+        if _is_closed(control):
+            return
+        with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
+            importlib.import_module(name)
+    if start == "fork":
+        with contextlib.suppress(Exception):
+            importlib.import_module("dynslam_bench.trackers.registry").all_specs()  # imports all systems
+    adopt_orphans()
+    _Server(control, start).run()
+
+
+def _is_closed(control: socket.socket) -> bool:
+    try:
+        return control.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
+if __name__ == "__main__":
+    serve(int(sys.argv[1]), sys.argv[2])
+    os._exit(0)  # nothing is left to clean up, and libraries take long to end

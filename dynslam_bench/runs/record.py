@@ -1,0 +1,336 @@
+"""What is kept of a run: `run.json`, and the metrics that lie apart from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from dynslam_bench.core.fingerprint import GitRevision, Machine
+from dynslam_bench.core.records import Digest, Record, digest, schema
+from dynslam_bench.evaluation.evaluate import Evaluation
+
+RUN_SCHEMA = 1
+METRIC_SCHEMA = 1
+
+Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
+IDENTITY_SCHEME = 1
+"""Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
+_CODE = ("tracker_version", "distribution", "source", "requires", "files")
+FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
+"""Statuses of runs that did not come to their end."""
+LOST_COVERAGE = 0.5
+"""A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
+
+
+def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
+    """Code, weights and library versions in a run's identity, by name, as short texts."""
+    code = digest([identity.get(name) for name in _CODE], 8)
+    libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
+    weights = {f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()}
+    return {"code": code} | libraries | weights
+
+
+class TrackerInfo(Record):
+    """The tracker, as its spec described it; see `TrackerSpec`.
+
+    Beside that `given`: what it was named by where its id alone does not find it, ``/path/file.py:Attr`` or
+    ``module:Attr``; empty for an id, and in older records.
+    """
+
+    id: str
+    label: str
+    version: str = ""
+    distribution: str = ""
+    provenance: str = "external"
+    ranked: bool = True
+    deterministic: bool = True
+    license: str = ""
+    citation: str = ""
+    remarks: str = ""
+    sensors: Literal["rgbd", "rgb"] = "rgbd"
+    given: str = ""
+
+
+class SequenceInfo(Record):
+    """The sequence.
+
+    Attributes:
+        id: Its id.
+        content: Digest of its content.
+        part: Digest of content and frames: names the folder with the stamps and the ground truth.
+        block: Digest of what is filmed, camera, frames and stride, without the start offset and the noise seed: one
+            column of a table. Empty in records of older versions, whose `part` stands for it.
+        noise: Seed of the sensors' noise; None for the sequence's own.
+        frames: Frames of the run's part.
+        duration_s: Time between its first and last frame.
+        fps: Nominal frame rate.
+        ground_truth: Whether it has any.
+        license: Licence of the data.
+        citation: What to cite.
+        tags: For example ``high-dynamic``.
+        split: ``tune``, ``held-out`` or empty.
+    """
+
+    id: str
+    content: str = ""
+    part: Digest
+    block: Annotated[str, Field(pattern=r"^([0-9a-f]{16})?$")] = ""
+    noise: int | None = None
+    frames: int
+    duration_s: float
+    fps: float
+    ground_truth: bool
+    license: str = ""
+    citation: str = ""
+    tags: list[str] = Field(default_factory=list)
+    split: str = ""
+
+
+class StageTime(Record):
+    """Wall-clock seconds a frame of one stage, over the tracked frames; frames on which it did not run count as 0."""
+
+    median_s: float
+    p95_s: float
+    mean_s: float
+
+
+class StartMap(Record):
+    """The map of an earlier run, in which a run began.
+
+    Attributes:
+        digest: Of its content: runs that began in different maps are never repeats of each other.
+        file: Where it lay.
+        made_by: Which run made it, in words.
+        keyframes: Keyframes that it brought.
+        points: Points that it brought.
+        localisation_only: Whether it stayed as it was.
+    """
+
+    digest: Digest
+    file: str = ""
+    made_by: str = ""
+    keyframes: int
+    points: int
+    localisation_only: bool = False
+
+    def describe(self) -> str:
+        """One line: which map, of which run, and whether it stayed as it was."""
+        what = f"begun in the map {self.digest[:8]} ({self.keyframes} keyframes, {self.points} points)"
+        of = f" of {self.made_by}" if self.made_by else ""
+        return what + of + (", localisation only" if self.localisation_only else "") + f": {self.file}"
+
+
+class RunRecord(Record):
+    """The outcome of a run.
+
+    Attributes:
+        schema_version: Of this record; older ones stay loadable.
+        kind: ``run`` (made here) or ``imported`` (a trajectory from elsewhere).
+        run_id: Digest of `identity`.
+        status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`); ``crashed``,
+            ``timeout``, ``out-of-memory``; ``invalid``: the tracker broke its contract; ``stopped``: ended early
+            on request.
+        reason: One line, empty for ``ok``.
+        tracker: The tracker.
+        overrides: The settings that were asked for, dotted name to value.
+        settings: All settings, dotted name to value.
+        sequence: The sequence.
+        frames: Part of it; None for all.
+        offset: So many leading frames of that part were left out.
+        stride: Every so many frames.
+        seed: Seed.
+        device: Where it computed.
+        threads: Threads it was given.
+        realtime: Whether frames were dropped while the tracker was busy.
+        drop_share: Share of the frames dropped at random.
+        degrade: Degradation of the images.
+        segmentation: Where the masks came from: ``oracle``, ``embedded``, ...; empty without a semantic stage.
+        n_frames: Input frames.
+        n_processed: Frames that the tracker saw.
+        n_tracked: Frames with state ``ok``.
+        n_lost: Frames with state ``lost``.
+        n_initialising: Frames with state ``initialising``.
+        n_dropped: Frames that never reached the tracker.
+        coverage: ``n_tracked / n_frames``.
+        keyframes: Keyframes at the end, None if the tracker does not say.
+        map_points: Map points at the end, None if the tracker does not say.
+        maps: Maps at the end that never met, those of their own begun after a loss among them; None if the tracker does
+            not say.
+        start_map: The map that the run began in; None for one that began without.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
+            without an epipolar test.
+        mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
+            where either is missing.
+        timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded;
+            ``processor`` the processor time of the run's own process in it (missing in older runs).
+        finalize_s: Time of the final optimisation.
+        started: UTC, ISO 8601.
+        wall_s: Wall-clock time of the whole run.
+        peak_memory_mb: Largest resident memory.
+        peak_gpu_memory_mb: Largest GPU memory, None without one.
+        machine: The computer.
+        versions: Of Python and the packages that matter.
+        git: Revision of the checkout.
+        command: The command line of the parent process.
+        identity: What `run_id` stands for.
+        provenance: For imported trajectories: where it came from.
+        place: Folder of the sequence where it was named by its path; empty for an id.
+        stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
+        study: Study that made it and nobody else asked for; empty for any other run, and in older records.
+        notes: Anything a reader should know, one line each.
+    """
+
+    schema_version: int = schema(RUN_SCHEMA)
+    kind: Literal["run", "imported"] = "run"
+    run_id: Digest
+    status: Status
+    reason: str = ""
+    tracker: TrackerInfo
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    settings: dict[str, Any] = Field(default_factory=dict)
+    sequence: SequenceInfo
+    frames: tuple[int, int | None] | None = None
+    offset: int = 0
+    stride: int = 1
+    seed: int = 0
+    device: str = ""
+    threads: int = 1
+    realtime: bool = False
+    drop_share: float = 0.0
+    degrade: dict[str, float] = Field(default_factory=dict)
+    segmentation: str = ""
+    n_frames: int
+    n_processed: int = 0
+    n_tracked: int = 0
+    n_lost: int = 0
+    n_initialising: int = 0
+    n_dropped: int = 0
+    coverage: float = 0.0
+    keyframes: int | None = None
+    map_points: int | None = None
+    maps: int | None = None
+    start_map: StartMap | None = None
+    epipolar_skipped: float | None = None
+    mask_iou: float | None = None
+    timings: dict[str, StageTime] = Field(default_factory=dict)
+    finalize_s: float | None = None
+    started: str = ""
+    wall_s: float = 0.0
+    peak_memory_mb: float | None = None
+    peak_gpu_memory_mb: float | None = None
+    machine: Machine | None = None
+    versions: dict[str, str] = Field(default_factory=dict)
+    git: GitRevision | None = None
+    command: list[str] = Field(default_factory=list)
+    identity: dict[str, Any] = Field(default_factory=dict)
+    provenance: str = ""
+    place: str = ""
+    stamps_match: bool = True
+    study: str = ""
+    notes: list[str] = Field(default_factory=list)
+
+    def normalised(self) -> RunRecord:
+        """The record as it reads after it was written: tuples inside settings are lists then."""
+        return RunRecord.model_validate_json(self.to_json())
+
+    @property
+    def verified(self) -> bool:
+        """Whether its id tells content, code, weights and libraries; runs of older identity schemes do not."""
+        return self.kind == "imported" or self.identity.get("scheme") == IDENTITY_SCHEME
+
+    @property
+    def program(self) -> dict[str, str]:
+        """What made the run beside its settings: code, weights and library versions, by name, as short texts."""
+        made = program_of(self.identity) if self.kind == "run" else {}
+        return made if self.verified else made | {"identity": "unverified"}
+
+    @property
+    def failed(self) -> bool:
+        """Whether it did not come to its end."""
+        return self.status in FAILED
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings that were asked for; in place of a map's path the digest of its content, as ``map``.
+
+        Values are those that the run had, however they were spelled: ``"1"`` and ``1.0`` are one.
+        """
+        asked = {name: self.settings.get(name, value) for name, value in self.overrides.items()}
+        if self.start_map is None:
+            return asked
+        named = {name: value for name, value in asked.items() if not name.startswith("backend.map.")}
+        alone = {"backend.map.localisation_only": True} if self.start_map.localisation_only else {}
+        return named | {"map": self.start_map.digest[:8]} | alone
+
+    @property
+    def trial_of(self) -> str:
+        """The study that made it with settings of its own; empty for its runs with the default settings, and others."""
+        return self.study if self.asked else ""
+
+    @property
+    def repeat(self) -> str:
+        """Which repeat of its block the run is, in words, e.g. ``seed 0, offset 2``."""
+        words = [f"seed {self.seed}"]
+        words += [f"offset {self.offset}"] * bool(self.offset)
+        words += [] if self.sequence.noise is None else [f"noise {self.sequence.noise}"]
+        return ", ".join(words)
+
+    @property
+    def frame_time_s(self) -> float | None:
+        """Median time a frame, segmentation included, decoding excluded."""
+        total = self.timings.get("total")
+        return None if total is None else total.median_s
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Sensor's frame interval over the mean frame time: above 1 the tracker keeps up."""
+        total = self.timings.get("total")
+        return None if total is None or total.mean_s <= 0 else 1.0 / (self.sequence.fps * total.mean_s)
+
+    def describe(self) -> str:
+        """One line: tracker, sequence, seed, status, coverage, frame time."""
+        parts = [f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"]
+        parts.append(f"coverage {100 * self.coverage:.1f} %")
+        if self.frame_time_s is not None:
+            parts.append(f"{1000 * self.frame_time_s:.1f} ms a frame")
+        return ", ".join(parts) + (f" ({self.reason})" if self.reason else "")
+
+
+class MetricRecord(Record):
+    """The errors of one run under one protocol.
+
+    Attributes:
+        schema_version: Of this record.
+        run_id: The run.
+        protocol_id: Id of the protocol.
+        protocol_digest: Its digest; numbers of different digests are not comparable.
+        code: Digest of the evaluation code that computed them.
+        trajectory: Which of the two the protocol asks for.
+        online: Evaluation of the online trajectory; None if it cannot be evaluated.
+        final: Evaluation of the final trajectory; None if there is none or it cannot be evaluated.
+        reasons: Why an evaluation is missing, by ``online`` and ``final``.
+        hints: What is probably wrong with the trajectory that the protocol asks for, a line each; see `hints`.
+    """
+
+    schema_version: int = schema(METRIC_SCHEMA)
+    run_id: Digest
+    protocol_id: str
+    protocol_digest: str
+    code: str = ""
+    trajectory: Literal["online", "final"] = "online"
+    online: Evaluation | None = None
+    final: Evaluation | None = None
+    reasons: dict[str, str] = Field(default_factory=dict)
+    hints: list[str] = Field(default_factory=list)
+
+    @property
+    def primary(self) -> Evaluation | None:
+        """The evaluation of the trajectory that the protocol asks for."""
+        return self.online if self.trajectory == "online" else self.final
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """The primary evaluation's metrics; empty if there is none."""
+        return {} if self.primary is None else self.primary.metrics

@@ -1,1 +1,0 @@
-"""What is kept of runs: records, frames, the store, scores."""

@@ -1,0 +1,552 @@
+"""The run store: one folder a run, which appears whole or not at all; its runs as lists, and their scores."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import re
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import DynslamError, EvaluationError, InfrastructureError, RunError, did_you_mean
+from dynslam_bench.core.files import claimed, replace_folder, sweep_temporary, temporary_folder
+from dynslam_bench.core.fingerprint import package_digest
+from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core.records import digest, write_atomic
+from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
+from dynslam_bench.evaluation.hints import hints
+from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, get_protocol
+from dynslam_bench.geometry.stamps import format_ns
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import format_tum, read_tum
+from dynslam_bench.runs.record import MetricRecord, RunRecord
+from dynslam_bench.runs.run_index import (
+    FIELDS,
+    ONLINE,
+    RUN_FILE,
+    Row,
+    RunIndex,
+    check_plain,
+    file_stamp,
+    run_row,
+    runs_frame,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+LOGGER = logging.getLogger(__name__)
+DEFAULT_PROTOCOL = "tum-rgbd/v1"
+Which = Literal["online", "final"]
+_RUN_ID = re.compile(r"[0-9a-f]{16}")
+OnProgress = Callable[[int, int], None]
+"""Called with how many runs are done, of how many."""
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """A folder of the store that holds no valid record."""
+
+    path: Path
+    reason: str
+
+
+class RunStore:
+    """Runs and the sequences' ground truth below one folder.
+
+    ``runs/<run_id>/`` holds ``run.json``, ``trajectory_online.txt``, ``trajectory_final.txt``, ``frames.csv``,
+    ``keyframes.csv``, ``map.ply`` and ``log.txt``; ``sequences/<part>/`` stamps and ground truth, so that a run can be
+    scored again without its data; ``index.sqlite`` metrics and rows of tables, which are computed from these;
+    ``latest`` links the newest run.
+
+    Args:
+        root: The folder; it is made when something is written.
+
+    Attributes:
+        root: The same, absolute.
+        runs: Folder of the runs.
+        index: What was computed from the runs.
+    """
+
+    def __init__(self, root: str | Path = "results") -> None:
+        self.root = Path(root).expanduser().absolute()
+        self.runs = self.root / "runs"
+        self.index = RunIndex(self.root)
+        self._swept = False
+
+    def folder(self, run_id: str) -> Path:
+        """Folder of one run, whether it exists or not.
+
+        Raises:
+            RunError: It is no run's id, which is 16 hexadecimal digits: anything else could lead out of the store.
+        """
+        return self.runs / _checked(run_id, "a run's id")
+
+    def _part(self, part: str) -> Path:
+        """Folder of the stamps and the ground truth of a sequence's part."""
+        return self.root / "sequences" / _checked(part, "the part of a sequence")
+
+    # -- writing ---------------------------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Make sure that runs can be stored, and remove what killed processes left behind.
+
+        Raises:
+            RunError: The folder cannot be written.
+        """
+        try:
+            with temporary_folder(self.runs / "probe"):
+                pass
+        except DynslamError as error:
+            raise RunError(str(error.args[0]), "name another folder with --results") from error
+        if not self._swept:
+            self._swept = True
+            for pattern in ("", "runs", "sequences/*"):
+                sweep_temporary(self.root, pattern)
+            for left in self.runs.glob(".*.claim"):
+                with claimed(left):  # if no process holds it, it is removed
+                    pass
+            self._unlink_dangling()
+
+    def work_folder(self, run_id: str) -> AbstractContextManager[Path]:
+        """A hidden folder to make a run in; it vanishes unless `publish` moved it into place.
+
+        Raises:
+            DynslamError: The store cannot be written.
+        """
+        return temporary_folder(self.folder(run_id))
+
+    def claim(self, run_id: str) -> AbstractContextManager[bool]:
+        """Make a run alone while the block lasts; it is given False where another process or thread is making it.
+
+        Raises:
+            DynslamError: The store cannot be written.
+        """
+        return claimed(self.runs / f".{run_id}.claim")
+
+    def publish(self, work: Path, record: RunRecord) -> RunRecord:
+        """Write the record into its work folder and rename that to the run's; replaces an earlier run of the id.
+
+        Returns:
+            The record as it is stored, with a note if the earlier run gave another result.
+
+        Raises:
+            InfrastructureError: It cannot be written; then nothing has changed.
+        """
+        target = self.folder(record.run_id)
+        record = self._with_alarm(record, work)
+        try:
+            (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
+            replace_folder(work, target)
+        except OSError as error:
+            raise InfrastructureError(f"cannot write {target}: {error.strerror}", "check the free space") from error
+        link = self.root / "latest"
+        with contextlib.suppress(OSError), temporary_folder(link) as folder:  # a file system may have no links
+            fresh = folder / link.name
+            fresh.symlink_to(target.relative_to(self.root))
+            fresh.replace(link)
+        return record
+
+    def _with_alarm(self, record: RunRecord, work: Path) -> RunRecord:
+        """The record, with a note where an earlier run of its id, which should be equal, gave another trajectory."""
+        earlier = self.get(record.run_id)
+        if earlier is None or not record.tracker.deterministic or record.realtime:
+            return record
+        if earlier.status != "ok" or record.status != "ok":
+            return record
+        if _content(work / ONLINE) == _content(self.folder(record.run_id) / ONLINE):
+            return record
+        note = (
+            f"an earlier run with this id, started {earlier.started}, gave another trajectory, although tracker "
+            f"'{record.tracker.id}' is declared deterministic"
+        )
+        LOGGER.warning("run %s: %s", record.run_id, note)
+        return record.model_copy(update={"notes": [*record.notes, note]})
+
+    def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
+        """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth; done once a part."""
+        folder = self._part(part)
+        if (folder / "timestamps.txt").is_file():
+            return
+        if ground_truth is not None and len(ground_truth):
+            write_atomic(folder / "groundtruth.txt", format_tum(ground_truth))
+        write_atomic(folder / "timestamps.txt", "".join(f"{format_ns(ns)}\n" for ns in timestamps_ns.tolist()))
+
+    def relabel(self, record: RunRecord, label: str) -> RunRecord:
+        """Give a stored run another name in tables; see `rewrite`."""
+        return self.rewrite(record, tracker=record.tracker.model_copy(update={"label": label}))
+
+    def rewrite(self, record: RunRecord, **changes: Any) -> RunRecord:
+        """Change fields of a stored run that are no part of its outcome: its label in tables, the study that made it.
+
+        Raises:
+            DynslamError: It cannot be written.
+        """
+        changed = (self.get(record.run_id) or record).model_copy(update=changes)
+        write_atomic(self.folder(record.run_id) / RUN_FILE, changed.to_json())
+        return changed
+
+    def remove(self, run_id: str) -> None:
+        """Delete a run and its metrics.
+
+        Raises:
+            RunError: There is no such run, or it cannot be deleted.
+        """
+        run_id = self.find(run_id)
+        try:
+            with self.work_folder(run_id) as removed:
+                self.folder(run_id).rename(removed / run_id)
+        except OSError as error:
+            raise RunError(f"cannot remove run {run_id}: {error.strerror}") from error
+        self.index.forget(run_id)
+        self._unlink_dangling()
+
+    def _unlink_dangling(self) -> None:
+        latest = self.root / "latest"
+        if latest.is_symlink() and not latest.exists():
+            latest.unlink(missing_ok=True)
+
+    # -- reading ---------------------------------------------------------------------------------------------------
+
+    def ids(self) -> list[str]:
+        """Ids of all stored runs, sorted."""
+        if not self.runs.is_dir():
+            return []
+        with os.scandir(self.runs) as entries:
+            return sorted(entry.name for entry in entries if _RUN_ID.fullmatch(entry.name) and entry.is_dir())
+
+    def read(self, run_id: str) -> RunRecord:
+        """The record of a run by its id, the id's first digits, or ``latest``.
+
+        Raises:
+            RunError: There is no such run.
+            DynslamError: Its record is damaged.
+        """
+        return self.read_whole(self.find(run_id))
+
+    def get(self, run_id: str) -> RunRecord | None:
+        """The record of a run by its full id, None if it is not stored or damaged."""
+        if not (self.folder(run_id) / RUN_FILE).is_file():
+            return None
+        try:
+            return self.read_whole(run_id)
+        except DynslamError:
+            return None
+
+    def read_whole(self, run_id: str) -> RunRecord:
+        """The record of a run by its full id.
+
+        Raises:
+            DynslamError: It is missing or damaged, names itself otherwise, or its folder holds more than plain files.
+        """
+        path = self.folder(run_id) / RUN_FILE
+        check_plain(path.parent, self.root)
+        record = RunRecord.read(path)
+        if record.run_id != run_id:
+            raise RunError(f"{path} names itself {record.run_id}, not as its folder", "it was copied or made by hand")
+        return record
+
+    def read_with_state(self, run_id: str) -> tuple[RunRecord, str]:
+        """As `read_whole`, with the state for values that are computed from the record, see `RunIndex.write`."""
+        stamp = file_stamp(self.folder(run_id) / RUN_FILE)
+        record = self.read_whole(run_id)
+        return record, self.index.state(run_id, record.sequence.part, stamp)
+
+    def all(self) -> tuple[list[RunRecord], list[Unreadable]]:
+        """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
+        records, unreadable = [], []
+        for run_id in self.ids():
+            try:
+                records.append(self.read_whole(run_id))
+            except DynslamError as error:
+                unreadable.append(Unreadable(self.folder(run_id), str(error)))
+        return sorted(records, key=lambda record: (record.started, record.run_id)), unreadable
+
+    def find(self, prefix: str) -> str:
+        """The full id of a run from its first digits, or of ``latest``.
+
+        Raises:
+            RunError: No run, or more than one, begins so.
+        """
+        run_ids = self.ids()
+        if prefix == "latest" and (self.root / "latest").exists():
+            return (self.root / "latest").resolve().name
+        matching = [run_id for run_id in run_ids if run_id.startswith(prefix)] if prefix else []
+        if len(matching) == 1:
+            return matching[0]
+        if matching:
+            raise RunError(f"{len(matching)} runs begin with '{prefix}'", ", ".join(matching[:5]))
+        hint = did_you_mean(prefix, run_ids) if run_ids else f"there are no runs in {self.root}"
+        raise RunError(f"there is no run '{prefix}'", hint)
+
+    def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
+        """The ``online`` or ``final`` trajectory of a run; None if there is none or no frame was tracked."""
+        path = self.folder(run_id) / f"trajectory_{which}.txt"
+        if not path.is_file() or not any(line.strip() and line[0] != "#" for line in read_lines(path, kind=RunError)):
+            return None
+        return read_tum(path)
+
+    def ground_truth(self, part: str) -> Trajectory | None:
+        """The ground truth of a sequence's part; None if it has none."""
+        path = self._part(part) / "groundtruth.txt"
+        check_plain(path.parent, self.root)
+        return _read_truth(path, file_stamp(path)) if path.is_file() else None
+
+    def timestamps(self, part: str) -> NDArray[np.float64]:
+        """Stamps in seconds of all input frames of a sequence's part.
+
+        Raises:
+            RunError: They are not stored, or damaged.
+        """
+        path = self._part(part) / "timestamps.txt"
+        check_plain(path.parent, self.root)
+        return _read_stamps(path, file_stamp(path))
+
+    # -- scores ----------------------------------------------------------------------------------------------------
+
+    def metrics(self, record: RunRecord, protocol: Protocol) -> MetricRecord | None:
+        """A run's stored metrics under a protocol; None if it was not scored under it, or they are out of date.
+
+        Metrics hold for one version of the evaluation code and one state of the trajectories and the ground truth.
+        """
+        text = self.index.get(_metrics_of(protocol), evaluation_code(), record.run_id)
+        if text is None:
+            return None
+        try:
+            metrics = MetricRecord.parse(text, f"metrics of run {record.run_id}")
+        except DynslamError as error:
+            LOGGER.warning("run %s is scored again: %s", record.run_id, error)
+            return None
+        is_right = (metrics.run_id, metrics.protocol_digest) == (record.run_id, protocol.digest())
+        return metrics if is_right else None
+
+    def add_metrics(self, record: RunRecord, metrics: MetricRecord, state: str = "") -> None:
+        """Keep a run's metrics under a protocol, for its state when they were computed or, without one, the present."""
+        entry = (record.run_id, state or self.index.state(record.run_id, record.sequence.part), metrics.to_line())
+        self.index.write(f"metrics {metrics.protocol_digest}", metrics.code, [entry])
+
+    def score(
+        self, record: RunRecord, protocol: Protocol | str = DEFAULT_PROTOCOL, *, again: bool = False
+    ) -> MetricRecord:
+        """The metrics of a stored run under a protocol, from its stored trajectories and ground truth.
+
+        Args:
+            record: The run.
+            protocol: A protocol or its id.
+            again: Compute them even if they are stored.
+
+        Returns:
+            The metrics; evaluations that are not possible are None, with the reason.
+        """
+        protocol = get_protocol(protocol)
+        stored = None if again else self.metrics(record, protocol)
+        if stored is not None:
+            return stored
+        state = self.index.state(record.run_id, record.sequence.part)  # before the files are read
+        evaluations: dict[Which, Evaluation | None] = {"online": None, "final": None}
+        reasons: dict[str, str] = {}
+        lines: list[str] = []
+        for which in evaluations:
+            try:
+                trajectory, truth, stamps = self._inputs(record, protocol, which)
+                evaluations[which] = evaluate(trajectory, truth, protocol, input_timestamps=stamps)
+            except DynslamError as error:
+                reasons[which] = str(error)
+                continue
+            if which == protocol.trajectory or not evaluations[protocol.trajectory]:
+                lines = [str(hint) for hint in hints(trajectory, truth, protocol)]
+        asked: Which = protocol.trajectory
+        if record.kind == "imported":  # it has only one trajectory
+            asked = "online" if (self.folder(record.run_id) / ONLINE).is_file() else "final"
+        metrics = MetricRecord(
+            run_id=record.run_id,
+            protocol_id=protocol.id,
+            protocol_digest=protocol.digest(),
+            code=evaluation_code(),
+            trajectory=asked,
+            **evaluations,
+            reasons=reasons,
+            hints=lines,
+        )
+        self.add_metrics(record, metrics, state)
+        return metrics
+
+    def _inputs(
+        self, record: RunRecord, protocol: Protocol, which: Which
+    ) -> tuple[Trajectory, Trajectory, NDArray[np.float64] | None]:
+        """One of a run's trajectories, the ground truth, and the stamps of the input frames where its own are theirs.
+
+        Raises:
+            DynslamError: One is missing or damaged, or the protocol does not fit the sequence or the tracker.
+        """
+        protocol.check_sequence(record.sequence.id)
+        protocol.check_scale(record.tracker.id, record.tracker.sensors)
+        truth = self.ground_truth(record.sequence.part)
+        if truth is None:
+            raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")
+        trajectory = self.trajectory(record.run_id, which)
+        if trajectory is None:
+            raise EvaluationError("there is no such trajectory, or it holds no tracked frame")
+        return trajectory, truth, self.timestamps(record.sequence.part) if record.stamps_match else None
+
+    def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL, *, trials: bool = False) -> pd.DataFrame:
+        """All runs, scored under one protocol, as a pandas frame: one row a run, from the oldest to the newest.
+
+        Args:
+            protocol: How to evaluate; SLAM is never run again for it.
+            trials: Whether the trials of studies are listed, too: their settings are candidates, no results.
+
+        Returns:
+            The columns that `runs_frame` describes.
+        """
+        listed = [record for record in self.all()[0] if trials or not record.trial_of]
+        return runs_frame([(r, None if r.status == "stopped" else self.score(r, protocol)) for r in listed])
+
+
+def evaluation_code() -> str:
+    """Digest of the code that metrics are computed by."""
+    return package_digest(("evaluation", "geometry"))
+
+
+def _metrics_of(protocol: Protocol) -> str:
+    return f"metrics {protocol.digest()}"
+
+
+def _content(file: Path) -> bytes:
+    return file.read_bytes() if file.is_file() else b""
+
+
+def _checked(name: str, what: str) -> str:
+    """A name that data gives to a folder of the store, if it is one that this package makes."""
+    if not _RUN_ID.fullmatch(name):
+        raise RunError(f"{name[:100]!r} is not {what}: expected 16 hexadecimal digits")
+    return name
+
+
+@lru_cache(maxsize=64)
+def _read_truth(path: Path, _stamp: str) -> Trajectory:
+    """A ground truth, which many runs share; its arrays are read-only."""
+    truth = read_tum(path)
+    truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
+    return truth
+
+
+@lru_cache(maxsize=64)
+def _read_stamps(path: Path, _stamp: str) -> NDArray[np.float64]:
+    """The stamps of a part, likewise shared."""
+    try:
+        stamps = np.array([float(line) for line in read_lines(path, kind=RunError) if line.strip()], dtype=np.float64)
+    except ValueError as error:
+        raise RunError(f"cannot read {path}: {error}", "the results folder is incomplete") from error
+    stamps.flags.writeable = False
+    return stamps
+
+
+def score(
+    store: RunStore, record: RunRecord, protocol: Protocol | str = DEFAULT_PROTOCOL, *, again: bool = False
+) -> MetricRecord:
+    """The metrics of a stored run under a protocol, see `RunStore.score`."""
+    return store.score(record, protocol, again=again)
+
+
+def list_runs(
+    store: RunStore, protocol: Protocol | str = DEFAULT_PROTOCOL, *, on_progress: OnProgress = lambda done, total: None
+) -> tuple[list[Row], list[Unreadable]]:
+    """Every run as `run_row` gives it, from the oldest to the newest, and the folders that hold no valid record.
+
+    Rows are taken from the store's index while the files of their run are the same; a store that cannot be written is
+    read without it.
+
+    Args:
+        store: The store.
+        protocol: What the errors hold under; runs that were not scored under it are scored now.
+        on_progress: Called now and then.
+    """
+    protocol = get_protocol(protocol)
+    name = f"list {protocol.digest()}"
+    version = digest([package_digest(("evaluation", "geometry", "runs")), *FIELDS])
+    ids = store.ids()
+    rows = {run_id: row for run_id, text in store.index.read(name, version, ids).items() if (row := _row(run_id, text))}
+    entries: list[tuple[str, str, str]] = []
+    unreadable: list[Unreadable] = []
+    for position, run_id in enumerate(ids):
+        if position % 100 == 0:
+            on_progress(position, len(ids))
+        if run_id in rows:
+            continue
+        try:
+            record, state = store.read_with_state(run_id)
+            rows[run_id] = run_row(record, None if record.status == "stopped" else store.score(record, protocol))
+            entries.append((run_id, state, json.dumps(list(rows[run_id].values()))))
+        except DynslamError as error:
+            unreadable.append(Unreadable(store.folder(run_id), str(error)))
+    store.index.write(name, version, entries)
+    return sorted(rows.values(), key=lambda row: (row["started"], row["run_id"])), unreadable
+
+
+def _row(run_id: str, text: str) -> Row | None:
+    """A row of the index, if it is one of that run, and can be sorted."""
+    try:
+        row = dict(zip(FIELDS, json.loads(text), strict=True))
+    except (ValueError, TypeError, RecursionError):
+        return None
+    return row if row["run_id"] == run_id and isinstance(row["started"], str) else None
+
+
+@dataclass(frozen=True)
+class Rescored:
+    """What scoring all runs of a store again has changed.
+
+    Attributes:
+        protocol: Id of the protocol.
+        runs: Runs that were scored.
+        changed: Ids of those whose stored metrics had other values.
+        unreadable: Folders without a valid record, with reasons.
+    """
+
+    protocol: str
+    runs: int
+    changed: tuple[str, ...]
+    unreadable: tuple[str, ...]
+
+
+def rescore(
+    store: RunStore, protocol: Protocol | str | None = None, *, on_progress: OnProgress = lambda done, total: None
+) -> list[Rescored]:
+    """Compute the metrics of all stored runs again, whatever is stored.
+
+    Args:
+        store: The store.
+        protocol: The protocol; None for every known one under which the store has metrics, at least the default one.
+        on_progress: Called after every run.
+
+    Returns:
+        What has changed, by protocol.
+    """
+    records, unreadable = store.all()
+    ended = [record for record in records if record.status != "stopped"]
+    reasons = tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)
+    names = store.index.names()
+    chosen = [option for option in PROTOCOLS.values() if option.id == DEFAULT_PROTOCOL or _metrics_of(option) in names]
+    chosen = chosen if protocol is None else [get_protocol(protocol)]
+    outcomes: list[Rescored] = []
+    for current in chosen:
+        changed = []
+        for number, record in enumerate(ended, start=1):
+            before = store.metrics(record, current)
+            after = store.score(record, current, again=True)
+            if before is not None and (before.online, before.final) != (after.online, after.final):
+                changed.append(record.run_id)
+            on_progress(len(outcomes) * len(ended) + number, len(chosen) * len(ended))
+        outcomes.append(Rescored(current.id, len(ended), tuple(changed), reasons))
+    return outcomes

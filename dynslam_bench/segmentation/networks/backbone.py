@@ -1,0 +1,295 @@
+"""Shape, residual trunk and feature pyramids of a Mask R-CNN; state-dict keys as torchvision's.
+
+Trunk: He et al. 2016, with the stride in the 3x3 convolution of a bottleneck (v1.5). FPN: Lin et al. 2017. CFPN: the
+paper's section on semantic segmentation; see `CFPN`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dynslam_bench.segmentation.settings import COCO_IDS
+
+COCO_CLASSES: tuple[str, ...] = tuple(COCO_IDS.get(number, "") for number in range(1, 91))
+"""Names of classes 1..90 as torchvision's COCO models number them; unused numbers are empty."""
+
+Count = Annotated[int, Field(ge=1, le=4096)]
+"""Of channels, layers or pixels; the upper bound refuses files with an absurd shape."""
+Blocks = Annotated[int, Field(ge=1, le=64)]
+Side = Annotated[float, Field(gt=0, le=1e5)]
+
+
+class NetworkConfig(BaseModel):
+    """A Mask R-CNN.
+
+    The defaults are torchvision's ``maskrcnn_resnet50_fpn``.
+
+    Attributes:
+        blocks: Residual blocks of the four stages, e.g. (3, 4, 6, 3) for ResNet-50.
+        bottleneck: Bottleneck blocks (ResNet-50 and deeper) or basic ones (ResNet-18 and -34).
+        stem: Channels of the stem; 64 is full width, the stages have 1, 2, 4, 8 times as many.
+        channels: Of the feature pyramid and the RPN.
+        cfpn: Whether the mask branch takes cross-layer fused features.
+        classes: Names of classes 1..n; 0 is background.
+        anchor_sizes: One a pyramid level (P2..P6), input pixels.
+        anchor_ratios: Height over width.
+        box_hidden: Width of the box head's two layers.
+        mask_channels: Of the mask head's convolutions.
+        mask_layers: How many convolutions the mask head has.
+        mask_pool: RoI resolution of the mask branch; masks have twice as many pixels a side.
+        canonical: Box side (input pixels) that is assigned to P4.
+        mask_canonical: The same for the mask branch; a larger value gives masks finer features.
+        min_side: Shorter side of the network's input; the frame is resized to it.
+        max_side: Longest side of the network's input.
+        divisor: The input is padded to multiples of this.
+        pre_nms: Proposals a level before suppression.
+        post_nms: Proposals an image after it.
+        rpn_nms: IoU of the RPN's suppression.
+        max_detections: Objects an image.
+        exact_paste: Masks are placed to the fraction of a pixel instead of as the published models place them.
+        norm: ``frozen`` batch norm (published checkpoints) or ``batch`` (trained from scratch).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    blocks: tuple[Blocks, Blocks, Blocks, Blocks] = (3, 4, 6, 3)
+    bottleneck: bool = True
+    stem: Count = 64
+    channels: Count = 256
+    cfpn: bool = True
+    classes: tuple[str, ...] = Field(default=COCO_CLASSES, max_length=4096)
+    anchor_sizes: tuple[Side, ...] = Field(default=(32.0, 64.0, 128.0, 256.0, 512.0), min_length=5, max_length=5)
+    anchor_ratios: tuple[Side, ...] = Field(default=(0.5, 1.0, 2.0), min_length=1, max_length=16)
+    box_hidden: Count = 1024
+    mask_channels: Count = 256
+    mask_layers: Blocks = 4
+    mask_pool: Count = 14
+    canonical: Side = 224.0
+    mask_canonical: Side = 224.0
+    min_side: Count = 800
+    max_side: Count = 1333
+    divisor: Count = 32
+    pre_nms: Count = 1000
+    post_nms: Count = 1000
+    rpn_nms: float = 0.7
+    max_detections: Count = 100
+    exact_paste: bool = False
+    norm: Literal["frozen", "batch"] = "frozen"
+
+    @property
+    def stages(self) -> tuple[int, int, int, int]:
+        """Output channels of the four residual stages."""
+        expansion = 4 if self.bottleneck else 1
+        return (self.stem * expansion, 2 * self.stem * expansion, 4 * self.stem * expansion, 8 * self.stem * expansion)
+
+
+def embedded_config(*, cfpn: bool = True) -> NetworkConfig:
+    """The small network of this package: half-width ResNet-18, 64-channel pyramid, 320 x 240 input, persons only."""
+    return NetworkConfig(
+        blocks=(2, 2, 2, 2), bottleneck=False, stem=32, channels=64, cfpn=cfpn, classes=("person",),
+        anchor_sizes=(16.0, 32.0, 64.0, 128.0, 224.0), anchor_ratios=(1.0, 2.0, 3.0), box_hidden=256,
+        mask_channels=64, mask_layers=4, mask_pool=14, canonical=112.0, mask_canonical=224.0, min_side=240,
+        max_side=427, pre_nms=200, post_nms=100, max_detections=20, exact_paste=True, norm="batch",
+    )  # fmt: skip
+
+
+def resnet18_config(classes: tuple[str, ...] = ("person",), *, cfpn: bool = True) -> NetworkConfig:
+    """Mask R-CNN on a full-width ResNet-18."""
+    return NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, cfpn=cfpn, classes=classes, norm="batch")
+
+
+def normal(weight: Tensor, std: float) -> None:
+    """Initialise weights with a normal distribution; nothing on torch's ``meta`` device.
+
+    A network whose shapes are only compared with a file lies on the ``meta`` device. Drawing numbers there has no
+    effect, but loads torch's compiler (1.6 s of processor, once a process).
+    """
+    if not weight.is_meta:
+        nn.init.normal_(weight, std=std)
+
+
+def kaiming_normal(weight: Tensor) -> None:
+    """Initialise as He et al. 2015 for a ReLU, by the outputs; nothing on the ``meta`` device, see `normal`."""
+    if not weight.is_meta:
+        nn.init.kaiming_normal_(weight, mode="fan_out", nonlinearity="relu")
+
+
+class FrozenBatchNorm2d(nn.Module):
+    """Batch normalisation with constant statistics and affine parameters (four buffers)."""
+
+    weight: Tensor
+    bias: Tensor
+    running_mean: Tensor
+    running_var: Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.register_buffer("weight", torch.ones(channels))
+        self.register_buffer("bias", torch.zeros(channels))
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+        self.eps = 1e-5
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Scale and shift each channel of ``[B, C, H, W]``."""
+        scale = self.weight * (self.running_var + self.eps).rsqrt()
+        shift = self.bias - self.running_mean * scale
+        return x * scale.reshape(1, -1, 1, 1) + shift.reshape(1, -1, 1, 1)
+
+
+def _norm(channels: int, config: NetworkConfig) -> nn.Module:
+    return nn.BatchNorm2d(channels) if config.norm == "batch" else FrozenBatchNorm2d(channels)
+
+
+def _conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions around a shortcut."""
+
+    expansion = 1
+
+    def __init__(self, inputs: int, width: int, stride: int, config: NetworkConfig) -> None:
+        super().__init__()
+        self.conv1, self.bn1 = _conv(inputs, width, 3, stride), _norm(width, config)
+        self.conv2, self.bn2 = _conv(width, width, 3), _norm(width, config)
+        self.downsample = _shortcut(inputs, width, stride, config)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[B, C, H, W]`` to ``[B, width, H / stride, W / stride]``."""
+        y = functional.relu(self.bn1(self.conv1(x)), inplace=True)
+        y = self.bn2(self.conv2(y))
+        return functional.relu(y + (x if self.downsample is None else self.downsample(x)), inplace=True)
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3 and 1x1 convolution around a shortcut."""
+
+    expansion = 4
+
+    def __init__(self, inputs: int, width: int, stride: int, config: NetworkConfig) -> None:
+        super().__init__()
+        self.conv1, self.bn1 = _conv(inputs, width, 1), _norm(width, config)
+        self.conv2, self.bn2 = _conv(width, width, 3, stride), _norm(width, config)
+        self.conv3, self.bn3 = _conv(width, 4 * width, 1), _norm(4 * width, config)
+        self.downsample = _shortcut(inputs, 4 * width, stride, config)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``[B, C, H, W]`` to ``[B, 4 width, H / stride, W / stride]``."""
+        y = functional.relu(self.bn1(self.conv1(x)), inplace=True)
+        y = functional.relu(self.bn2(self.conv2(y)), inplace=True)
+        y = self.bn3(self.conv3(y))
+        return functional.relu(y + (x if self.downsample is None else self.downsample(x)), inplace=True)
+
+
+def _shortcut(inputs: int, outputs: int, stride: int, config: NetworkConfig) -> nn.Sequential | None:
+    if stride == 1 and inputs == outputs:
+        return None
+    return nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config))
+
+
+class Trunk(nn.Module):
+    """The residual network up to C5, without the classifier."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        block = Bottleneck if config.bottleneck else BasicBlock
+        self.conv1 = nn.Conv2d(3, config.stem, 7, 2, 3, bias=False)
+        self.bn1 = _norm(config.stem, config)
+        inputs = config.stem
+        for stage, (count, outputs) in enumerate(zip(config.blocks, config.stages, strict=True)):
+            width = outputs // block.expansion
+            blocks = [block(inputs, width, 1 if stage == 0 else 2, config)]
+            blocks += [block(outputs, width, 1, config) for _ in range(count - 1)]
+            self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
+            inputs = outputs
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """``[B, 3, H, W]`` to C2..C5, strides 4, 8, 16, 32."""
+        x = functional.relu(self.bn1(self.conv1(x)), inplace=True)
+        x = functional.max_pool2d(x, 3, 2, 1)
+        stages = []
+        for stage in range(1, 5):
+            x = self.get_submodule(f"layer{stage}")(x)
+            stages.append(x)
+        return stages
+
+
+class FPN(nn.Module):
+    """Feature pyramid: 1x1 laterals, nearest-neighbour top-down sums, 3x3 smoothing, and a subsampled P6."""
+
+    def __init__(self, stages: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.inner_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(width, channels, 1)) for width in stages)
+        self.layer_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1)) for _ in stages)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_uniform_(module.weight, a=1)
+                assert module.bias is not None
+                nn.init.zeros_(module.bias)
+
+    def forward(self, stages: list[Tensor]) -> list[Tensor]:
+        """C2..C5 to P2..P6."""
+        fused = top_down([block(x) for block, x in zip(self.inner_blocks, stages, strict=True)])
+        levels = [block(x) for block, x in zip(self.layer_blocks, fused, strict=True)]
+        return [*levels, levels[-1][:, :, ::2, ::2]]
+
+
+class CFPN(nn.Module):
+    """Cross-layer feature pyramid of the mask branch (paper, Figure 3 and its text).
+
+    C2..C5 are reduced by 1x1 convolutions; m5 comes from C5 directly, m4..m2 from fusing the upsampled higher levels
+    with the level itself; a 3x3 convolution against aliasing ends each level. Only the mask branch takes the result;
+    RPN and box head keep the FPN's.
+
+    Deviation: the mask branch takes the FPN's level *plus* the CFPN's, and the 3x3 convolutions start at zero. A plain
+    Mask R-CNN checkpoint therefore gives exactly its own output until the CFPN is trained (the paper is silent on
+    initialisation; it fine-tunes from COCO weights).
+    """
+
+    def __init__(self, stages: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.reduce = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in stages)
+        self.smooth = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in stages)
+        for reduce, smooth in zip(self.reduce, self.smooth, strict=True):
+            assert isinstance(reduce, nn.Conv2d) and isinstance(smooth, nn.Conv2d)
+            nn.init.kaiming_uniform_(reduce.weight, a=1)
+            for zero in (reduce.bias, smooth.weight, smooth.bias):
+                assert zero is not None
+                nn.init.zeros_(zero)
+
+    def forward(self, stages: list[Tensor], levels: list[Tensor]) -> list[Tensor]:
+        """C2..C5 and P2..P5 (a longer list is cut) to the mask branch's m2..m5."""
+        fused = top_down([reduce(x) for reduce, x in zip(self.reduce, stages, strict=True)])
+        smoothed = [smooth(x) for smooth, x in zip(self.smooth, fused, strict=True)]
+        return [level + extra for level, extra in zip(levels[: len(stages)], smoothed, strict=True)]
+
+
+def top_down(laterals: list[Tensor]) -> list[Tensor]:
+    """Add each level, upsampled to the size below, to the level below; from coarse to fine."""
+    fused = [laterals[-1]]
+    for lateral in reversed(laterals[:-1]):
+        fused.insert(0, lateral + functional.interpolate(fused[0], size=lateral.shape[-2:], mode="nearest"))
+    return fused
+
+
+class Backbone(nn.Module):
+    """Trunk and pyramids."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.body = Trunk(config)
+        self.fpn = FPN(config.stages, config.channels)
+        self.cfpn = CFPN(config.stages, config.channels) if config.cfpn else None
+
+    def forward(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """``[B, 3, H, W]`` to P2..P6 (for proposals and boxes) and m2..m5 (for masks)."""
+        stages = self.body(x)
+        levels = self.fpn(stages)
+        return levels, levels[:4] if self.cfpn is None else self.cfpn(stages, levels)

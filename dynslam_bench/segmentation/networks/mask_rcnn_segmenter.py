@@ -1,0 +1,154 @@
+"""The Mask R-CNN as a segmenter: a frame in, objects at the frame's resolution out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.networks.loading import load_network
+from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.postprocess import pick
+from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
+
+
+class MaskRCNNSegmenter:
+    """Runs a `MaskRCNN`.
+
+    Args:
+        network: In inference mode.
+        settings: Classes and thresholds.
+        device: ``cpu`` or ``cuda:N``.
+        threads: Threads torch may use on the CPU while the network runs.
+        floor: Least score of a detection that is returned.
+    """
+
+    def __init__(
+        self,
+        network: MaskRCNN,
+        settings: SegmentationSettings,
+        *,
+        device: str = "cpu",
+        threads: int = 1,
+        floor: float = 0.1,
+    ) -> None:
+        self.network = network.eval().fuse().to(device)
+        self.settings, self.device, self.threads, self.floor = settings, device, threads, floor
+
+    @classmethod
+    def from_file(
+        cls, path: Path, settings: SegmentationSettings, *, device: str = "cpu", threads: int = 1, floor: float = 0.1
+    ) -> MaskRCNNSegmenter:
+        """The segmenter of a checkpoint file; a COCO checkpoint works at `settings.network_side` pixels.
+
+        Raises:
+            SegmentationError: The file does not fit, the device is missing, or the network knows none of the classes.
+        """
+        if device.startswith("cuda") and not torch.cuda.is_available():
+            raise SegmentationError(f"device '{device}' is not available: torch {torch.__version__} sees no GPU")
+        network = load_network(path)
+        classes = set(network.config.classes)
+        if not classes & settings.class_names():
+            raise SegmentationError(
+                f"{path} knows none of the classes {', '.join(sorted(settings.class_names()))}",
+                "it knows " + ", ".join(sorted(filter(None, classes))),
+            )
+        if settings.network_side > 0:
+            network.set_input(settings.network_side)
+        return cls(network, settings, device=device, threads=threads, floor=floor)
+
+    def segment(self, frame: Frame) -> Instances:
+        """The objects of the dynamic classes in the frame; none is an empty result."""
+        height, width = frame.rgb.shape[:2]
+        with torch_threads(self.threads):
+            image = torch.from_numpy(np.ascontiguousarray(frame.rgb)).to(self.device).permute(2, 0, 1).float() / 255
+            detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
+            boxes, scores = detections.boxes.cpu().numpy(), detections.scores.cpu().numpy()
+            labels, planes = detections.labels.cpu().numpy(), detections.masks.cpu().numpy()
+        config, wanted = self.network.config, self.settings.class_names()
+        names = [config.classes[label - 1] for label in labels]
+        masks = np.zeros((len(names), height, width), bool)
+        for index in (index for index, name in enumerate(names) if name in wanted):
+            masks[index] = paste(
+                planes[index], boxes[index], height, width, self.settings.mask_threshold, exact=config.exact_paste
+            )
+        instances = Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32))
+        return pick(instances, np.asarray(masks.any(axis=(1, 2))))
+
+
+def paste(
+    plane: NDArray[np.float32],
+    box: NDArray[np.float32],
+    height: int,
+    width: int,
+    threshold: float,
+    *,
+    exact: bool = False,
+) -> NDArray[np.bool_]:
+    """A mask predicted inside a box, as a bool ``[H, W]`` mask of the image.
+
+    Args:
+        plane: ``[M, M]`` probabilities.
+        box: x0, y0, x1, y1 in pixels.
+        height: Of the image.
+        width: Of the image.
+        threshold: Least probability of a pixel.
+        exact: Interpolate at the pixels' centres. Otherwise as in the published models: the mask gets a border of one
+            pixel, the box grows by the same share and is cut to whole pixels, which shifts edges by up to a pixel.
+    """
+    if exact:
+        return _paste_exactly(plane, box, height, width, threshold)
+    side = plane.shape[0]
+    padded = np.zeros((side + 2, side + 2), np.float32)
+    padded[1:-1, 1:-1] = plane
+    centre = (box[:2] + box[2:]) / 2
+    half = (box[2:] - box[:2]) / 2 * ((side + 2) / side)
+    x0, y0 = (int(value) for value in np.trunc(centre - half))
+    x1, y1 = (int(value) for value in np.trunc(centre + half))
+    columns, rows = max(x1 - x0 + 1, 1), max(y1 - y0 + 1, 1)
+    patch = cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    mask = np.zeros((height, width), bool)
+    left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1 + 1, width), min(y1 + 1, height)
+    if left < right and top < bottom:
+        mask[top:bottom, left:right] = patch[top - y0 : bottom - y0, left - x0 : right - x0] >= threshold
+    return mask
+
+
+def _paste_exactly(
+    plane: NDArray[np.float32], box: NDArray[np.float32], height: int, width: int, threshold: float
+) -> NDArray[np.bool_]:
+    mask = np.zeros((height, width), bool)
+    left, top = max(math.floor(box[0]), 0), max(math.floor(box[1]), 0)
+    right, bottom = min(math.ceil(box[2]), width), min(math.ceil(box[3]), height)
+    if left >= right or top >= bottom or box[2] <= box[0] or box[3] <= box[1]:
+        return mask
+    scale = plane.shape[0] / (box[2:] - box[:2])
+    to_plane = np.array(
+        [[scale[0], 0, (left + 0.5 - box[0]) * scale[0] - 0.5], [0, scale[1], (top + 0.5 - box[1]) * scale[1] - 0.5]]
+    )
+    size, flags = (right - left, bottom - top), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    patch = cv2.warpAffine(plane, to_plane, size, borderMode=cv2.BORDER_REPLICATE, flags=flags)
+    columns, rows = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
+    inside = ((rows >= box[1]) & (rows <= box[3]))[:, None] & ((columns >= box[0]) & (columns <= box[2]))[None]
+    mask[top:bottom, left:right] = (patch >= threshold) & inside
+    return mask
+
+
+@contextmanager
+def torch_threads(threads: int) -> Iterator[None]:
+    """Pin torch's thread count while the block runs (it is one number for the whole process)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

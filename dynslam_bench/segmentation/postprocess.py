@@ -1,0 +1,150 @@
+"""From instances to the dynamic pixels: selection, repair, dilation. Pure functions."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.settings import REPAIR_BAND_PX, SegmentationSettings
+
+HOLE_RADIUS_PX = 3
+"""Radius of the closing that fills small gaps (MOR-SLAM's morphological step; the radius is this project's)."""
+
+
+def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Tight boxes x0, y0, x1, y1 (x1, y1 exclusive) of bool ``[K, H, W]`` masks; an empty mask gives zeros."""
+    boxes = np.zeros((len(masks), 4), np.float32)
+    for index, mask in enumerate(masks):
+        rows = np.flatnonzero(mask.any(axis=1))
+        if rows.size:
+            columns = np.flatnonzero(mask[rows[0] : rows[-1] + 1].any(axis=0))
+            boxes[index] = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+    return boxes
+
+
+def select(instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()) -> Instances:
+    """The objects that count: confident, and of a dynamic class or one of `also`, or known to move."""
+    names = settings.class_names() | also
+    wanted = np.array([name in names for name in instances.class_names], dtype=bool)
+    if instances.moving is not None:
+        wanted |= instances.moving
+    return pick(instances, wanted & (instances.scores >= settings.confidence))
+
+
+def pick(instances: Instances, keep: NDArray[np.bool_]) -> Instances:
+    """The objects where `keep` (bool ``[K]``) is true."""
+    if keep.all():
+        return instances
+    names = tuple(name for name, kept in zip(instances.class_names, keep, strict=True) if kept)
+    moving = None if instances.moving is None else instances.moving[keep]
+    return Instances(instances.masks[keep], instances.boxes[keep], names, instances.scores[keep], moving)
+
+
+def dynamic_mask(
+    instances: Instances, settings: SegmentationSettings, depth: NDArray[np.float32] | None = None
+) -> NDArray[np.bool_]:
+    """The dynamic pixels.
+
+    Args:
+        instances: The objects that the segmenter returned.
+        settings: Classes, confidence, repair and dilation.
+        depth: float32 ``[H, W]`` metres, 0 missing, for ``repair = depth``; None fills holes only.
+
+    Returns:
+        Bool ``[H, W]``; all false without dynamic objects.
+
+    Raises:
+        SegmentationError: The depth image does not have the masks' size.
+    """
+    chosen = select(instances, settings)
+    height, width = instances.masks.shape[1:]
+    if depth is not None and depth.shape != (height, width):
+        raise SegmentationError(
+            f"the depth image is {depth.shape[1]}x{depth.shape[0]}, the masks {width}x{height}",
+            "masks must have the frame's size",
+        )
+    union = chosen.union()
+    if settings.repair == "depth" and len(chosen):
+        union = np.any([repair(mask, depth, settings.repair_depth_m) for mask in chosen.masks], axis=0)
+    return dilate(np.asarray(union), settings.dilation_px)
+
+
+def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """Grow a bool ``[H, W]`` mask by a disc of `radius` pixels.
+
+    A pixel is set if a set pixel lies within `radius` of it (Euclidean distance between pixel centres). For radius 15,
+    DynaSLAM's 31 x 31 ellipse approximates this disc.
+    """
+    if radius <= 0:
+        return mask
+    part = _region(mask, radius + 1)
+    if part is None:
+        return mask
+    rows, columns = part
+    distance = cv2.distanceTransform((~mask[rows, columns]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    grown = mask.copy()
+    grown[rows, columns] = distance <= radius + 1e-3
+    return grown
+
+
+def repair(mask: NDArray[np.bool_], depth: NDArray[np.float32] | None, step_m: float) -> NDArray[np.bool_]:
+    """Fill the holes of one object's mask; with depth, also fit its border to the depth edges.
+
+    Within `REPAIR_BAND_PX` of the mask's edge, a pixel with valid depth belongs to the object if its depth is within
+    `step_m` of the mean depth of the object's core nearby. This is mask repair by depth fusion as in Blitz-SLAM and
+    MOR-SLAM; band and local mean are assumptions. Pixels without depth stay as they are.
+    """
+    part = _region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)
+    if part is None:
+        return mask
+    patch = fill_holes(mask[part])
+    if depth is not None:
+        patch = _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
+    repaired = mask.copy()
+    repaired[part] = patch
+    return repaired
+
+
+def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Close gaps of up to `HOLE_RADIUS_PX` and fill the background that the mask encloses."""
+    radius = HOLE_RADIUS_PX
+    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    padded = np.pad(mask, radius + 1).view(np.uint8)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, element)
+    count, labels = cv2.connectedComponents(1 - closed, connectivity=4)
+    filled = closed.astype(bool) if count <= 1 else labels != labels[0, 0]
+    inner = slice(radius + 1, -(radius + 1))
+    return np.asarray(filled[inner, inner] | mask)
+
+
+def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: float) -> NDArray[np.bool_]:
+    band = REPAIR_BAND_PX
+    valid = np.isfinite(depth) & (depth > 0)
+    inside = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    outside = cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3)
+    core = mask & valid & (inside > min(band, float(inside.max()) / 2))
+    if np.count_nonzero(core) < 20:
+        return mask
+    window = (4 * band + 1, 4 * band + 1)
+    weight = cv2.boxFilter(core.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    total = cv2.boxFilter(
+        np.where(core, depth, 0).astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    judged = valid & (weight >= 1) & (inside <= band) & (outside <= band) & ~core
+    near = np.abs(depth - total / np.maximum(weight, 1)) <= step_m
+    return np.asarray(np.where(judged, near, mask))
+
+
+def _region(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice] | None:
+    """The mask's bounding box grown by a margin, as slices; None for an empty mask."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    if not rows.size:
+        return None
+    columns = np.flatnonzero(mask[rows[0] : rows[-1] + 1].any(axis=0))
+    return (
+        slice(max(0, int(rows[0]) - margin), min(mask.shape[0], int(rows[-1]) + margin + 1)),
+        slice(max(0, int(columns[0]) - margin), min(mask.shape[1], int(columns[-1]) + margin + 1)),
+    )

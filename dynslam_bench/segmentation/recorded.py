@@ -1,0 +1,337 @@
+"""Masks that no network computes here: read from PNG files, written to them, or exact masks of the sequence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
+from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.images import read_image
+from dynslam_bench.core.reading import read_json
+from dynslam_bench.segmentation.build_segmenter import build_segmenter, weights_digest
+from dynslam_bench.segmentation.postprocess import boxes_of
+from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings
+
+CLASSES_FILE = "classes.json"
+MAX_DIFFERENCE_S = 0.02
+"""Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
+ORIGIN_FILE = "recorded.json"
+"""Beside the masks: the sequence and the settings that they were made of."""
+
+
+class RecordedSegmenter:
+    """Reads label images ``DIR/<stamp>.png`` or ``DIR/<index>.png``.
+
+    A label image is 8 or 16 bit, one channel (or several equal ones): 0 is background, every other value one object. A
+    file with the values 0 and 255 (or 0 and 1) holds one object. Objects are persons unless ``DIR/classes.json`` maps
+    values to COCO names, e.g. ``{"1": "person", "7": "chair"}``.
+
+    File names with a decimal point are stamps in seconds, matched to the nearest within 0.02 s; names without are
+    indices into the sequence as it is run (from 0): prefer stamps where only part of a sequence is run.
+
+    Args:
+        folder: Where the files are.
+
+    Raises:
+        SegmentationError: No such folder, no PNG files in it, names of both kinds or of none, a bad ``classes.json``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.expanduser()
+        files = sorted(self.folder.glob("*.png")) if self.folder.is_dir() else []
+        if not files:
+            reason = "holds no PNG files" if self.folder.is_dir() else "does not exist"
+            raise SegmentationError(
+                f"the folder of recorded masks {self.folder} {reason}",
+                "it needs one PNG a frame, named by stamp or index",
+            )
+        stamped = [file for file in files if "." in file.stem]
+        if stamped and len(stamped) != len(files):
+            raise SegmentationError(
+                f"{self.folder}: {len(stamped)} of {len(files)} mask files are named by stamp, the others are not",
+                "name all by stamp or all by index",
+            )
+        try:
+            numbers = [float(file.stem if stamped else int(file.stem)) for file in files]
+            if not np.isfinite(numbers).all():
+                raise ValueError("a stamp is not finite")
+        except (ValueError, OverflowError) as error:
+            raise SegmentationError(
+                f"{self.folder}: a mask file is named neither by stamp nor by index: {error}",
+                "for example 1311868164.363181.png or 000012.png",
+            ) from error
+        self.by_stamp = bool(stamped)
+        order = np.argsort(numbers, kind="stable")
+        self._tolerance = MAX_DIFFERENCE_S if self.by_stamp else 0.5
+        self._keys: NDArray[np.float64] = np.asarray(numbers, np.float64)[order]
+        self._files: list[Path] = [files[i] for i in order]
+        self._names = read_classes(self.folder / CLASSES_FILE)
+
+    def segment(self, frame: Frame) -> Instances:
+        """The recorded objects of a frame.
+
+        Raises:
+            SegmentationError: No file for the frame, an unreadable file, a wrong size, an object without a class.
+        """
+        path = self._find(frame)
+        height, width = frame.rgb.shape[:2]
+        labels = read_image(
+            path,
+            size=(width, height),
+            mismatch=f"but the frame is {width}x{height}",
+            hint="record the masks at the size of the frames",
+            flags=cv2.IMREAD_UNCHANGED,
+            kind=SegmentationError,
+        )
+        if labels.ndim == 3:
+            if (labels[:, :, :3] != labels[:, :, :1]).any():
+                raise SegmentationError(
+                    f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
+                )
+            labels = np.asarray(labels[:, :, 0])
+        values = [int(value) for value in np.unique(labels) if value != 0]
+        masks = _planes(labels, values)
+        names = tuple(self._name(value, path) for value in values)
+        return Instances(masks, boxes_of(masks), names, np.ones(len(values), np.float32))
+
+    def missing(self, timestamps: NDArray[np.float64]) -> list[int]:
+        """Indices of the frames that have no file.
+
+        Args:
+            timestamps: Stamps in seconds of all frames, in their order.
+        """
+        keys = timestamps.tolist() if self.by_stamp else range(len(timestamps))
+        return [index for index, key in enumerate(keys) if self._nearest(key)[1] >= self._tolerance]
+
+    def _nearest(self, key: float) -> tuple[int, float]:
+        """The file nearest to a stamp or index, and its distance."""
+        distance = np.abs(self._keys - key)
+        nearest = int(np.argmin(distance))
+        return nearest, float(distance[nearest])
+
+    def _find(self, frame: Frame) -> Path:
+        nearest, distance = self._nearest(frame.timestamp if self.by_stamp else frame.index)
+        if distance < self._tolerance:
+            return self._files[nearest]
+        if self.by_stamp:
+            raise SegmentationError(
+                f"no recorded mask within {MAX_DIFFERENCE_S} s of frame {frame.index} ({frame.timestamp:.6f} s) "
+                f"in {self.folder}",
+                f"the nearest is {self._files[nearest].name}, {distance:.3f} s away",
+            )
+        raise SegmentationError(
+            f"no recorded mask of frame {frame.index} in {self.folder}",
+            f"there are {len(self._files)}, indices {self._keys[0]:.0f} to {self._keys[-1]:.0f}",
+        )
+
+    def _name(self, value: int, path: Path) -> str:
+        if self._names is None:
+            return "person"
+        if value not in self._names:
+            raise SegmentationError(
+                f"{path}: object {value} has no class in {CLASSES_FILE}",
+                "known: " + ", ".join(map(str, sorted(self._names))),
+            )
+        return self._names[value]
+
+
+def _planes(labels: NDArray[Any], values: list[int]) -> NDArray[np.bool_]:
+    return np.asarray(labels[None] == np.array(values, labels.dtype)[:, None, None])
+
+
+def read_classes(path: Path) -> dict[int, str] | None:
+    """The COCO name of each number in the label images; None without that file.
+
+    Raises:
+        SegmentationError: The file cannot be read, or names an unknown class.
+    """
+    if not path.is_file():
+        return None
+    try:
+        names = {int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()}
+    except (ValueError, AttributeError) as error:
+        raise SegmentationError(f"cannot read {path}: {error}", 'expected {"1": "person", ...}') from error
+    unknown = sorted({name for name in names.values() if name not in COCO_NAMES})
+    if unknown:
+        raise SegmentationError(f"{path}: '{unknown[0]}' is no COCO class")
+    return names
+
+
+def record_masks(
+    sequence: Sequence,
+    folder: Path,
+    settings: SegmentationSettings,
+    *,
+    device: str = "cpu",
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Segment every frame of a sequence, one PNG a frame, named by stamp; existing files are kept.
+
+    The files hold the objects of the settings' classes and confidence, before repair and dilation, which are done when
+    the masks are used. Where two objects overlap, the one with the higher score has the pixel. Scores are not stored.
+
+    Args:
+        sequence: The frames.
+        folder: Made if it does not exist.
+        settings: Source, classes, confidence.
+        device: ``cpu`` or ``cuda:N``.
+        threads: Threads a network may use.
+        progress: Called with (frames done, frames in all).
+
+    Returns:
+        How many frames were segmented now.
+
+    Raises:
+        SegmentationError: The source is ``none`` or not available, or the folder holds other masks.
+    """
+    segmenter = build_segmenter(settings, sequence_id=sequence.id, masks=sequence.masks, device=device, threads=threads)
+    if segmenter is None:
+        raise SegmentationError("segmentation.source=none has no masks to record")
+    origin = {
+        "sequence": sequence.id,
+        "source": segmenter.source,
+        "weights": weights_digest(settings, sequence.id, sequence.masks),
+        "classes": settings.classes,
+        "confidence": settings.confidence,
+    }
+    _begin(folder, origin)
+    numbers = LabelNumbers(folder / CLASSES_FILE)
+    segmented = 0
+    for index in range(len(sequence)):
+        path = folder / f"{sequence.timestamps[index]:.6f}.png"
+        if not path.exists():
+            labels = numbers.label_image(segmenter.segment(sequence[index]))
+            write_atomic(path, cv2.imencode(".png", labels)[1].tobytes())
+            segmented += 1
+        if progress is not None:
+            progress(index + 1, len(sequence))
+    return segmented
+
+
+def _begin(folder: Path, origin: dict[str, object]) -> None:
+    """Make the folder, or make sure that it holds the same masks."""
+    path = folder / ORIGIN_FILE
+    if path.is_file():
+        stored = read_json(path, kind=SegmentationError)
+        before = stored if isinstance(stored, dict) else {}
+        for name, value in origin.items():
+            if before.get(name) != value:
+                raise SegmentationError(
+                    f"{folder} holds other masks: {name} is '{before.get(name)}' there and '{value}' now",
+                    "record into a folder of their own",
+                )
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise SegmentationError(f"{folder} holds something else", "record into an empty folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, json.dumps(origin, indent=1))
+
+
+class LabelNumbers:
+    """The number of each object in the label images: one for the first person of a frame, one for the second, ...
+
+    Args:
+        path: The file that says which class each number is; written whenever a number is added.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._classes = read_classes(path) or {}
+
+    def label_image(self, instances: Instances) -> NDArray[np.uint16]:
+        """uint16 ``[H, W]``: 0 background, else the object's number; the object with the highest score on top."""
+        labels = np.zeros(instances.masks.shape[1:], np.uint16)
+        free = sorted(self._classes)
+        for index in np.argsort(instances.scores, kind="stable"):
+            name = instances.class_names[index]
+            number = next((number for number in free if self._classes[number] == name), None)
+            if number is None:
+                number = self._add(name)
+            else:
+                free.remove(number)
+            labels[instances.masks[index]] = number
+        return labels
+
+    def _add(self, name: str) -> int:
+        number = max(self._classes, default=0) + 1
+        self._classes[number] = name
+        write_atomic(self._path, json.dumps(self._classes, indent=1))
+        return number
+
+
+def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
+    """The objects of a label image, with exact boxes and score 1.
+
+    Args:
+        masks: Label image with class names and the set of moving ids.
+        where: Named in the error.
+
+    Returns:
+        One row an id that is visible and has a class name, in order of id. `Instances.moving` is filled.
+
+    Raises:
+        SegmentationError: An id in the image has no class name.
+    """
+    labels = np.asarray(masks.instances)
+    ids = [int(number) for number in np.unique(labels) if number != 0]
+    nameless = [number for number in ids if number not in masks.class_names]
+    if nameless:
+        raise SegmentationError(
+            f"{where}: instance {nameless[0]} has no class name",
+            "known ids: " + (", ".join(map(str, sorted(masks.class_names))) or "none"),
+        )
+    planes = _planes(labels, ids)
+    return Instances(
+        planes,
+        boxes_of(planes),
+        tuple(masks.class_names[number] for number in ids),
+        np.ones(len(ids), np.float32),
+        np.array([number in masks.moving for number in ids], dtype=bool),
+    )
+
+
+class OracleSegmenter:
+    """A sequence's exact masks: every object, with the flag whether it moves.
+
+    Args:
+        source: The sequence's masks.
+        motion: Whether `Instances.moving` is filled; without, objects count by class, as those of a perfect network.
+    """
+
+    def __init__(self, source: MaskSource, *, motion: bool = True) -> None:
+        self.source = source
+        self.motion = motion
+
+    def segment(self, frame: Frame) -> Instances:
+        """The objects of frame `frame.index`.
+
+        Raises:
+            SegmentationError: The masks do not have the frame's size, or the sequence has none for this frame, or they
+                cannot be read.
+        """
+        try:
+            masks = self.source[frame.index]
+        except (IndexError, KeyError) as error:
+            raise SegmentationError(f"there are no exact masks for frame {frame.index}") from error
+        except MemoryError:
+            raise
+        except Exception as error:  # the masks of a plug-in's data set may raise anything
+            raise SegmentationError(f"the exact masks of frame {frame.index} cannot be read: {error}") from error
+        (height, width), (rows, columns) = np.shape(masks.instances)[:2], frame.rgb.shape[:2]
+        if (height, width) != (rows, columns):
+            raise SegmentationError(
+                f"exact masks of frame {frame.index}: the mask is {width}x{height}, the frame {columns}x{rows}"
+            )
+        instances = instances_of(masks, where=f"exact masks of frame {frame.index}")
+        return instances if self.motion else replace(instances, moving=None)

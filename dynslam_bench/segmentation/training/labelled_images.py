@@ -1,0 +1,386 @@
+"""Labelled images for training and evaluation: COCO and YOLO files, sequences with masks, rendered sequences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.core.errors import SegmentationError, did_you_mean
+from dynslam_bench.core.images import read_image
+from dynslam_bench.core.reading import TABLE_BYTES, read_json, read_lines
+from dynslam_bench.core.records import digest
+from dynslam_bench.core.sanitise import inside
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.core.settings import apply_overrides
+from dynslam_bench.segmentation.recorded import instances_of
+from dynslam_bench.segmentation.settings import COCO_NAMES
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, parse_synthetic_id
+from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
+from dynslam_bench.sequences.synthetic.settings import RENDERER_VERSION
+
+FINER = 4
+"""Polygons are filled at this many times the image's resolution."""
+FARTHEST_PX = 1e6
+"""Corners of polygons farther away than any image is wide are refused: OpenCV counts in 32 bits."""
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledImage:
+    """An image and its objects.
+
+    Attributes:
+        rgb: uint8 ``[H, W, 3]``.
+        masks: bool ``[K, H, W]``.
+        class_names: COCO name of each object.
+    """
+
+    rgb: NDArray[np.uint8]
+    masks: NDArray[np.bool_]
+    class_names: tuple[str, ...]
+
+
+class LabelledImages(Protocol):
+    """A set of labelled images, decoded or rendered on access."""
+
+    @property
+    def name(self) -> str:
+        """Name of the set, for records."""
+        ...
+
+    @property
+    def version(self) -> str:
+        """Changes when the content of the images changes under the same name."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> LabelledImage: ...
+
+
+class CocoImages:
+    """Images of a COCO annotation file (``images``, ``annotations``, ``categories``); crowds are left out.
+
+    Polygons and uncompressed and compressed run lengths are understood.
+
+    Args:
+        annotations: The JSON file.
+        images: Folder of the images; None means the folder of the file.
+
+    Raises:
+        SegmentationError: The file is missing or not in COCO's format.
+    """
+
+    def __init__(self, annotations: Path, images: Path | None = None) -> None:
+        self.path = annotations.expanduser()
+        folder = images.expanduser() if images is not None else self.path.parent
+        content = read_json(self.path, limit=TABLE_BYTES, kind=SegmentationError)
+        try:
+            names = {int(entry["id"]): str(entry["name"]) for entry in content["categories"]}
+            shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
+            for entry in content["annotations"]:
+                if not entry.get("iscrowd"):
+                    shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
+            images_named = [(str(entry["file_name"]), int(entry["id"])) for entry in content["images"]]
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+            raise SegmentationError(
+                f"{self.path} is not in COCO's annotation format: {type(error).__name__} {str(error)[:200]}",
+                "it needs images, annotations and categories",
+            ) from error
+        if not images_named:
+            raise SegmentationError(f"{self.path} lists no images")
+        self._entries = [
+            (inside(folder, name, where=str(self.path), kind=SegmentationError), shapes[number])
+            for name, number in images_named
+        ]
+        self.name = f"coco:{self.path.name}"
+
+    @property
+    def version(self) -> str:
+        """Digest of the files' names and sizes."""
+        return _files_digest([self.path, *(image for image, _ in self._entries)])
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        path, shapes = self._entries[index]
+        rgb = _read(path)
+        masks = [_coco_mask(shape, rgb.shape[:2], path) for _, shape in shapes]
+        return _labelled(rgb, masks, [name for name, _ in shapes])
+
+
+class YoloImages:
+    """Images with YOLO polygon labels: ``images/**/NAME.jpg`` beside ``labels/**/NAME.txt``.
+
+    A label's line is ``class x1 y1 x2 y2 ...`` with COCO's class numbers from 0 and coordinates in [0, 1]. An image
+    without a label file has no objects.
+
+    Args:
+        folder: Holds ``images`` and ``labels``.
+
+    Raises:
+        SegmentationError: The folder or its images are missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.expanduser()
+        self.name = f"yolo:{self.folder.name}"
+        root = self.folder / "images"
+        self._images = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
+        if not self._images:
+            raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
+
+    @property
+    def version(self) -> str:
+        """Digest of the files' names and sizes."""
+        return _files_digest([*self._images, *sorted((self.folder / "labels").rglob("*.txt"))])
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        path = self._images[index]
+        rgb = _read(path)
+        label = self.folder / "labels" / path.relative_to(self.folder / "images").with_suffix(".txt")
+        masks, names = [], []
+        for number, line in enumerate(read_lines(label, kind=SegmentationError) if label.is_file() else [], 1):
+            if not line.strip():
+                continue
+            try:
+                kind, *points = line.split()
+                name = dict(enumerate(COCO_NAMES))[int(kind)]
+                polygon = _polygon(points) * [rgb.shape[1], rgb.shape[0]]
+            except (ValueError, LookupError, OverflowError) as error:
+                raise SegmentationError(
+                    f"{label} line {number} is no polygon label: {error}", "expected class x1 y1 x2 y2 ..."
+                ) from error
+            masks.append(_fill([polygon], rgb.shape[:2]))
+            names.append(name)
+        return _labelled(rgb, masks, names)
+
+
+def _files_digest(paths: list[Path]) -> str:
+    return digest([(str(path), path.stat().st_size) for path in paths if path.is_file()])
+
+
+def _read(path: Path) -> NDArray[np.uint8]:
+    image = read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)
+    return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+
+
+def _labelled(rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: list[str]) -> LabelledImage:
+    stack = np.stack(masks) if masks else np.zeros((0, *rgb.shape[:2]), bool)
+    visible = np.asarray(stack.any(axis=(1, 2)))
+    return LabelledImage(rgb, stack[visible], tuple(np.array(names, object)[visible]))
+
+
+def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels at least half covered by the union of polygons (x, y in pixels, the image's corner is 0, 0)."""
+    mask = np.zeros(shape, bool)
+    for polygon in polygons:
+        if len(polygon) < 3:
+            continue
+        low = np.maximum(np.floor(polygon.min(axis=0)), 0).astype(int)
+        high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int)
+        if (high <= low).any():
+            continue
+        size = (high - low) * FINER  # OpenCV also fills pixels that the outline touches: at this scale it hardly counts
+        fine = np.zeros((size[1], size[0]), np.uint8)
+        cv2.fillPoly(fine, [np.rint(((polygon - low) * FINER - 0.5) * 16).astype(np.int32)], 255, shift=4)
+        whole = cv2.resize(fine, (high - low).tolist(), interpolation=cv2.INTER_AREA)
+        mask[low[1] : high[1], low[0] : high[0]] |= whole >= 128
+    return mask
+
+
+def _polygon(points: Any) -> NDArray[np.float64]:
+    """Corners ``[N, 2]``; raises ValueError where one is no number or far outside of any image."""
+    polygon = np.array(points, np.float64).reshape(-1, 2)
+    if not (np.abs(polygon) < FARTHEST_PX).all():  # also catches NaN
+        raise ValueError(f"a corner is not finite, or more than {FARTHEST_PX:g} pixels away")
+    return polygon
+
+
+def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:
+    try:
+        if isinstance(segmentation, list):
+            return _fill([_polygon(points) for points in segmentation], shape)
+        if isinstance(segmentation, dict) and "counts" in segmentation and "size" in segmentation:
+            return _from_runs(segmentation["counts"], segmentation["size"], shape)
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
+        raise SegmentationError(f"{where}: a segmentation is damaged: {str(error)[:200]}") from error
+    raise SegmentationError(f"{where}: a segmentation is neither polygons nor run lengths")
+
+
+def _from_runs(counts: Any, size: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The mask of run lengths, column by column; raises ValueError where they do not fill the image exactly."""
+    runs = decode_runs(counts) if isinstance(counts, str) else [int(count) for count in counts]
+    height, width = (int(value) for value in size)
+    total = sum(runs)
+    if (height, width) != tuple(shape) or total != height * width or min(runs) < 0:
+        raise ValueError(f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}")
+    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    return np.ascontiguousarray(flat.reshape(width, height).T)
+
+
+def decode_runs(text: str) -> list[int]:
+    """COCO's compressed run lengths: base-32 digits, least first, differences to the run two before.
+
+    Raises:
+        ValueError: The text ends within a number, or a number is longer than any image.
+    """
+    runs: list[int] = []
+    position = 0
+    while position < len(text):
+        value = shift = 0
+        while True:
+            if position == len(text) or shift > 60:
+                raise ValueError(f"the run lengths are damaged at character {position} of {len(text)}")
+            digit = ord(text[position]) - 48
+            position += 1
+            value |= (digit & 0x1F) << shift
+            shift += 5
+            if not digit & 0x20:
+                if digit & 0x10:
+                    value |= -1 << shift
+                break
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+    return runs
+
+
+VARIANTS: tuple[dict[str, object], ...] = (
+    {"lighting_change": True},
+    {"glare": True},
+    {"shadow": True},
+    {"color.read_noise": 6.0, "color.shot_noise": 0.1},
+    {"color.shutter": 0.9},
+    {"color.shutter": 0.0, "color.read_noise": 0.0, "color.shot_noise": 0.0},
+)
+"""Renderer options that a share of the training frames is rendered with."""
+
+
+class SequenceFrames:
+    """Every frame of a sequence that has masks.
+
+    Args:
+        sequence_id: Id or folder of the sequence.
+
+    Raises:
+        SegmentationError: It has no masks.
+    """
+
+    def __init__(self, sequence_id: str) -> None:
+        self.sequence = open_sequence(sequence_id)
+        self.name = self.sequence.id
+        if self.sequence.masks is None:
+            raise SegmentationError(f"sequence '{self.name}' has no masks to train on or compare with")
+
+    @property
+    def version(self) -> str:
+        """Digest of the sequence's content."""
+        return self.sequence.digest()
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        return labelled_frame(self.sequence, index)
+
+
+class RenderedFrames:
+    """Frames drawn at random from rendered sequences.
+
+    Args:
+        text: ``scenes=0-99,frames=4,length=600,options=0.3,seed=0``, where what is left out keeps its default: scenes
+            (0-99 are for training, 100-199 held out), frames drawn from each of a scene's eight sequences, frames of a
+            sequence that are drawn from, share of the frames rendered with one of `VARIANTS`, seed of the draws.
+
+    Raises:
+        SegmentationError: Unknown option, or a value that does not fit.
+    """
+
+    version = f"renderer {RENDERER_VERSION}"
+
+    def __init__(self, text: str = "") -> None:
+        values = {"scenes": "0-99", "frames": "2", "length": "600", "options": "0", "seed": "0"}
+        for part in filter(None, text.split(",")):
+            key, separator, value = part.partition("=")
+            if key not in values or not separator:
+                raise SegmentationError(f"synthetic: unknown option '{part}'", "known: " + ", ".join(values))
+            values[key] = value
+        try:
+            first, _, last = values["scenes"].partition("-")
+            self.scenes = range(int(first), int(last or first) + 1)
+            self.frames, self.length, self.seed = (int(values[key]) for key in ("frames", "length", "seed"))
+            self.options = float(values["options"])
+        except ValueError as error:
+            raise SegmentationError(f"synthetic: '{text}' is not understood: {error}") from error
+        if not self.scenes or self.scenes[0] < 0 or self.scenes[-1] > 199 or not 1 <= self.frames <= self.length:
+            raise SegmentationError(
+                f"synthetic: '{text}' asks for scenes or frames that do not exist", "scenes 0-199, at least one frame"
+            )
+        self.name = (
+            f"synthetic:scenes={self.scenes.start}-{self.scenes.stop - 1},frames={self.frames},"
+            f"length={self.length},options={self.options:g},seed={self.seed}"
+        )
+
+    def __len__(self) -> int:
+        return len(self.scenes) * len(REPLICA_IDS) * self.frames
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        order, draw = divmod(range(len(self))[index], self.frames)
+        scene, motion = divmod(order, len(REPLICA_IDS))
+        sequence_id = f"{REPLICA_IDS[motion]}@{self.scenes[scene]}?frames={self.length}"
+        rng = stream(self.seed, "frames", sequence_id)
+        frame = int(rng.choice(self.length, self.frames, replace=False)[draw])
+        rng = stream(self.seed, "variant", sequence_id, draw)
+        variant = int(rng.integers(len(VARIANTS))) if rng.random() < self.options else None
+        return labelled_frame(_rendered(sequence_id, variant), frame)
+
+
+@lru_cache(maxsize=1)  # neighbours in the order share a sequence
+def _rendered(sequence_id: str, variant: int | None) -> SyntheticSequence:
+    settings = apply_overrides(RenderSettings(), {} if variant is None else VARIANTS[variant])
+    return SyntheticSequence(parse_synthetic_id(sequence_id), None, settings, threads=1)
+
+
+def labelled_frame(sequence: Sequence, index: int) -> LabelledImage:
+    """A frame and its exact masks."""
+    assert sequence.masks is not None
+    instances = instances_of(sequence.masks[index], where=f"{sequence.id} frame {index}")
+    return LabelledImage(np.ascontiguousarray(sequence[index].rgb), instances.masks, instances.class_names)
+
+
+FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
+
+
+def open_labelled(text: str) -> LabelledImages:
+    """The set that a text names.
+
+    ``synthetic:scenes=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences (`RenderedFrames`),
+    ``sequence:ID`` every frame of one sequence that has masks, ``coco:FILE[:IMAGES]`` a COCO annotation file,
+    ``yolo:DIR`` a folder with ``images/`` and ``labels/``.
+
+    Raises:
+        SegmentationError: Another form, or the set does not exist.
+    """
+    kind, _, rest = text.partition(":")
+    if kind == "synthetic":
+        return RenderedFrames(rest)
+    if kind == "sequence" and rest:
+        return SequenceFrames(rest)
+    if kind == "coco" and rest:
+        annotations, _, images = rest.partition(":")
+        return CocoImages(Path(annotations), Path(images) if images else None)
+    if kind == "yolo" and rest:
+        return YoloImages(Path(rest))
+    hint = did_you_mean(kind, ["synthetic", "sequence", "coco", "yolo"])
+    raise SegmentationError(f"'{text}' names no set of labelled images; the forms are {FORMS}", hint)

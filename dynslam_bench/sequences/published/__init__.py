@@ -1,1 +1,0 @@
-"""The public data sets: their sequences, cameras and archives."""

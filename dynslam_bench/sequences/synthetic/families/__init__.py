@@ -1,1 +1,0 @@
-"""The families of rendered sequences: one file a family, each a description on shared machinery."""

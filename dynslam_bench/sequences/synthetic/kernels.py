@@ -1,0 +1,426 @@
+"""The renderer's numba kernels: intersections of rays, tiles, shading with antialiased edges, flow and motion blur."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import dividing_kernel
+from dynslam_bench.sequences.synthetic.arithmetic import atan2 as _atan2
+from dynslam_bench.sequences.synthetic.parts import BOX, ROUND_CONE
+
+Ints = NDArray[np.integer]
+Reals = NDArray[np.floating]
+Intrinsics = tuple[float, float, float, float]
+"""Focal lengths and principal point, pixels."""
+
+
+# Intersections of rays with primitives.
+
+NEAR_M = 0.05
+"""Nothing nearer than this is seen, metres."""
+
+
+@dividing_kernel
+def hit_box(
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, hx: float, hy: float, hz: float, t_max: float
+) -> tuple[float, int]:
+    """Nearest hit of a ray with a box from outside: (t, face), face = 2 * axis + (1 if the positive side)."""
+    t_in, t_out, face = -1.0e30, 1.0e30, -1
+    origin, direction, half = (ox, oy, oz), (dx, dy, dz), (hx, hy, hz)
+    for axis in range(3):
+        o, d, h = origin[axis], direction[axis], half[axis]
+        if abs(d) < 1e-12:
+            if abs(o) > h:
+                return 1e30, -1
+        else:
+            inv = 1.0 / d
+            a, b, side = (-h - o) * inv, (h - o) * inv, 2 * axis
+            if a > b:
+                a, b, side = b, a, side + 1
+            if a > t_in:
+                t_in, face = a, side
+            t_out = min(t_out, b)
+    if t_in > t_out or t_in < NEAR_M or t_in >= t_max:
+        return 1e30, -1
+    return t_in, face
+
+
+@dividing_kernel
+def hit_round_cone(
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, h: float, r1: float, r2: float, t_max: float
+) -> float:
+    """Nearest hit with the hull of a sphere r1 at the origin and a sphere r2 at (0, 0, h); h = 0 is a sphere."""
+    best = 1e30
+    dd = dx * dx + dy * dy + dz * dz
+    # Bounding sphere first: most rays of a tile miss.
+    cz = oz - 0.5 * h
+    rb = 0.5 * h + max(r1, r2)
+    b = ox * dx + oy * dy + cz * dz
+    if b * b < dd * (ox * ox + oy * oy + cz * cz - rb * rb):
+        return best
+    if h > 0.0:
+        # Tangent cone: sin(alpha) = s = (r1 - r2) / h; its side is x^2 + y^2 = (r1 - s z)^2 / (1 - s^2).
+        s = (r1 - r2) / h
+        k = 1.0 / (1.0 - s * s)
+        w, wd = r1 - s * oz, -s * dz
+        a2 = dx * dx + dy * dy - k * wd * wd
+        b2 = ox * dx + oy * dy - k * w * wd
+        c2 = ox * ox + oy * oy - k * w * w
+        disc = b2 * b2 - a2 * c2
+        if disc >= 0.0 and abs(a2) > 1e-14:
+            t = (-b2 - math.sqrt(disc)) / a2
+            z = oz + t * dz
+            # The side counts between the two circles of tangency.
+            if NEAR_M < t and r1 * s <= z <= h + r2 * s and r1 - s * z > 0.0:
+                best = t
+    b = ox * dx + oy * dy + oz * dz
+    disc = b * b - dd * (ox * ox + oy * oy + oz * oz - r1 * r1)
+    if disc >= 0.0:
+        t = (-b - math.sqrt(disc)) / dd
+        if NEAR_M < t < best:
+            best = t
+    if h > 0.0:
+        cz = oz - h
+        b = ox * dx + oy * dy + cz * dz
+        disc = b * b - dd * (ox * ox + oy * oy + cz * cz - r2 * r2)
+        if disc >= 0.0:
+            t = (-b - math.sqrt(disc)) / dd
+            if NEAR_M < t < best:
+                best = t
+    if best >= t_max:
+        return 1e30
+    return best
+
+
+# Ray casting over tiles, and antialiasing of edges.
+
+
+@dividing_kernel
+def hit_primitive(
+    kind: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, a: float, b: float, c: float,
+    t_max: float,
+) -> tuple[float, int]:  # fmt: skip
+    """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one."""
+    if kind == ROUND_CONE:
+        t = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
+        return t, 0 if t < t_max else -1
+    if kind == BOX:
+        return hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
+    t = -oz / dz
+    return t, 4 if NEAR_M < t < t_max and abs(ox + t * dx) <= a and abs(oy + t * dy) <= b else -1
+
+
+TILE = 8
+atan2 = dividing_kernel(_atan2)
+_PER_TURN = 1.0 / (2.0 * math.pi)
+
+
+@dividing_kernel
+def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Ints, Ints]:
+    """Primitive lists of all tiles, nearest bound first.
+
+    Args:
+        order: int32 ``[P]`` primitives sorted by their nearest depth; those out of view left out.
+        boxes: int32 ``[P_all, 4]`` tile ranges x0, y0, x1, y1 (inclusive) of each primitive.
+        tiles_x: Tiles in a row.
+        tiles_y: Tiles in a column.
+
+    Returns:
+        (start int32 ``[tiles + 1]``, list int32).
+    """
+    start = np.zeros(tiles_x * tiles_y + 1, np.int32)
+    for n in range(order.shape[0]):
+        p = order[n]
+        for ty in range(boxes[p, 1], boxes[p, 3] + 1):
+            for tx in range(boxes[p, 0], boxes[p, 2] + 1):
+                start[ty * tiles_x + tx + 1] += 1
+    for i in range(tiles_x * tiles_y):
+        start[i + 1] += start[i]
+    fill = start[:-1].copy()
+    members = np.empty(start[-1], np.int32)
+    for n in range(order.shape[0]):
+        p = order[n]
+        for ty in range(boxes[p, 1], boxes[p, 3] + 1):
+            for tx in range(boxes[p, 0], boxes[p, 2] + 1):
+                tile = ty * tiles_x + tx
+                members[fill[tile]] = p
+                fill[tile] += 1
+    return start, members
+
+
+# The two kernels below repeat the loop over a tile's primitives: numba counts references of every array that is passed
+# to a function that it does not inline, which costs more than the tracing.
+
+
+@dividing_kernel
+def cast_geometry(
+    row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
+    local: Reals, shape: Reals, hit: Ints, depth: Reals,
+) -> None:  # fmt: skip
+    """Primitive (``hit`` int32, 8 * index + face, -1 for none) and z-depth (float64) at the pixel centres of rows.
+
+    What the neighbouring pixel of the tile saw is tried first, which bounds the search.
+    """
+    fx, fy, cx, cy = intrinsics
+    width = hit.shape[1]
+    for row in range(row0, row1):
+        y = (row - cy) / fy
+        last = -1
+        for column in range(width):
+            tile = (row // TILE) * tiles_x + column // TILE
+            first, end = start[tile], start[tile + 1]
+            if column % TILE == 0:
+                last = -1
+            x = (column - cx) / fx
+            t, p, face = 1e30, -1, 0
+            for n in range(first - 1 if last >= 0 else first, end):
+                q = last
+                if n >= first:
+                    q = members[n]
+                    if zmin[q] >= t:
+                        break
+                    if q == last:
+                        continue
+                dx = local[q, 0] * x + local[q, 1] * y + local[q, 2]
+                dy = local[q, 4] * x + local[q, 5] * y + local[q, 6]
+                dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
+                ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
+                a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
+                t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                if face_hit >= 0:
+                    t, p, face = t_hit, q, face_hit
+            last = p
+            hit[row, column] = 8 * p + face if p >= 0 else -1
+            depth[row, column] = t if p >= 0 else 0.0
+
+
+@dividing_kernel
+def shade_pixels(
+    row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
+    local: Reals, shape: Reals, texture: Ints, uv: Reals, tint: Reals, facets: Reals, atlas: Ints, level_offset: Ints,
+    log2_size: Ints, lights: Reals, hit: Ints, depth: Reals, jitter: Reals, color: Reals, cosine: Reals,
+) -> None:  # fmt: skip
+    """Colour (float32, 0-255 scale) and cosine of incidence of rows.
+
+    ``facets`` [P, 6, 5] holds for each face its unit normal in the camera frame (boxes and quads), its light, and for
+    all primitives the texels a pixel at 1 m. Pixels on an edge are the mean of the ``jitter`` [S, 2] samples (offsets
+    in pixels); each surface that these meet is shaded once, at the first of its samples.
+    """
+    fx, fy, cx, cy = intrinsics
+    height, width = hit.shape
+    samples = jitter.shape[0]
+    share = 1.0 / samples
+    one, two = np.uint64(1), np.uint64(2)  # unsigned: an index that may be negative costs a test
+    for row in range(row0, row1):
+        for column in range(width):
+            key = hit[row, column]
+            edge = (
+                (column > 0 and hit[row, column - 1] != key)
+                or (column + 1 < width and hit[row, column + 1] != key)
+                or (row > 0 and hit[row - 1, column] != key)
+                or (row + 1 < height and hit[row + 1, column] != key)
+            )
+            red, green, blue = 0.0, 0.0, 0.0
+            own_red, own_green, own_blue = 0.0, 0.0, 0.0
+            new_red, new_green, new_blue = 0.0, 0.0, 0.0
+            own_cos, last = 0.0, -2
+            centre = key >> 3
+            tile = (row // TILE) * tiles_x + column // TILE
+            first, end = start[tile], start[tile + 1]
+            # Sample -1 is the pixel centre, which the first pass has traced.
+            for sample in range(-1, samples if edge else 0):
+                x, y = (column - cx) / fx, (row - cy) / fy
+                surface, t, p, face = key, depth[row, column], centre, key & 7
+                if sample >= 0:
+                    x, y = (column + jitter[sample, 0] - cx) / fx, (row + jitter[sample, 1] - cy) / fy
+                    t, p, face = 1e30, -1, 0
+                    for n in range(first - 1 if centre >= 0 else first, end):
+                        q = centre
+                        if n >= first:
+                            q = members[n]
+                            if zmin[q] >= t:
+                                break
+                            if q == centre:
+                                continue
+                        dx = local[q, 0] * x + local[q, 1] * y + local[q, 2]
+                        dy = local[q, 4] * x + local[q, 5] * y + local[q, 6]
+                        dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
+                        ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
+                        a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
+                        t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                        if face_hit >= 0:
+                            t, p, face = t_hit, q, face_hit
+                    surface = 8 * p + face if p >= 0 else -1
+                    if surface == key:
+                        red, green, blue = red + own_red, green + own_green, blue + own_blue
+                        continue
+                if surface == last:
+                    red, green, blue = red + new_red, green + new_green, blue + new_blue
+                    continue
+                last = surface
+                new_red, new_green, new_blue, cos = 0.0, 0.0, 0.0, 0.0
+                if surface >= 0:
+                    su, sv = uv[p, face, 0], uv[p, face, 1]
+                    u, v = uv[p, face, 2], uv[p, face, 3]
+                    lx = local[p, 3] + t * (local[p, 0] * x + local[p, 1] * y + local[p, 2])
+                    ly = local[p, 7] + t * (local[p, 4] * x + local[p, 5] * y + local[p, 6])
+                    lz = local[p, 11] + t * (local[p, 8] * x + local[p, 9] * y + local[p, 10])
+                    norm = math.sqrt(x * x + y * y + 1.0)
+                    if kind[p] == ROUND_CONE:
+                        h, r1, r2 = shape[p, 0], shape[p, 1], shape[p, 2]
+                        nz = lz
+                        if h > 0.0:
+                            s = (r1 - r2) / h
+                            if lz >= h + r2 * s:
+                                nz = lz - h
+                            elif lz > r1 * s:
+                                nz = s * (r1 - s * lz) / (1.0 - s * s)
+                        u += atan2(lx, ly) * _PER_TURN * su
+                        v -= lz * sv
+                        # Normal into the camera frame: transpose of the (camera to local) linear part.
+                        nu = local[p, 0] * lx + local[p, 4] * ly + local[p, 8] * nz
+                        nv = local[p, 1] * lx + local[p, 5] * ly + local[p, 9] * nz
+                        nw = local[p, 2] * lx + local[p, 6] * ly + local[p, 10] * nz
+                        inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
+                        cos = abs(nu * x + nv * y + nw) * inv / norm
+                        light = lights[0, 3]
+                        for i in range(1, lights.shape[0]):
+                            facing = (nu * lights[i, 0] + nv * lights[i, 1] + nw * lights[i, 2]) * inv
+                            if facing > 0.0:
+                                light += facing * lights[i, 3]
+                    else:
+                        cos = abs(facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]) / norm
+                        light = facets[p, face, 3]
+                        if face < 4:
+                            side = su if (face & 1) else -su
+                            u += ly * side if face < 2 else -lx * side
+                            v -= lz * sv
+                        else:
+                            u += lx * su
+                            v -= ly * sv
+                    # Texel footprint squared, between those along and across a slanted surface; then two mip levels.
+                    tex = texture[p, face]
+                    log2 = log2_size[tex]
+                    footprint = facets[p, face, 4] * t
+                    footprint = footprint * footprint / max(cos, 0.05)
+                    level = 0
+                    while footprint > 4.0 and level < log2 - 1:
+                        footprint *= 0.25
+                        level += 1
+                    blend = min(max((footprint - 1.0) * (1.0 / 3.0), 0.0), 1.0)
+                    u -= math.floor(u)
+                    v -= math.floor(v)
+                    for upper in range(2 if blend > 0.0 else 1):
+                        bits = log2 - level - upper
+                        size = 1 << bits
+                        base = level_offset[tex, level + upper]
+                        fu, fv = u * size + (size - 0.5), v * size + (size - 0.5)  # positive, so that int() floors
+                        iu, iv = int(fu), int(fv)
+                        au, av = fu - iu, fv - iv
+                        u0, v0 = iu & (size - 1), (iv & (size - 1)) << bits
+                        u1, v1 = (iu + 1) & (size - 1), ((iv + 1) & (size - 1)) << bits
+                        a, b = np.uint64(base + ((v0 + u0) << 2)), np.uint64(base + ((v0 + u1) << 2))
+                        c, d = np.uint64(base + ((v1 + u0) << 2)), np.uint64(base + ((v1 + u1) << 2))
+                        weight = light * (blend if upper else 1.0 - blend)
+                        wa, wb = (1.0 - au) * (1.0 - av) * weight, au * (1.0 - av) * weight
+                        wc, wd = (1.0 - au) * av * weight, au * av * weight
+                        new_red += wa * atlas[a] + wb * atlas[b] + wc * atlas[c] + wd * atlas[d]
+                        new_green += (
+                            wa * atlas[a + one] + wb * atlas[b + one] + wc * atlas[c + one] + wd * atlas[d + one]
+                        )
+                        new_blue += (
+                            wa * atlas[a + two] + wb * atlas[b + two] + wc * atlas[c + two] + wd * atlas[d + two]
+                        )
+                    new_red, new_green, new_blue = new_red * tint[p, 0], new_green * tint[p, 1], new_blue * tint[p, 2]
+                if sample < 0:
+                    own_red, own_green, own_blue, own_cos = new_red, new_green, new_blue, cos
+                else:
+                    red, green, blue = red + new_red, green + new_green, blue + new_blue
+            if edge:
+                red, green, blue = red * share, green * share, blue * share
+            else:
+                red, green, blue = own_red, own_green, own_blue
+            color[row, column, 0], color[row, column, 1], color[row, column, 2] = red, green, blue
+            cosine[row, column] = own_cos
+
+
+# Motion in the image: exact flow, and blur along it. Rows are independent.
+
+MOST_TAPS = 16
+"""Samples of the longest blur."""
+
+
+def tap_shares() -> Reals:
+    """Where along a blur each of its taps lies, as shares of its length from the middle: ``[n, i]`` for tap i of n."""
+    taps, i = np.arange(MOST_TAPS + 1)[:, None], np.arange(MOST_TAPS)[None]
+    return np.where(i < taps, (i + 0.5) / np.maximum(taps, 1) - 0.5, 0.0)
+
+
+@dividing_kernel
+def flow_field(
+    row0: int, row1: int, intrinsics: Intrinsics, hit: Ints, depth: Reals, motion: Reals, flow: Reals
+) -> None:
+    """Exact optical flow (float32 pixels) of rows.
+
+    ``motion`` [P, 12] takes a point in this camera's frame, fixed to primitive p, to the other camera's frame; where
+    nothing is hit or the point leaves the front of the camera, the flow is NaN.
+    """
+    fx, fy, cx, cy = intrinsics
+    width = hit.shape[1]
+    for row in range(row0, row1):
+        for column in range(width):
+            key = hit[row, column]
+            if key < 0:
+                flow[row, column, 0] = flow[row, column, 1] = np.nan
+                continue
+            p = key >> 3
+            z = depth[row, column]
+            x, y = (column - cx) / fx * z, (row - cy) / fy * z
+            w = motion[p, 8] * x + motion[p, 9] * y + motion[p, 10] * z + motion[p, 11]
+            if w <= NEAR_M:
+                flow[row, column, 0] = flow[row, column, 1] = np.nan
+                continue
+            u = motion[p, 0] * x + motion[p, 1] * y + motion[p, 2] * z + motion[p, 3]
+            v = motion[p, 4] * x + motion[p, 5] * y + motion[p, 6] * z + motion[p, 7]
+            flow[row, column, 0] = u / w * fx + cx - column
+            flow[row, column, 1] = v / w * fy + cy - row
+
+
+@dividing_kernel
+def motion_blur(
+    row0: int, row1: int, color: Reals, exact: Reals, shares: Reals, flow: Reals, shutter: float, blurred: Reals
+) -> None:
+    """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred.
+
+    ``exact`` is the whole colour image as flat float64: what all taps read is converted once. ``shares`` are
+    `tap_shares`. Unsigned indices need no test for negative ones.
+    """
+    height, width = color.shape[:2]
+    right, below, stride = width - 1.001, height - 1.001, np.uint64(3 * width)
+    one, two, three, four, five = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4), np.uint64(5)
+    for row in range(row0, row1):
+        for column in range(width):
+            du, dv = flow[row, column, 0] * shutter, flow[row, column, 1] * shutter
+            length = math.sqrt(du * du + dv * dv)
+            if not length > 0.75:
+                for ch in range(3):
+                    blurred[row, column, ch] = color[row, column, ch]
+                continue
+            taps = min(int(length) + 2, MOST_TAPS)
+            r, g, b = 0.0, 0.0, 0.0
+            for i in range(taps):
+                s = shares[taps, i]
+                x = min(max(column + s * du, 0.0), right)
+                y = min(max(row + s * dv, 0.0), below)
+                x0, y0 = np.uint32(x), np.uint32(y)
+                ax, ay = x - x0, y - y0
+                w00, w10, w01, w11 = (1 - ax) * (1 - ay), ax * (1 - ay), (1 - ax) * ay, ax * ay
+                k = np.uint64(y0) * stride + three * np.uint64(x0)
+                m = k + stride
+                r += w00 * exact[k] + w10 * exact[k + three] + w01 * exact[m] + w11 * exact[m + three]
+                g += w00 * exact[k + one] + w10 * exact[k + four] + w01 * exact[m + one] + w11 * exact[m + four]
+                b += w00 * exact[k + two] + w10 * exact[k + five] + w01 * exact[m + two] + w11 * exact[m + five]
+            blurred[row, column, 0], blurred[row, column, 1], blurred[row, column, 2] = r / taps, g / taps, b / taps

@@ -1,1 +1,0 @@
-"""The renderer's compiled kernels and its two sensors."""

@@ -1,1 +1,0 @@
-"""Rendered people: their bodies and what they do."""

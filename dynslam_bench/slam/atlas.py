@@ -1,0 +1,320 @@
+"""The atlas: the root map, submaps that begin after the camera was lost, and the trajectory of all tracked frames.
+
+As in ORB-SLAM3 (Campos et al., 2021) a camera that is not relocalised begins a new submap, which is merged when a place
+of another map is recognised. Keyframes and points of all maps lie in one `Map` (`Map.kf_map` says which is whose; 0 is
+the root map). The atlas knows where an unmerged submap may lie. Poses count in the world of the root map alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map_files import (
+    FEATURE_ARRAYS,
+    KEYFRAME_ARRAYS,
+    OBSERVATION_ARRAYS,
+    POINT_ARRAYS,
+    MapFeatures,
+    MapHeader,
+    SavedMap,
+    described,
+    read_map,
+    write_map,
+)
+from dynslam_bench.slam.motion_model import pose_covariance, smooth
+from dynslam_bench.slam.settings import MotionModelSettings
+
+Array = NDArray[np.float64]
+
+MAX_UNIT_RATIO = 10.0
+"""Without depth each map has its own unit of length, the median depth of its first views: their largest ratio."""
+UNKNOWN_FRAME = -1
+"""Frame of a keyframe that is of another run; its stamp is NaN."""
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A map that is not connected with the root map.
+
+    Attributes:
+        start: Camera centre of its first frame in its own world ``[3]``, metres.
+        anchor: Camera centre where the root map was left ``[3]``, in that map's world, metres.
+        bound_m: How far from there it began, at most.
+        slack: How far its world may be rotated against the root map's, radians; any angle if it comes from a file.
+    """
+
+    start: Array
+    anchor: Array
+    bound_m: float
+    slack: float = np.pi
+
+
+class Atlas:
+    """The root map and all submaps, by number.
+
+    Args:
+        world: Keyframes and points of all maps.
+        submaps: Those of a loaded map, from number 1 on.
+        unit_ratio: By how much units of length of two maps may differ: 1 with depth.
+
+    Attributes:
+        world: Keyframes and points of all maps.
+        active: Number of the map that the camera is in, or was in last.
+        submaps: The submaps by number, merged ones included.
+    """
+
+    def __init__(self, world: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0) -> None:
+        self.world = world
+        self.active = 0
+        self.submaps = dict(enumerate(submaps, 1))
+        self._unit_ratio = unit_ratio
+
+    def begin_submap(self, start: Array, bound_m: float, slack: float = np.pi) -> None:
+        """A submap begins where the camera was lost, as far as is known, and becomes the active one.
+
+        Args:
+            start: Camera centre in the map that was active ``[3]``; the submap takes it for that of its first frame.
+            bound_m: How far the camera may have moved since it was lost.
+            slack: How far the submap's directions may be rotated against those of the map that was active, radians.
+        """
+        slack = min(slack + self.slack(self.active, 0), np.pi)
+        submap = Submap(start.copy(), *self._from_root(self.active, start, bound_m), slack)
+        self.active = 1 + len(self.submaps)
+        self.submaps[self.active] = submap
+
+    def move_nearby(self, number: int, before: Array, after: Array, scales: Array) -> None:
+        """Keyframes of a map were moved: what is known of places in its world moves with the nearest keyframe.
+
+        Args:
+            number: The submap, or 0.
+            before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
+            after: Those from now on.
+            scales: What lengths around each were multiplied by ``[K]``.
+        """
+        centres = se3.inverse(before)[:, :3, 3]
+        for other, submap in self.submaps.items():
+            if number not in (0, other):
+                continue
+            place = submap.start if number else submap.anchor
+            nearest = int(np.linalg.norm(centres - place, axis=1).argmin())
+            scale, back = float(scales[nearest]), se3.inverse(after[nearest])
+            moved = se3.transform(back, scale * se3.transform(before[nearest], place))
+            slack = min(submap.slack + float(se3.rotation_angle(back @ before[nearest])), np.pi)
+            if number:
+                self.submaps[other] = replace(submap, start=moved, slack=slack)
+            else:
+                self.submaps[other] = replace(submap, anchor=moved, bound_m=scale * submap.bound_m, slack=slack)
+
+    def slack(self, one: int, other: int) -> float:
+        """How far the worlds of two maps may be rotated against each other, radians."""
+        if one == other:
+            return 0.0
+        return float(sum(self.submaps[number].slack for number in (one, other) if number in self.submaps))
+
+    def reachable(self, left: int, there: int, last: Array, now: Array, bound_m: float) -> bool:
+        """Whether a camera can have moved from one place to another.
+
+        Args:
+            left: The map in which it was tracked last.
+            there: The map of the place; nothing is known of the way to submaps other than `left`.
+            last: Its centre then ``[3]``.
+            now: Its centre now.
+            bound_m: How far it may have moved.
+        """
+        anchor, bound = (last, bound_m) if there == left else self._from_root(left, last, bound_m)
+        return there in (left, 0) and bool(np.linalg.norm(now - anchor) <= bound)
+
+    def admits_start(self, number: int, moved: Callable[[Array], Array], drift_m: float = 0.0) -> bool:
+        """Whether a submap can have begun where a merge would put its start.
+
+        Args:
+            number: The submap.
+            moved: Where in the root map's world the merge puts a place ``[3]`` of the submap, ``[3]``.
+            drift_m: By how much drift may have put it too far away.
+        """
+        submap = self.submaps[number]
+        return bool(np.linalg.norm(moved(submap.start) - submap.anchor) <= submap.bound_m + drift_m)
+
+    def _from_root(self, left: int, last: Array, bound_m: float) -> tuple[Array, float]:
+        """Where the root map was left, and how far from there the camera can be now."""
+        submap = self.submaps.get(left)
+        if submap is None:
+            return last.copy(), bound_m
+        length = self._unit_ratio * float(np.linalg.norm(last - submap.start))
+        return submap.anchor, submap.bound_m + length + bound_m
+
+
+# ---------------------------------------------------------------------- the trajectory
+
+
+class TrajectoryHistory:
+    """All tracked frames: stamp, reference keyframe and pose relative to it, so that refinement moves them along."""
+
+    _TABLES = ("_stamp", "_reference", "_relative", "_information")
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._stamp = np.zeros(64)
+        self._reference = np.zeros(64, np.int32)
+        self._relative = np.zeros((64, 4, 4))
+        self._information = np.zeros((64, 6, 6), np.float32)
+
+    def append(self, stamp: float, reference: int, T_cam_ref: Array, information: Array) -> None:
+        """Add a tracked frame: stamp, reference keyframe's slot, ``T_cam_ref`` and the information of the pose."""
+        if self.count == len(self._stamp):
+            for name in self._TABLES:
+                table = getattr(self, name)
+                setattr(self, name, np.concatenate([table, np.zeros_like(table)]))
+        self._stamp[self.count] = stamp
+        self._reference[self.count] = reference
+        self._relative[self.count] = T_cam_ref
+        self._information[self.count] = information
+        self.count += 1
+
+    def reanchor_newest(self, world: Map, reference: int, T_cam_world: Array) -> None:
+        """The newest frame's pose is known from another keyframe, with its world."""
+        self._reference[self.count - 1] = reference
+        self._relative[self.count - 1] = T_cam_world @ se3.inverse(world.kf_pose[reference])
+
+    def replace_keyframe(self, culled: int, replacement: int, T_culled_replacement: Array) -> None:
+        """The frames of a culled keyframe become relative to its replacement."""
+        rows = np.flatnonzero(self._reference[: self.count] == culled)
+        self._relative[rows] = self._relative[rows] @ T_culled_replacement
+        self._reference[rows] = replacement
+
+    def rescale(self, scales: Mapping[int, float]) -> None:
+        """Lengths around keyframes, by their slots, were multiplied by scales: so are those of their frames."""
+        for reference, scale in scales.items():
+            rows = np.flatnonzero(self._reference[: self.count] == reference)
+            self._relative[rows, :3, 3] *= scale
+            self._information[rows, :3] /= scale
+            self._information[rows, :, :3] /= scale
+
+    def poses(self, world: Map) -> tuple[Array, Array, Array]:
+        """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``.
+
+        Frames of unmerged submaps are left out: where they were taken in the root map's world is unknown.
+        """
+        rows = np.flatnonzero(world.kf_map[self._reference[: self.count]] == 0)
+        poses = self._relative[rows] @ world.kf_pose[self._reference[rows]]
+        return self._stamp[rows], poses, self._information[rows].astype(np.float64)
+
+    def trajectory(self, world: Map, motion: MotionModelSettings) -> Trajectory:
+        """Camera-to-world poses in the order of their stamps, smoothed where the settings say so."""
+        stamps, poses, information = self.poses(world)
+        order = np.argsort(stamps, kind="stable")
+        fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)
+        rows = order[fresh]
+        stamps, poses = stamps[rows], poses[rows]
+        if motion.smooth and len(stamps) > 2:
+            covariances = [pose_covariance(*pair) for pair in zip(poses, information[rows], strict=True)]
+            poses = smooth(stamps, poses, np.array(covariances), motion)
+        return Trajectory(stamps, se3.inverse(poses))
+
+
+# ---------------------------------------------------------------------- from and to a file
+
+
+def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool) -> Atlas:
+    """The atlas that a run begins with: that of a file, or an empty one where none is named.
+
+    Args:
+        file: The file, or an empty text.
+        camera: Undistorted intrinsics of the run.
+        features: The features of its frames.
+        depth: Whether they have depth.
+
+    Raises:
+        SettingsError: The file cannot be read, is no map, or one of another camera, features or sensor.
+    """
+    if not file:
+        return Atlas(Map(camera, features.scales), unit_ratio=1.0 if depth else MAX_UNIT_RATIO)
+    path = Path(file).expanduser()
+    saved = read_map(path)
+    saved.check(camera, features, "rgbd" if depth else "rgb", str(path))
+    return unpacked(saved, camera, features.scales)
+
+
+def save_atlas(path: Path, atlas: Atlas, features: MapFeatures, *, depth: bool, made_by: str = "") -> None:
+    """Write the atlas to a file; `open_atlas` restores every bit.
+
+    Raises:
+        TrackerError: There is no map yet, or it is too large for a file.
+        DynslamError: The file cannot be written.
+    """
+    world = atlas.world
+    if not world.next_keyframe:
+        raise TrackerError("there is no map to save: no frame has begun one")
+    header = MapHeader(
+        sensors="rgbd" if depth else "rgb",
+        camera=described(world.camera),
+        features=features,
+        next_keyframe=world.next_keyframe,
+        next_point=world.next_point,
+        made_by=made_by[:1000],
+    )
+    write_map(path, SavedMap(header, packed(atlas)))
+
+
+def packed(atlas: Atlas) -> dict[str, NDArray[Any]]:
+    """The arrays of an atlas, as `map_files` describes them."""
+    world = atlas.world
+    slots, points = world.keyframes, world.points
+    points = points[np.argsort(world.id[points], kind="stable")]
+    features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
+    observations = world.observations(points)
+    arrays = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
+    arrays |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
+    arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
+    row_of_point = np.full(world.alive.size + 1, -1, np.int32)  # the last one stands for "no point"
+    row_of_point[points] = np.arange(len(points))
+    row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
+    row_of_keyframe[slots] = np.arange(len(slots))
+    arrays["kf_point"] = row_of_point[arrays["kf_point"]]
+    arrays["obs_kf"] = row_of_keyframe[world.obs_kf[observations]]
+    arrays["obs_ft"] = world.obs_ft[observations]
+    submaps = atlas.submaps.values()
+    arrays["submap_start"] = np.array([submap.start for submap in submaps]).reshape(-1, 3)
+    arrays["submap_anchor"] = np.array([submap.anchor for submap in submaps]).reshape(-1, 3)
+    arrays["submap_bound"] = np.array([submap.bound_m for submap in submaps], np.float64)
+    return arrays
+
+
+def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
+    """The atlas of a file.
+
+    Args:
+        saved: What was read; it has to fit the camera and the features.
+        camera: Undistorted intrinsics.
+        scales: Scale of each octave.
+    """
+    arrays, header = saved.arrays, saved.header
+    count, n_obs = arrays["kf_count"], arrays["n_obs"]
+    tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS, *OBSERVATION_ARRAYS)}
+    in_use = np.arange(int(count.max(initial=0))) < count[:, None]
+    for name in FEATURE_ARRAYS:
+        rows = arrays[name]
+        tables[name] = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
+        tables[name][in_use] = rows
+    tables["kf_point"][~in_use] = -1
+    tables["obs_at"], tables["obs_capacity"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
+    tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)
+    tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
+    tables["kf_stamp"] = np.full(len(count), np.nan)
+    tables["kf_centre"] = np.zeros((len(count), 3))
+    world = Map(camera, scales)
+    world.take_over(tables, header.next_keyframe, header.next_point)
+    priors = zip(arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True)
+    submaps = [Submap(start.copy(), anchor.copy(), float(bound)) for start, anchor, bound in priors]
+    return Atlas(world, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)

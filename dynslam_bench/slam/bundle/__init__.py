@@ -1,1 +1,0 @@
-"""Local bundle adjustment: the own solver, and gtsam as its reference."""

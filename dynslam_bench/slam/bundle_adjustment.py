@@ -1,0 +1,426 @@
+"""Local bundle adjustment: Levenberg-Marquardt with the Schur complement over the points.
+
+The work is a function of the number of observations and iterations only, and everything runs in one thread in a fixed
+order: equal input gives equal bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.version import install_hint
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, NEAR_M, apply_twist, cholesky_solve
+
+Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
+Index = NDArray[np.int64]
+
+FIXED_KEYFRAMES = 6
+"""Further keyframes that observe the same points and stay where they are."""
+MAX_OBSERVATIONS = 6000
+"""Observations used at most: the budget that bounds the time of a keyframe."""
+FIXED_SIGMA = 1e-5
+"""For gtsam: standard deviation (rad, m) of the prior of a fixed pose; an equality constraint is seven times slower."""
+
+
+@dataclass(frozen=True, eq=False)
+class BundleProblem:
+    """Poses, points and observations of a local bundle adjustment.
+
+    Attributes:
+        poses: World-to-camera ``[P, 4, 4]``; the first `variable` ones are refined, the others stay fixed.
+        variable: How many poses are refined.
+        points: World points ``[Q, 3]``, metres.
+        obs_pose: int64 ``[N]``, observing pose.
+        obs_point: int64 ``[N]``, observed point, ascending.
+        uv: Undistorted pixels ``[N, 2]``.
+        right: Right coordinates ``[N]``.
+        info: Inverse variances of the pixels ``[N]``.
+        info_right: Inverse variances of the right coordinates ``[N]``, 0 without depth.
+        camera: Intrinsics and baseline.
+    """
+
+    poses: Array
+    variable: int
+    points: Array
+    obs_pose: Index
+    obs_point: Index
+    uv: Array
+    right: Array
+    info: Array
+    info_right: Array
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class BundleResult:
+    """Refined poses ``[P, 4, 4]`` and points ``[Q, 3]``, which observations fit, robust cost before and after."""
+
+    poses: Array
+    points: Array
+    inliers: NDArray[np.bool_]
+    cost_before: float
+    cost_after: float
+
+
+@kernel
+def _cost(
+    poses: Array, points: Array, obs_pose: Index, obs_point: Index, uv: Array, right: Array, info: Array,
+    info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, chi2: Array,
+) -> float:  # fmt: skip
+    """Huber cost of all observations; fills `chi2` (inf behind the camera)."""
+    total = 0.0
+    for k in range(obs_pose.shape[0]):
+        pose, p = poses[obs_pose[k]], points[obs_point[k]]
+        x = pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2] + pose[0, 3]
+        y = pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2] + pose[1, 3]
+        z = pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2] + pose[2, 3]
+        depth = info_right[k] > 0.0
+        limit = CHI2_DEPTH if depth else CHI2_MONO
+        if z < NEAR_M:
+            chi2[k] = np.inf
+            total += 100.0 * limit
+            continue
+        u = fx * x / z + cx
+        du, dv = uv[k, 0] - u, uv[k, 1] - (fy * y / z + cy)
+        c = info[k] * (du * du + dv * dv)
+        if depth:
+            dr = right[k] - (u - bf / z)
+            c += info_right[k] * dr * dr
+        chi2[k] = c
+        total += c if c <= limit else 2.0 * np.sqrt(limit * c) - limit
+    return total
+
+
+@kernel
+def _step(
+    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, damping: float,
+    chi2: Array, new_poses: Array, new_points: Array,
+) -> bool:  # fmt: skip
+    """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
+    n, q = obs_pose.shape[0], points.shape[0]
+    size = 6 * variable
+    s = np.zeros((size, size))
+    g = np.zeros(size)
+    w = np.zeros((n, 6, 3))  # J_pose^T Lambda J_point
+    inverse = np.zeros((q, 3, 3))
+    b = np.zeros((q, 3))
+    jc, jl, e = np.zeros((3, 6)), np.zeros((3, 3)), np.zeros(3)
+    hll = np.zeros((3, 3))
+    y = np.zeros((6, 3))
+    for i in range(q):
+        hll[:] = 0.0
+        for k in range(start[i], start[i + 1]):
+            depth = info_right[k] > 0.0
+            limit = CHI2_DEPTH if depth else CHI2_MONO
+            if chi2[k] == np.inf:
+                continue
+            weight = 1.0 if chi2[k] <= limit else np.sqrt(limit / chi2[k])
+            c = obs_pose[k]
+            r = poses[c]
+            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+            xc = r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + r[0, 3]
+            yc = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]
+            zc = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + r[2, 3]
+            iz = 1.0 / zc
+            a, d = fx * iz, fy * iz
+            au, dv = -a * xc * iz, -d * yc * iz
+            rows = 3 if depth else 2
+            u = fx * xc * iz + cx
+            e[0] = uv[k, 0] - u
+            e[1] = uv[k, 1] - (fy * yc * iz + cy)
+            e[2] = right[k] - (u - bf * iz) if depth else 0.0
+            ar = au + bf * iz * iz
+            for m in range(3):
+                jl[0, m] = a * r[0, m] + au * r[2, m]
+                jl[1, m] = d * r[1, m] + dv * r[2, m]
+                jl[2, m] = a * r[0, m] + ar * r[2, m]
+            lu = weight * info[k]
+            lr = weight * info_right[k]
+            for m in range(3):
+                f0, f1, f2 = lu * jl[0, m], lu * jl[1, m], (lr * jl[2, m] if rows == 3 else 0.0)
+                b[i, m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
+                for o in range(m + 1):
+                    hll[m, o] += f0 * jl[0, o] + f1 * jl[1, o] + f2 * jl[2, o]
+            if c < variable:
+                jc[0, 0], jc[0, 1], jc[0, 2] = a, 0.0, au
+                jc[0, 3], jc[0, 4], jc[0, 5] = au * yc, a * zc - au * xc, -a * yc
+                jc[1, 0], jc[1, 1], jc[1, 2] = 0.0, d, dv
+                jc[1, 3], jc[1, 4], jc[1, 5] = dv * yc - d * zc, -dv * xc, d * xc
+                jc[2, 0], jc[2, 1], jc[2, 2] = a, 0.0, ar
+                jc[2, 3], jc[2, 4], jc[2, 5] = ar * yc, a * zc - ar * xc, -a * yc
+                base = 6 * c
+                for m in range(6):
+                    f0, f1, f2 = lu * jc[0, m], lu * jc[1, m], (lr * jc[2, m] if rows == 3 else 0.0)
+                    g[base + m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
+                    for o in range(m + 1):
+                        s[base + m, base + o] += f0 * jc[0, o] + f1 * jc[1, o] + f2 * jc[2, o]
+                    for o in range(3):
+                        w[k, m, o] = f0 * jl[0, o] + f1 * jl[1, o] + f2 * jl[2, o]
+        for m in range(3):
+            hll[m, m] += damping * hll[m, m] + 1e-9
+        # inverse of the symmetric 3x3 block
+        h00, h10, h11, h20, h21, h22 = hll[0, 0], hll[1, 0], hll[1, 1], hll[2, 0], hll[2, 1], hll[2, 2]
+        c00, c10, c20 = h11 * h22 - h21 * h21, h20 * h21 - h10 * h22, h10 * h21 - h20 * h11
+        det = h00 * c00 + h10 * c10 + h20 * c20
+        if not det > 1e-18:
+            continue
+        t = 1.0 / det
+        v = inverse[i]
+        v[0, 0], v[0, 1], v[0, 2] = c00 * t, c10 * t, c20 * t
+        v[1, 0], v[1, 1], v[1, 2] = c10 * t, (h00 * h22 - h20 * h20) * t, (h10 * h20 - h00 * h21) * t
+        v[2, 0], v[2, 1], v[2, 2] = c20 * t, (h10 * h20 - h00 * h21) * t, (h00 * h11 - h10 * h10) * t
+    for i in range(size):  # damp the pose blocks before the points are eliminated
+        s[i, i] += damping * s[i, i] + 1e-9
+    for i in range(q):
+        v = inverse[i]
+        for k in range(start[i], start[i + 1]):
+            c = obs_pose[k]
+            if c >= variable:
+                continue
+            wk = w[k]
+            for m in range(6):
+                for o in range(3):
+                    y[m, o] = wk[m, 0] * v[0, o] + wk[m, 1] * v[1, o] + wk[m, 2] * v[2, o]
+            base = 6 * c
+            for m in range(6):
+                g[base + m] -= y[m, 0] * b[i, 0] + y[m, 1] * b[i, 1] + y[m, 2] * b[i, 2]
+            for k2 in range(start[i], start[i + 1]):
+                c2 = obs_pose[k2]
+                if c2 > c:
+                    continue
+                wl = w[k2]
+                other = 6 * c2
+                for m in range(6):
+                    y0, y1, y2 = y[m, 0], y[m, 1], y[m, 2]
+                    for o in range(6):
+                        s[base + m, other + o] -= y0 * wl[o, 0] + y1 * wl[o, 1] + y2 * wl[o, 2]
+    if not cholesky_solve(s, g):
+        return False
+    for c in range(variable):
+        moved = apply_twist(poses[c], g[6 * c : 6 * c + 6])
+        for m in range(4):
+            for o in range(4):
+                new_poses[c, m, o] = moved[m, o]
+    for i in range(q):
+        b0, b1, b2 = b[i, 0], b[i, 1], b[i, 2]
+        for k in range(start[i], start[i + 1]):
+            c = obs_pose[k]
+            if c < variable:
+                for m in range(6):
+                    x = g[6 * c + m]
+                    b0 -= w[k, m, 0] * x
+                    b1 -= w[k, m, 1] * x
+                    b2 -= w[k, m, 2] * x
+        v = inverse[i]
+        for m in range(3):
+            new_points[i, m] = points[i, m] + v[m, 0] * b0 + v[m, 1] * b1 + v[m, 2] * b2
+    return True
+
+
+@kernel
+def _adjust(
+    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float,
+    iterations: int, chi2: Array,
+) -> tuple[Array, Array, float, float]:  # fmt: skip
+    cost = _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, chi2)
+    before = cost
+    damping = 1e-5
+    trial = np.empty_like(chi2)
+    for _ in range(iterations):
+        new_poses, new_points = poses.copy(), points.copy()
+        solved = _step(
+            poses, variable, points, obs_pose, obs_point, start, uv, right, info, info_right, fx, fy, cx, cy, bf,
+            damping, chi2, new_poses, new_points,
+        )  # fmt: skip
+        if solved:
+            new = _cost(
+                new_poses, new_points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, trial
+            )
+            if new < cost:
+                poses, points = new_poses, new_points
+                for k in range(chi2.shape[0]):
+                    chi2[k] = trial[k]
+                gain = cost - new
+                cost = new
+                damping = max(damping * 0.2, 1e-8)
+                if gain < 1e-5 * cost:
+                    break
+                continue
+        damping *= 30.0
+    return poses, points, before, cost
+
+
+def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
+    """Minimise the Huber reprojection error over the variable poses and all points.
+
+    Args:
+        problem: Start values and observations; every point should have two observations or depth.
+        iterations: Levenberg-Marquardt iterations at most.
+    """
+    c = problem.camera
+    count = len(problem.points)
+    start = np.searchsorted(problem.obs_point, np.arange(count + 1)).astype(np.int64)
+    chi2 = np.zeros(len(problem.obs_pose))
+    guess = np.ascontiguousarray(problem.poses), problem.variable, np.ascontiguousarray(problem.points)
+    measured = problem.uv, problem.right, problem.info, problem.info_right
+    lens = c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m
+    poses, points, before, after = _adjust(
+        *guess, problem.obs_pose, problem.obs_point, start, *measured, *lens, iterations, chi2
+    )
+    limit = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
+    return BundleResult(poses, points, chi2 <= limit, before, after)
+
+
+def reprojection_chi2(problem: BundleProblem, poses: Array, points: Array) -> tuple[float, Array]:
+    """Huber cost and chi-square of each observation ``[N]`` at given poses and points; inf behind the camera."""
+    c = problem.camera
+    chi2 = np.zeros(len(problem.obs_pose))
+    guess = np.ascontiguousarray(poses), np.ascontiguousarray(points)
+    measured = problem.uv, problem.right, problem.info, problem.info_right
+    cost = _cost(
+        *guess, problem.obs_pose, problem.obs_point, *measured, c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, chi2
+    )
+    return float(cost), chi2
+
+
+# ---------------------------------------------------------------------- the bundle of a map
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """A bundle adjustment, and where its parts are stored in the map.
+
+    Attributes:
+        problem: What is to be solved.
+        poses: Slots of its keyframes ``[P]``.
+        points: Slots of its points ``[Q]``.
+        features: Feature number of each observation ``[N]``.
+    """
+
+    problem: BundleProblem
+    poses: Slots
+    points: Slots
+    features: Slots
+
+
+def local_bundle(world: Map, slot: int, window: int) -> Bundle | None:
+    """The local window around a keyframe, cut to the observation budget; None if there is nothing to refine.
+
+    Variable are the keyframe and its most covisible ones; fixed are further keyframes that observe the same points, and
+    always at least one. The oldest keyframe of all is never variable.
+    """
+    near, _ = world.covisible(slot)
+    variable = np.concatenate([[slot], near[: window - 1]]).astype(np.int64)
+    variable = variable[world.kf_id[variable] > 0]
+    if not len(variable):
+        return None
+    points = world.points_of(variable)
+    fixed, _ = world.covisible_of(points)
+    fixed = fixed[~np.isin(fixed, variable)][:FIXED_KEYFRAMES]
+    if not len(fixed):
+        if len(variable) < 2:
+            return None
+        fixed, variable = variable[-1:], variable[:-1]
+    return _bundle(world, variable, fixed, points, MAX_OBSERVATIONS)
+
+
+def full_bundle(world: Map) -> Bundle | None:
+    """All keyframes and points; the oldest keyframe stays. None if there are no two keyframes."""
+    keyframes = world.keyframes
+    if len(keyframes) < 2:
+        return None
+    return _bundle(world, keyframes[1:], keyframes[:1], world.points, int(world.n_obs[world.points].sum()))
+
+
+def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, max_observations: int) -> Bundle | None:
+    poses = np.concatenate([variable, fixed])
+    pose_number = np.full(world.kf_alive.size, -1, np.int64)
+    pose_number[poses] = np.arange(len(poses))
+    rows = world.observations(points)
+    of_point, pose = np.repeat(np.arange(len(points)), world.n_obs[points]), pose_number[world.obs_kf[rows]]
+    support = np.bincount(of_point[pose >= 0], minlength=len(points))
+    supported = np.flatnonzero(support >= 2)
+    order = supported[np.lexsort((world.id[points[supported]], -support[supported]))]  # long tracks first
+    order = order[np.cumsum(support[order]) <= max_observations]
+    order.sort()
+    if not len(order):
+        return None
+    point_number = np.full(len(points), -1, np.int64)
+    point_number[order] = np.arange(len(order))
+    used = (pose >= 0) & (point_number[of_point] >= 0)
+    obs_point, obs_pose, points = point_number[of_point[used]], pose[used], points[order]
+    features = world.obs_ft[rows[used]].astype(np.int64)
+    at = poses[obs_pose]
+    problem = BundleProblem(
+        world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point,
+        world.kf_xy[at, features], world.kf_right[at, features], world.kf_info[at, features],
+        world.kf_info_right[at, features], world.camera,
+    )  # fmt: skip
+    return Bundle(problem, poses, points, features)
+
+
+# ---------------------------------------------------------------------- the reference solver
+
+
+def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult:
+    """The same minimisation by gtsam's Levenberg-Marquardt: the reference that `adjust_bundle` is compared with.
+
+    Args:
+        problem: As for `adjust_bundle`.
+        iterations: Levenberg-Marquardt iterations at most.
+
+    Raises:
+        TrackerError: gtsam is not installed.
+    """
+    try:
+        import gtsam
+    except ImportError as error:
+        message = f"backend.bundle_adjustment.solver = gtsam needs a package that cannot be imported: {error}"
+        raise TrackerError(message, f"{install_hint('gtsam')}, or leave the setting") from error
+    camera = problem.camera
+    mono = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
+    stereo = gtsam.Cal3_S2Stereo(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.baseline_m)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    pose_keys = [gtsam.symbol("x", i) for i in range(len(problem.poses))]
+    point_keys = [gtsam.symbol("l", i) for i in range(len(problem.points))]
+    prior = gtsam.noiseModel.Isotropic.Sigma(6, FIXED_SIGMA)
+    for i, pose in enumerate(np.linalg.inv(problem.poses)):
+        values.insert(pose_keys[i], gtsam.Pose3(pose))
+        if i >= problem.variable:
+            graph.add(gtsam.PriorFactorPose3(pose_keys[i], gtsam.Pose3(pose), prior))
+    for key, point in zip(point_keys, problem.points, strict=True):
+        values.insert(key, point)
+    limits = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
+    for k, limit in enumerate(limits.tolist()):
+        keys = pose_keys[problem.obs_pose[k]], point_keys[problem.obs_point[k]]
+        u, v = problem.uv[k]
+        sigma = problem.info[k] ** -0.5
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(float(np.sqrt(limit)))
+        if problem.info_right[k] > 0:
+            noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, problem.info_right[k] ** -0.5, sigma]))
+            measured = gtsam.StereoPoint2(u, problem.right[k], v)
+            robust = gtsam.noiseModel.Robust.Create(huber, noise)
+            graph.add(gtsam.GenericStereoFactor3D(measured, robust, *keys, stereo))
+        else:
+            robust = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(problem.uv[k], robust, *keys, mono))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    poses = problem.poses.copy()
+    for i in range(problem.variable):
+        poses[i] = np.linalg.inv(result.atPose3(pose_keys[i]).matrix())
+    points = np.array([result.atPoint3(key) for key in point_keys]).reshape(-1, 3)
+    before, _ = reprojection_chi2(problem, problem.poses, problem.points)
+    after, chi2 = reprojection_chi2(problem, poses, points)
+    return BundleResult(poses, points, chi2 <= limits, before, after)

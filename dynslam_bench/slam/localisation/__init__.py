@@ -1,1 +1,0 @@
-"""Where is this frame? First pose, local map, pose, relocalisation."""

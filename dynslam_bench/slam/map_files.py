@@ -1,0 +1,370 @@
+"""Files of a map: ``map.npz``, from which a later run starts, ``keyframes.csv`` and ``map.ply``.
+
+``map.npz`` holds arrays and nothing else, which are checked before they are used. Keyframes and points are stored
+without gaps, oldest first, and refer to each other by row. Which frames of which recording the keyframes were is left
+out: in another one it means nothing. `docs/backend.md` lists the arrays.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from dynslam_bench.contracts.tracker import MapOutputs
+from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
+from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
+from dynslam_bench.core.records import Record, schema, write_atomic
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import format_ns, ns_of
+
+MAP_FILE = "map.npz"
+MAP_SCHEMA = 1
+HEADER = "header"
+ARRAY_HEADER_BYTES = 256
+"""What numpy writes before an array, at most."""
+MAKE_ONE = "a map is made by: run --save-map"
+
+Sensors = Literal["rgbd", "rgb"]
+Arrays = Mapping[str, NDArray[Any]]
+
+KEYFRAME_ARRAYS = {
+    "kf_id": ("i8", "S"), "kf_map": ("i8", "S"), "kf_pose": ("f8", "S44"), "kf_count": ("i8", "S"),
+}  # fmt: skip
+"""Type and shape of what is stored of each keyframe; S keyframes."""
+FEATURE_ARRAYS = {
+    "kf_raw": ("f4", "F2"), "kf_response": ("f4", "F"), "kf_xy": ("f8", "F2"), "kf_right": ("f8", "F"),
+    "kf_z": ("f4", "F"), "kf_octave": ("i1", "F"), "kf_angle": ("f4", "F"), "kf_info": ("f8", "F"),
+    "kf_info_right": ("f8", "F"), "kf_words": ("u8", "FW"), "kf_point": ("i4", "F"),
+}  # fmt: skip
+"""Of each feature of each keyframe, one keyframe after the other; F features, W words of 64 bits a descriptor."""
+POINT_ARRAYS = {
+    "id": ("i8", "P"), "position": ("f8", "P3"), "normal": ("f8", "P3"), "far": ("f8", "P"), "words": ("u8", "PW"),
+    "rgb": ("u1", "P3"), "visible": ("i4", "P"), "found": ("i4", "P"), "born": ("i8", "P"), "n_obs": ("i4", "P"),
+}  # fmt: skip
+"""Of each point; P points."""
+OBSERVATION_ARRAYS = {"obs_kf": ("i4", "O"), "obs_ft": ("i4", "O")}
+"""Of each observation, one point after the other: row of the keyframe, and which of its features; O observations."""
+SUBMAP_ARRAYS = {"submap_start": ("f8", "I3"), "submap_anchor": ("f8", "I3"), "submap_bound": ("f8", "I")}
+"""Of each submap that was not merged (`Atlas`); I of them."""
+_LAYOUT = KEYFRAME_ARRAYS | FEATURE_ARRAYS | POINT_ARRAYS | OBSERVATION_ARRAYS | SUBMAP_ARRAYS
+
+
+MAX_TABLE_BYTES = 1 << 30
+"""Of all features of a map as tables; two thousand keyframes of a thousand features fill a fifth."""
+MAX_WORDS = 64
+"""Words of 64 bits of a descriptor; ORB's has four."""
+_FINITE = ("kf_pose", "kf_raw", "kf_response", "kf_xy", "kf_z", "kf_angle", "kf_info", "kf_info_right", "position",
+           "normal", "far", "submap_start", "submap_anchor")  # fmt: skip
+_NOT_BELOW = {"kf_count": 0, "kf_z": 0, "kf_info": 0, "kf_info_right": 0, "visible": 1, "found": 0, "n_obs": 1,
+              "kf_octave": 0, "kf_point": -1, "obs_kf": 0, "obs_ft": 0, "kf_id": 0, "kf_map": 0, "id": 0,
+              "born": 0, "submap_bound": 0}  # fmt: skip
+
+
+class MapFeatures(Record):
+    """The features that a map is made of; only the same are found in it.
+
+    Attributes:
+        extractor: Id of the extractor.
+        levels: Levels of its image pyramid.
+        scale_factor: Ratio of consecutive levels.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    extractor: str
+    levels: int = Field(ge=1, le=64)
+    scale_factor: float = Field(ge=1, le=100)
+
+    @property
+    def scales(self) -> NDArray[np.float64]:
+        """Scale of each level."""
+        return np.asarray(self.scale_factor ** np.arange(self.levels, dtype=np.float64))
+
+    def __str__(self) -> str:
+        return f"{self.extractor}, {self.levels} levels of {self.scale_factor:g}"
+
+
+class MapHeader(Record):
+    """What a map file says of the map.
+
+    Attributes:
+        kind: Says that the file is a map.
+        schema_version: Of the file; newer ones are refused.
+        sensors: ``rgbd``, or ``rgb`` for a map whose unit of length is its own.
+        camera: Intrinsics of the undistorted camera, see `Camera`.
+        features: What it is made of.
+        next_keyframe: Number of the next keyframe.
+        next_point: Number of the next point.
+        made_by: Which run made it, in words.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["dynslam-bench map"] = "dynslam-bench map"
+    schema_version: int = schema(MAP_SCHEMA)
+    sensors: Sensors
+    camera: dict[str, float]
+    features: MapFeatures
+    next_keyframe: int = Field(ge=1, lt=2**62)
+    next_point: int = Field(ge=0, lt=2**62)
+    made_by: str = Field("", max_length=1000)
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """The content of a map file.
+
+    Attributes:
+        header: Where it comes from.
+        arrays: By name, see `KEYFRAME_ARRAYS` and those after it.
+    """
+
+    header: MapHeader
+    arrays: Arrays
+
+    def check(self, camera: Camera, features: MapFeatures, sensors: Sensors, where: str) -> None:
+        """Refuse a map that a system cannot localise in.
+
+        Args:
+            camera: The system's.
+            features: Those that it extracts.
+            sensors: ``rgbd`` or ``rgb``.
+            where: The file, for the message.
+
+        Raises:
+            SettingsError: Names what differs.
+        """
+        kinds = {"rgbd": "an RGB-D", "rgb": "a monocular"}
+        if self.header.sensors != sensors:
+            made, here = kinds[self.header.sensors], kinds[sensors]
+            raise SettingsError(f"{where} is {made} map, and this is {here} system", "their units of length differ")
+        if self.header.features != features:
+            raise SettingsError(
+                f"{where} is made of other features ({self.header.features}) than this system's ({features})",
+                "set features.* as they were when the map was made",
+            )
+        own = described(camera)
+        odd = [name for name in own if self.header.camera.get(name) != own[name]]
+        if odd:
+            differs = ", ".join(f"{name} {self.header.camera.get(name)} instead of {own[name]}" for name in odd)
+            raise SettingsError(f"{where} was made with another camera: {differs}")
+
+
+def described(camera: Camera) -> dict[str, float]:
+    """The part of a camera that a map depends on: undistorted intrinsics and baseline."""
+    names = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
+    return {name: float(value) for name, value in asdict(camera).items() if name in names}
+
+
+def write_map(path: Path, saved: SavedMap) -> None:
+    """Write a map; the same map always gives the same bytes.
+
+    Raises:
+        TrackerError: The map is too large to be read again.
+        DynslamError: The folder cannot be written.
+    """
+    header = np.frombuffer(saved.header.to_json().encode(), np.uint8)
+    size = sum(array.nbytes + ARRAY_HEADER_BYTES for array in (header, *saved.arrays.values()))
+    if size > MOST_BYTES:
+        raise TrackerError(
+            f"the map holds {size / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read of such a file",
+            "keep fewer keyframes (backend.keyframes.maximum) or features (features.n_features)",
+        )
+    data = io.BytesIO()
+    np.savez_compressed(data, **{HEADER: header}, **saved.arrays)  # type: ignore[arg-type]
+    write_atomic(path, data.getvalue())
+
+
+def read_map(path: Path) -> SavedMap:
+    """Read a map that `write_map` wrote; every index is checked.
+
+    Raises:
+        SettingsError: The file cannot be read, is no map, of a newer version, or damaged; names the first fault.
+    """
+    arrays = read_npz(path, kind=SettingsError)
+    if HEADER not in arrays:
+        raise SettingsError(f"{path} is no map: it holds no header", MAKE_ONE)
+    try:
+        text = arrays.pop(HEADER).tobytes().decode()
+        header = MapHeader.parse(text, f"{path} (header)")
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"{path} is no map: its header is no text", MAKE_ONE) from error
+    except DynslamError as error:
+        raise SettingsError(str(error)) from error
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    for fault in _faults(arrays, header):
+        raise SettingsError(f"{path} is a damaged map: {fault}", MAKE_ONE)
+    return SavedMap(header, arrays)
+
+
+def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
+    """Faults of the arrays of a file that anyone may have written: compiled loops check no index.
+
+    Arrays that are missing, unknown, or of another type or shape; values out of bounds; references that contradict each
+    other. Later checks rely on earlier ones.
+    """
+    for name in sorted(_LAYOUT.keys() ^ arrays.keys()):
+        yield f"it holds no array '{name}'" if name in _LAYOUT else f"it holds an unknown array '{name[:40]}'"
+    sizes: dict[str, int] = {}
+    for name, (kind, axes) in _LAYOUT.items():
+        array = arrays[name]
+        expected = [int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
+                    for axis, size in zip(axes, array.shape, strict=False)]  # fmt: skip
+        if array.dtype != np.dtype(kind) or array.ndim != len(axes) or list(array.shape) != expected:
+            shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - array.ndim, 0)
+            yield f"'{name}' is {array.dtype} of shape {str(array.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
+    for name in _FINITE:
+        if not np.isfinite(arrays[name]).all():
+            yield f"'{name}' holds values that are not finite"
+    most = {"kf_map": len(arrays["submap_bound"]), "kf_octave": header.features.levels - 1,
+            "kf_id": header.next_keyframe - 1, "born": header.next_keyframe - 1, "id": header.next_point - 1,
+            "kf_point": len(arrays["id"]) - 1, "obs_kf": len(arrays["kf_id"]) - 1}  # fmt: skip
+    for name, least in _NOT_BELOW.items():
+        if not (arrays[name] >= least).all():
+            yield f"'{name}' holds values below {least}"
+        if not (arrays[name] <= most.get(name, np.inf)).all():
+            yield f"'{name}' holds values above {most[name]}"
+    yield from (fault for holds, fault in _contents(arrays) if not holds)
+    yield from (fault for holds, fault in _references(arrays) if not holds)
+
+
+def _contents(arrays: Arrays) -> Iterator[tuple[Any, str]]:
+    """What has to hold of values, and the fault if it does not."""
+    yield len(arrays["kf_id"]), "it holds no keyframe"
+    yield (arrays["far"] > 0).all(), "'far' holds values that are not above 0"
+    for name in ("kf_id", "id"):
+        yield (np.diff(arrays[name]) > 0).all(), f"'{name}' is not in ascending order"
+    rotation = arrays["kf_pose"][:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3))
+        right_handed = np.linalg.det(rotation) > 0
+    rigid = (off < 1e-6).all() and right_handed.all() and (arrays["kf_pose"][:, 3] == [0, 0, 0, 1]).all()
+    yield rigid, "'kf_pose' holds what is no rigid transformation"
+    right, z = arrays["kf_right"], arrays["kf_z"]
+    where_depth = np.array_equal(np.isnan(right), z == 0) and not np.isinf(right).any()
+    yield where_depth, "'kf_right' is not known where depth is, and only there"
+
+
+def _references(arrays: Arrays) -> Iterator[tuple[Any, str]]:
+    """Features name the point that they observe, and points the features that observe them; both have to agree."""
+    words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
+    yield words <= MAX_WORDS, f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
+    count = arrays["kf_count"]
+    claimed = len(count) * int(count.max(initial=0)) * (64 + 8 * words)  # as tables, as wide as the longest row
+    yield claimed <= MAX_TABLE_BYTES, f"'kf_count' claims tables of {claimed} bytes, at most {MAX_TABLE_BYTES} are made"
+    for name, total in (("kf_count", len(arrays["kf_point"])), ("n_obs", len(arrays["obs_kf"]))):
+        counts = arrays[name].astype(np.int64)
+        yield (counts <= total).all() and int(counts.sum()) == total, f"'{name}' does not add up to {total}"
+    keyframe, feature = arrays["obs_kf"], arrays["obs_ft"]
+    yield (feature < count[keyframe]).all(), "'obs_ft' names features that the keyframe does not have"
+    row = (np.cumsum(count) - count)[keyframe] + feature
+    point = np.repeat(np.arange(len(arrays["id"])), arrays["n_obs"])
+    agree = len(np.unique(row)) == len(row) and np.array_equal(arrays["kf_point"][row], point)
+    yield agree, "observations do not agree with 'kf_point'"
+    once = len(np.unique(point * len(arrays["kf_id"]) + keyframe)) == len(row)
+    yield once, "a keyframe observes a point with two features"
+    matched = np.count_nonzero(arrays["kf_point"] >= 0) == len(row)
+    yield matched, "'kf_point' names points that have no such observation"
+
+
+# ---------------------------------------------------------------------- keyframes.csv and map.ply
+
+_COLOURS = ("red", "green", "blue")
+_PLY_LAYOUT = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("n", "<i4")]
+)
+
+
+def write_keyframes_csv(path: Path, outputs: MapOutputs, exact: Mapping[float, int] | None = None) -> None:
+    """Write ``keyframes.csv``: the fields of `KeyframeRecord`, the pose as tx ty tz and qx qy qz qw.
+
+    The timestamp has nine decimals; `exact` gives the nanoseconds of stamps by their seconds, where a float does not
+    hold them. It and the frame are empty for keyframes of an earlier run, in whose map this one began.
+
+    Raises:
+        DynslamError: The folder cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        ["id", "frame", "timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "features", "observations", "map"]
+    )
+    for record in outputs.keyframes:
+        translation, quaternion = se3.to_quaternion(record.T_world_cam)
+        numbers = [f"{value:.9f}" for value in (*translation, *quaternion)]
+        when: list[object] = ["", ""]
+        if record.frame >= 0:
+            when = [record.frame, format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp))]
+        writer.writerow([record.id, *when, *numbers, record.features, record.observations, record.map])
+    write_atomic(path, text.getvalue())
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Map points of a stored run.
+
+    Attributes:
+        positions: float32 ``[M, 3]``, world coordinates, metres.
+        colours: uint8 ``[M, 3]``, red, green, blue.
+        observations: int32 ``[M]``, keyframes that observe each point.
+    """
+
+    positions: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    observations: NDArray[np.int32]
+
+
+def read_ply(path: Path) -> Cloud:
+    """Read a map that `write_ply` wrote.
+
+    Raises:
+        RunError: It cannot be read, or is no such file.
+    """
+    data = read_bytes(path, limit=TABLE_BYTES, kind=RunError)
+    head, _, body = data.partition(b"end_header\n")
+    rows = len(body) // _PLY_LAYOUT.itemsize
+    if head + b"end_header\n" != _ply_header(rows) or len(body) != rows * _PLY_LAYOUT.itemsize:
+        raise RunError(
+            f"{path} is no map of this package: expected {_PLY_LAYOUT.itemsize} bytes a point, little-endian"
+        )
+    points = np.frombuffer(body, _PLY_LAYOUT)
+    positions = np.stack([points[name] for name in "xyz"], axis=1)
+    if not np.isfinite(positions).all():
+        raise RunError(f"{path} holds points that are not finite")
+    colours = np.stack([points[name] for name in _COLOURS], axis=1)
+    return Cloud(positions, colours, points["n"])
+
+
+def _ply_header(rows: int) -> bytes:
+    kinds = {"float": ("x", "y", "z"), "uchar": _COLOURS, "int": ("observations",)}
+    properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}", *properties, "end_header"]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def write_ply(path: Path, outputs: MapOutputs) -> None:
+    """Write the map points as a binary PLY cloud: float x y z in metres, uchar red green blue, int observations.
+
+    Args:
+        path: The file to write.
+        outputs: The map.
+
+    Raises:
+        DynslamError: The folder cannot be written.
+    """
+    rows = np.zeros(len(outputs.positions), _PLY_LAYOUT)
+    for i, name in enumerate("xyz"):
+        rows[name] = outputs.positions[:, i]
+    for i, name in enumerate(_COLOURS):
+        rows[name] = outputs.colours[:, i]
+    rows["n"] = outputs.observations
+    write_atomic(path, _ply_header(len(rows)) + rows.tobytes())

@@ -1,1 +1,0 @@
-"""The map and what a new keyframe does to it."""

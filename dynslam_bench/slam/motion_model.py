@@ -1,0 +1,278 @@
+"""How a hand-held camera moves: white-noise acceleration, as a filter while tracking and a smoother afterwards.
+
+State of the filter: position p and velocity v in the world, orientation R_cam_world and angular velocity w in the
+camera frame; accelerations are white noise. The measurement is the pose that the image gives, with the Gauss-Newton
+matrix of its optimisation as information. With many well-spread inliers the image decides; with few the motion does.
+The smoother is the fixed-interval one of Rauch, Tung and Striebel (1965).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dynslam_bench.slam.pose_optimisation import apply_twist
+from dynslam_bench.slam.settings import MotionModelSettings
+from dynslam_bench.slam.tracking import TrackedFrame
+
+Array = NDArray[np.float64]
+
+CHI2_POSE = 12.592
+"""95 % quantile of chi-square with six degrees of freedom."""
+INFLATION = 100.0
+"""Factor on the covariance of a measured pose: pixel errors are not independent of each other."""
+MAX_GAP_S = 0.25
+"""After a longer gap between frames nothing is assumed of the motion."""
+FIRST_INTERVAL_S = 1 / 30
+"""Interval between frames until one was measured."""
+JITTER = 0.1
+"""Share of the last interval by which a stamp may be off and still count as regular: the noise of stamping."""
+INTERVALS = 15
+"""The latest intervals that are kept."""
+_START_SPEED = np.repeat([1.0, 2.0], 3)
+"""Standard deviations of velocity (m/s) and angular velocity (rad/s) when nothing is known of them."""
+
+
+def pose_covariance(T_cam_world: Array, information: Array, inflation: float = INFLATION) -> Array:
+    """Covariance ``[6, 6]`` of (position in the world, rotation in the camera frame) of a measured pose.
+
+    Args:
+        T_cam_world: The measured world-to-camera pose.
+        information: Gauss-Newton matrix of (translation, rotation) for ``exp(xi) @ T_cam_world``.
+        inflation: Factor on the covariance.
+    """
+    j = np.zeros((6, 6))
+    j[:3, :3] = -T_cam_world[:3, :3]
+    j[3:, 3:] = np.eye(3)
+    matrix = j.T @ information @ j / inflation
+    covariance = np.linalg.inv(matrix + 1e-3 * np.eye(6))
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
+    q = np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3)
+    noise = np.zeros((12, 12))
+    noise[:6, :6] = np.diag(q * dt**4 / 4)
+    noise[:6, 6:] = noise[6:, :6] = np.diag(q * dt**3 / 2)
+    noise[6:, 6:] = np.diag(q * dt**2)
+    return noise
+
+
+def _transition(dt: float) -> Array:
+    f = np.eye(12)
+    f[:6, 6:] = dt * np.eye(6)
+    return f
+
+
+@dataclass(eq=False)
+class MotionState:
+    """Pose, velocities and their covariance.
+
+    Attributes:
+        position: Camera centre in the world, metres ``[3]``.
+        rotation: ``R_cam_world`` ``[3, 3]``.
+        speed: Velocity in the world (m/s) and angular velocity in the camera frame (rad/s) ``[6]``.
+        covariance: ``[12, 12]`` of (position, rotation, velocity, angular velocity).
+    """
+
+    position: Array
+    rotation: Array
+    speed: Array
+    covariance: Array
+
+    @classmethod
+    def at(cls, T_cam_world: Array, covariance: Array) -> MotionState:
+        """A state with known pose and unknown velocity."""
+        full = np.zeros((12, 12))
+        full[:6, :6] = covariance
+        full[6:, 6:] = np.diag(_START_SPEED**2)
+        r = T_cam_world[:3, :3]
+        return cls(-r.T @ T_cam_world[:3, 3], r.copy(), np.zeros(6), full)
+
+    @property
+    def T_cam_world(self) -> Array:
+        """World-to-camera pose ``[4, 4]``."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation
+        pose[:3, 3] = -self.rotation @ self.position
+        return pose
+
+    def difference(self, T_cam_world: Array) -> Array:
+        """(position, rotation) ``[6]`` that leads from this state's pose to another."""
+        r = T_cam_world[:3, :3]
+        rotation = Rotation.from_matrix(r @ self.rotation.T).as_rotvec()
+        return np.concatenate([-r.T @ T_cam_world[:3, 3] - self.position, rotation])
+
+    def moved(self, correction: Array, covariance: Array) -> MotionState:
+        """The state after a correction ``[12]``."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation
+        twist = np.concatenate([np.zeros(3), correction[3:6]])
+        rotation = apply_twist(pose, twist)[:3, :3]  # keeps it orthonormal
+        return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
+
+    def transformed(self, rotation: Array, scale: float) -> MotionState:
+        """The same motion after the world was rotated by ``[3, 3]`` and its lengths were multiplied."""
+        by = np.eye(12)
+        by[:3, :3] = by[6:9, 6:9] = scale * rotation
+        return MotionState(
+            by[:3, :3] @ self.position, self.rotation @ rotation.T, by[6:, 6:] @ self.speed, by @ self.covariance @ by.T
+        )
+
+    def relocated(self, T_cam_world: Array) -> MotionState:
+        """The same motion at another pose, e.g. after bundle adjustment."""
+        r = T_cam_world[:3, :3]
+        return MotionState(-r.T @ T_cam_world[:3, 3], r.copy(), self.speed, self.covariance)
+
+    def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
+        """The state `dt` seconds later."""
+        f = _transition(dt)
+        noise = _process_noise(dt, settings)
+        step = np.concatenate([self.speed * dt, np.zeros(6)])
+        return self.moved(step, f @ self.covariance @ f.T + noise)
+
+    def motion_covariance(self, dt: float, settings: MotionModelSettings) -> Array:
+        """Covariance ``[6, 6]`` of the motion in the next `dt` seconds.
+
+        Of (position in the world, rotation in the camera frame); where the camera is now plays no part.
+        """
+        noise = _process_noise(dt, settings)
+        return np.asarray(dt**2 * self.covariance[6:, 6:] + noise[:6, :6])
+
+    def updated(self, T_cam_world: Array, covariance: Array) -> MotionState:
+        """The state after a measured pose; one beyond the chi-square limit inflates the predicted covariance."""
+        p = self.covariance
+        innovation = self.difference(T_cam_world)
+        s = p[:6, :6] + covariance
+        surprise = float(innovation @ np.linalg.solve(s, innovation)) / CHI2_POSE
+        if surprise > 1.0:
+            p = p * surprise
+            s = p[:6, :6] + covariance
+        gain = np.linalg.solve(s, p[:6]).T
+        reduced = p - gain @ p[:6]
+        return self.moved(gain @ innovation, 0.5 * (reduced + reduced.T))
+
+
+def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: MotionModelSettings) -> Array:
+    """Fixed-interval smoothing of measured poses; gaps longer than `MAX_GAP_S` are not bridged.
+
+    Args:
+        stamps: Seconds ``[N]``, ascending.
+        T_cam_world: Measured poses ``[N, 4, 4]``.
+        covariances: Of `pose_covariance` ``[N, 6, 6]``.
+        settings: Accelerations.
+
+    Returns:
+        Smoothed world-to-camera poses ``[N, 4, 4]``.
+    """
+    out = np.array(T_cam_world)
+    cuts = np.flatnonzero(np.diff(stamps) > MAX_GAP_S) + 1
+    for rows in np.split(np.arange(len(stamps)), cuts):
+        if len(rows) > 2:
+            out[rows] = _smooth_part(stamps[rows], T_cam_world[rows], covariances[rows], settings)
+    return out
+
+
+def _smooth_part(stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings) -> Array:
+    state = MotionState.at(poses[0], covariances[0])
+    filtered, predicted, steps = [state], [state], np.diff(stamps)
+    for k in range(1, len(stamps)):
+        ahead = state.predicted(float(steps[k - 1]), settings)
+        state = ahead.updated(poses[k], covariances[k])
+        predicted.append(ahead)
+        filtered.append(state)
+    out = np.empty_like(poses)
+    out[-1] = state.T_cam_world
+    later = state
+    for k in range(len(stamps) - 2, -1, -1):
+        ahead = predicted[k + 1]
+        f = _transition(float(steps[k]))
+        gain = np.linalg.solve(ahead.covariance, f @ filtered[k].covariance).T
+        error = np.concatenate([ahead.difference(later.T_cam_world), later.speed - ahead.speed])
+        covariance = filtered[k].covariance + gain @ (later.covariance - ahead.covariance) @ gain.T
+        later = filtered[k].moved(gain @ error, covariance)
+        out[k] = later.T_cam_world
+    return out
+
+
+class CameraMotion:
+    """The motion model while tracking; it knows nothing at the start and after a lost frame.
+
+    Args:
+        settings: Accelerations.
+
+    Attributes:
+        state: Filtered motion of the last tracked frame; None while nothing is known.
+        intervals: The latest intervals between tracked frames, seconds.
+    """
+
+    def __init__(self, settings: MotionModelSettings) -> None:
+        self._settings = settings
+        self._interval = FIRST_INTERVAL_S
+        self.state: MotionState | None = None
+        self.intervals: deque[float] = deque(maxlen=INTERVALS)
+
+    def forget(self) -> None:
+        """The camera was lost: nothing is known of its motion."""
+        self.state = None
+
+    def relocated(self, T_cam_world: Array) -> None:
+        """The same motion at another pose, as after bundle adjustment."""
+        if self.state is not None:
+            self.state = self.state.relocated(T_cam_world)
+
+    def transformed(self, T_cam_before: Array, T_cam_now: Array, scale: float) -> None:
+        """The same motion after a loop was closed.
+
+        Args:
+            T_cam_before: World-to-camera pose of a keyframe nearby as it was before.
+            T_cam_now: That pose now.
+            scale: What lengths around it were multiplied by.
+        """
+        if self.state is not None:
+            self.state = self.state.transformed(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], scale)
+
+    def regular(self, last: TrackedFrame, timestamp: float) -> float:
+        """The stamp, or where it is within `JITTER` of a regular one, the regular one."""
+        is_regular = abs(timestamp - last.timestamp - self._interval) <= JITTER * self._interval
+        return last.timestamp + self._interval if is_regular else timestamp
+
+    def predicted(self, last: TrackedFrame, timestamp: float) -> Array:
+        """World-to-camera pose at a time; that of the last tracked frame where nothing is known of the gap."""
+        dt = timestamp - last.timestamp
+        if self.state is None or not 0 < dt <= MAX_GAP_S:
+            return last.T_cam_world
+        return self.state.predicted(dt, self._settings).T_cam_world
+
+    def covariance(self, last: TrackedFrame, timestamp: float) -> Array | None:
+        """How far the motion since the last frame may be from the predicted one (`MotionState.motion_covariance`)."""
+        dt = timestamp - last.timestamp
+        if self.state is None or not 0 < dt <= MAX_GAP_S:
+            return None
+        return self.state.motion_covariance(dt, self._settings)
+
+    def filtered(self, last: TrackedFrame, timestamp: float, measured: Array, information: Array) -> Array:
+        """Weigh the image's pose against the motion model, and remember the motion.
+
+        Args:
+            last: The last tracked frame.
+            timestamp: The stamp of the new one, seconds.
+            measured: Its world-to-camera pose by the image.
+            information: Gauss-Newton matrix of that pose.
+
+        Returns:
+            World-to-camera pose; the measured one where nothing is known of the gap.
+        """
+        covariance = pose_covariance(measured, information)
+        dt = timestamp - last.timestamp
+        if self.state is None or not 0 < dt <= MAX_GAP_S:
+            self.state = MotionState.at(measured, covariance)
+            return measured
+        self._interval = dt
+        self.intervals.append(dt)
+        self.state = self.state.predicted(dt, self._settings).updated(measured, covariance)
+        return self.state.T_cam_world

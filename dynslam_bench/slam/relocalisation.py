@@ -1,0 +1,398 @@
+"""The initial pose of a frame: from the last frame, else from keyframes, within what the camera can have moved.
+
+Buildings repeat themselves: the next door looks like the last one, and the local map there agrees. The relocalisation
+gate tells such places apart: a camera covers a limited distance in the time, and the images since the last tracked
+frame tell how far it has rotated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.features.matching import match_brute_force
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.atlas import Atlas
+from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.place_recognition import (
+    MAX_DISTANCE,
+    RATIO,
+    PnpPose,
+    is_aliased,
+    pnp_poses,
+    pose_uncertainty,
+    top_candidates,
+    verify_place,
+)
+from dynslam_bench.slam.pose_optimisation import PoseEstimate
+from dynslam_bench.slam.settings import BackendSettings
+from dynslam_bench.slam.tracking import CLOSE_BASELINES, Matches, TrackedFrame, match_last_frame, solve
+
+Array = NDArray[np.float64]
+Slots = NDArray[np.int64]
+
+ENOUGH_MAPPED = 100
+"""So many matches with map points of the last frame make points from its depth alone unnecessary."""
+ENOUGH_MATCHES = 20
+"""Matches with the last frame that make a second, wider search unnecessary (ORB-SLAM2's number)."""
+MIN_MATCHES = 10
+"""Inliers that a pose needs at least to be a candidate."""
+WIDEN = 2.5
+"""Factor on the search window where the narrow one gave no trusted pose."""
+TRUSTED_INLIERS = 50
+TRUSTED_SHARE = 0.5
+"""Inliers, and their share of the matches, that make a pose from the last frame trusted by itself."""
+CANDIDATES = 10
+"""Best-ranked keyframes that are matched feature by feature; bounds the time of a frame."""
+MANY_POINTS = 60
+MANY_POINTS_SHARE = 0.75
+"""With so many matches at a place this factor of the required share suffices (`docs/backend.md`)."""
+
+SLACK_M = 0.5
+"""Distance that the camera may have moved in no time, metres."""
+KIDNAP_POINTS = 60
+"""A frame that shows so many map points, as many as a map begins with, followed by one that shows none of them and is
+not connected with it: the camera was kidnapped."""
+CONNECTED = 20
+CONNECTED_SHARE = 0.4
+"""Matches that fit one homography, and their share of all, that connect two images."""
+HOMOGRAPHY_PX = 4.0
+"""Largest error of these matches, pixels."""
+ROTATION_SLACK = np.radians(20.0)
+ROTATION_SLACK_SHARE = 0.75
+"""Largest error of the rotation: an angle, and a share of all rotations between images. A camera that moves sideways
+seems to rotate. On four rendered laps none of 4,000 sections of 3 to 30 steps exceeded the share and half the angle."""
+
+
+# ---------------------------------------------------------------------- the relocalisation gate
+
+
+@dataclass(frozen=True, eq=False)
+class RotationEstimate:
+    """The rotation since the last tracked frame, by images alone.
+
+    Attributes:
+        observations: Features of the newest image.
+        R_now_last: From the camera's axes in the last tracked frame to those of now, ``[3, 3]``.
+        apparent: Sum of the rotations between consecutive images, radians.
+    """
+
+    observations: Observations
+    R_now_last: Array
+    apparent: float = 0.0
+
+    def advanced(self, observations: Observations, camera: Camera) -> RotationEstimate | None:
+        """The rotation up to the next image; None where that is not connected with the one before.
+
+        Args:
+            observations: Its features.
+            camera: Intrinsics without distortion.
+        """
+        before, now, _ = match_brute_force(
+            self.observations.words, observations.words, max_distance=MAX_DISTANCE, ratio=RATIO
+        )
+        if len(before) < CONNECTED:
+            return None
+        xy_before, xy_now = self.observations.xy[before], observations.xy[now]
+        homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
+        fits = np.zeros(len(before), bool) if homography is None else mask.ravel() > 0
+        if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(before)):
+            return None
+        step, _ = Rotation.align_vectors(_bearings(xy_now[fits], camera), _bearings(xy_before[fits], camera))
+        return RotationEstimate(
+            observations, step.as_matrix() @ self.R_now_last, self.apparent + float(step.magnitude())
+        )
+
+    @property
+    def slack(self) -> float:
+        """Largest error of the rotation, radians."""
+        return float(ROTATION_SLACK + ROTATION_SLACK_SHARE * self.apparent)
+
+    def applied(self, T_last_world: Array) -> Array:
+        """The world-to-camera pose ``[4, 4]`` of the last tracked frame, rotated about its centre."""
+        pose = T_last_world.copy()
+        pose[:3] = self.R_now_last @ T_last_world[:3]
+        return pose
+
+    def allows(self, T_last_world: Array, T_now_world: Array, more: float = 0.0) -> bool:
+        """Whether the rotation between two poses agrees with the images.
+
+        Args:
+            T_last_world: World-to-camera pose ``[4, 4]`` in the last tracked frame.
+            T_now_world: That of now.
+            more: How far the two worlds may be rotated against each other, radians.
+        """
+        off = se3.rotation_angle(T_now_world @ se3.inverse(self.applied(T_last_world)))
+        return bool(off <= self.slack + more)
+
+
+def _bearings(xy: Array, camera: Camera) -> Array:
+    rays = camera.unproject(xy, np.ones(len(xy)))
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBound:
+    """Where the camera can be.
+
+    Attributes:
+        atlas: Where the submaps may lie; the camera was tracked last in the active one.
+        T_last_world: World-to-camera pose ``[4, 4]`` in the last tracked frame.
+        distance_m: How far it may have moved since.
+        rotation: How it has rotated since; None if that is unknown.
+    """
+
+    atlas: Atlas
+    T_last_world: Array
+    distance_m: float
+    rotation: RotationEstimate | None
+
+    def admits(self, submap: int, T_cam_world: Array) -> bool:
+        """Whether the camera can be at a world-to-camera pose in a submap."""
+        slack = self.atlas.slack(self.atlas.active, submap)
+        if self.rotation is not None and not self.rotation.allows(self.T_last_world, T_cam_world, slack):
+            return False
+        last, now = (se3.inverse(pose)[:3, 3] for pose in (self.T_last_world, T_cam_world))
+        return self.atlas.reachable(self.atlas.active, submap, last, now, self.distance_m)
+
+
+class RelocalisationGate:
+    """Bounds distance and rotation since the last tracked frame.
+
+    Args:
+        atlas: Where the submaps may lie.
+        max_speed: Largest speed of the camera, metres a second.
+        anywhere: Whether the camera may be anywhere at first, as in a loaded map.
+
+    Attributes:
+        rotation: The rotation since then; None where the images are not connected.
+    """
+
+    def __init__(self, atlas: Atlas, max_speed: float, *, anywhere: bool = False) -> None:
+        self._atlas = atlas
+        self._max_speed = max_speed
+        self._kidnapped = anywhere
+        self.rotation: RotationEstimate | None = None
+
+    def lose(self, last: TrackedFrame, observations: Observations, *, textured: bool) -> None:
+        """The first frame that is not tracked any more.
+
+        Args:
+            last: The last tracked frame.
+            observations: The new one's features.
+            textured: Whether it shows more than a blank wall or a covered lens.
+        """
+        self.start(last)
+        self._advance(observations)
+        many_points = np.count_nonzero(last.point >= 0) >= KIDNAP_POINTS
+        self._kidnapped = self.rotation is None and textured and bool(many_points)
+
+    def start(self, last: TrackedFrame) -> None:
+        """The camera counts as lost from the next frame on; `last` is the last tracked one."""
+        self.rotation, self._kidnapped = RotationEstimate(last.observations, np.eye(3)), False
+
+    def while_lost(self, last: TrackedFrame, observations: Observations, timestamp: float) -> MotionBound:
+        """The bound for the next frame of a lost camera; has to be called for every one of them."""
+        self._advance(observations)
+        return MotionBound(self._atlas, last.T_cam_world, self.distance_m(last, timestamp), self.rotation)
+
+    def while_tracked(
+        self, last: TrackedFrame, observations: Observations, timestamp: float, prediction: Array
+    ) -> MotionBound:
+        """The bound for the frame after a tracked one.
+
+        A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera `prediction`.
+        """
+        rotation = RotationEstimate(last.observations, np.eye(3)).advanced(observations, self._atlas.world.camera)
+        centres = [se3.inverse(pose)[:3, 3] for pose in (last.T_cam_world, prediction)]
+        step = float(np.linalg.norm(centres[1] - centres[0]))
+        return MotionBound(self._atlas, last.T_cam_world, step + self._distance(last, timestamp), rotation)
+
+    def _advance(self, observations: Observations) -> None:
+        if self.rotation is not None:
+            self.rotation = self.rotation.advanced(observations, self._atlas.world.camera)
+
+    @property
+    def slack(self) -> float:
+        """Largest error of the rotation, radians."""
+        return np.pi if self.rotation is None else self.rotation.slack
+
+    def rotated(self, last: TrackedFrame) -> Array:
+        """World-to-camera pose ``[4, 4]`` of a camera that has rotated but has not moved."""
+        return last.T_cam_world if self.rotation is None else self.rotation.applied(last.T_cam_world)
+
+    def distance_m(self, last: TrackedFrame, timestamp: float) -> float:
+        """Largest distance until a time, metres; infinite for a kidnapped camera."""
+        return np.inf if self._kidnapped else self._distance(last, timestamp)
+
+    def _distance(self, last: TrackedFrame, timestamp: float) -> float:
+        return SLACK_M + self._max_speed * max(timestamp - last.timestamp, 0.0)
+
+
+# ---------------------------------------------------------------------- the initial pose
+
+
+@dataclass(frozen=True, eq=False)
+class InitialPose:
+    """A pose that enough matches agree on.
+
+    Attributes:
+        T_cam_world: World-to-camera pose.
+        matches: The matches that agree.
+        keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's reference.
+        relocalised: Whether it comes from a keyframe, or the camera was lost before.
+        share: Which share of the keyframe's points in view is seen; NaN if not verified.
+        uncertainty: `place_recognition.pose_uncertainty`; NaN if not verified.
+    """
+
+    T_cam_world: Array
+    matches: Matches
+    keyframe: int
+    relocalised: bool
+    share: float = np.nan
+    uncertainty: float = np.nan
+
+    @classmethod
+    def of(cls, matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool) -> InitialPose:
+        """The pose of an estimate, with the matches that are inliers."""
+        return cls(estimate.T_cam_world, matches.select(estimate.inliers), keyframe, relocalised)
+
+
+@dataclass(eq=False)
+class PoseSearch:
+    """The search for the initial pose of one frame; it reads the map and never changes it.
+
+    Attributes:
+        atlas: The maps.
+        observations: The frame's features.
+        last: The last tracked frame.
+        prediction: World-to-camera pose by the motion model.
+        reference: Slot of the keyframe that shares most points with the last tracked frame.
+        keyframes: Slots of the candidate keyframes.
+        lost: Whether the camera was lost since then; else it was tracked in the frame before.
+        bound: Gives the motion bound.
+        settings: Of the back end.
+        seed: Of the sequence's random draws.
+        frame: Index of the frame.
+    """
+
+    atlas: Atlas
+    observations: Observations
+    last: TrackedFrame
+    prediction: Array
+    reference: int
+    keyframes: Slots
+    lost: bool
+    bound: Callable[[], MotionBound]
+    settings: BackendSettings
+    seed: int
+    frame: int
+    _weak: tuple[Matches, PoseEstimate] | None = None
+
+    def from_last_frame(self) -> InitialPose | None:
+        """The pose from the last frame, if enough of its points agree and the camera was not lost."""
+        if self.lost:
+            self.bound()  # advances the rotation from image to image, whatever is recognised
+        self._weak, trusted = self._match_last_frame()
+        if self._weak is None or not trusted or self.lost:
+            return None
+        return InitialPose.of(*self._weak, self.reference, relocalised=False)
+
+    def relocalised(self) -> InitialPose | None:
+        """The pose from keyframes; called after `from_last_frame`.
+
+        A pose from the last frame that few matches agree on, as by chance after a gap or a sudden rotation, competes
+        with those of keyframes, and has to be within the motion bound. After a loss it counts only if the place is
+        verified.
+        """
+        weak = self._weak
+        if weak is not None and self.lost:
+            verified = self._verified(PnpPose(self.reference, *weak))
+            if verified is not None:
+                return verified
+        pose = self._relocalise(MIN_MATCHES if weak is None or self.lost else weak[1].count + 1)
+        if pose is None and weak is not None and not self.lost and self._within_bound(weak[1]):
+            return InitialPose.of(*weak, self.reference, relocalised=False)
+        return pose
+
+    def in_root_map(self) -> InitialPose | None:
+        """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
+        world = self.atlas.world
+        if self.lost or not world.kf_map[self.reference]:
+            return None
+        pose = replace(self, keyframes=world.submap(0), lost=True)._relocalise(MIN_MATCHES)
+        enough = self.settings.relocalisation.min_inliers
+        return pose if pose is not None and len(pose.matches) >= enough else None
+
+    def _match_last_frame(self) -> tuple[tuple[Matches, PoseEstimate] | None, bool]:
+        """The best pose from the last frame, and whether it is trusted; each search is wider than the one before."""
+        world, s = self.atlas.world, self.settings.tracking
+        close_m = CLOSE_BASELINES * world.camera.baseline_m
+        best: tuple[Matches, PoseEstimate] | None = None
+        for widen, depth_m, enough in (
+            (1.0, 0.0, ENOUGH_MAPPED),
+            (1.0, close_m, ENOUGH_MATCHES),
+            (WIDEN, close_m, ENOUGH_MATCHES),
+        ):
+            radius = widen * s.radius_px
+            matches = match_last_frame(
+                world, self.last, self.observations, self.prediction, radius, depth_m, s.max_distance
+            )
+            if len(matches) < enough:
+                continue
+            estimate = solve(world.camera, self.observations, matches, self.prediction, rounds=3)
+            if estimate.count >= MIN_MATCHES and (best is None or estimate.count > best[1].count):
+                best = matches, estimate
+            if best is not None and estimate.count >= max(TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)):
+                return best, True
+        return best, False
+
+    def _relocalise(self, min_inliers: int) -> InitialPose | None:
+        """A pose by descriptors: from the reference keyframe, else from the best-ranked candidates."""
+        world, rng = self.atlas.world, stream(self.seed, "relocalisation", self.frame)
+        least = self.settings.tracking.min_inliers
+        if not self.lost:
+            for candidate in pnp_poses(world, [self.reference], self.observations, rng, least):
+                if candidate.estimate.count >= min_inliers and self._within_bound(candidate.estimate):
+                    return InitialPose.of(candidate.matches, candidate.estimate, candidate.keyframe, relocalised=True)
+        keyframes = top_candidates(world, self.keyframes, self.observations, CANDIDATES)
+        for candidate in pnp_poses(world, keyframes, self.observations, rng, least):
+            if candidate.estimate.count >= min_inliers:
+                verified = self._verified(candidate)
+                if verified is not None:
+                    return verified
+        return None
+
+    def _verified(self, candidate: PnpPose) -> InitialPose | None:
+        """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
+        world, observations, s = self.atlas.world, self.observations, self.settings
+        submap, admits = int(world.kf_map[candidate.keyframe]), self.bound().admits
+        if not admits(submap, candidate.estimate.T_cam_world):
+            return None
+        inliers = candidate.matches.select(candidate.estimate.inliers)
+        place = verify_place(
+            world, candidate.keyframe, observations, inliers, candidate.estimate.T_cam_world, s.tracking
+        )
+        many = len(place.matches) >= MANY_POINTS
+        if place.share < (MANY_POINTS_SHARE if many else 1.0) * s.relocalisation.min_share:
+            return None
+        uncertainty = 0.0
+        if self.lost:
+            uncertainty = pose_uncertainty(world, observations, place, stream(self.seed, "halves", self.frame))
+            hypotheses = {submap: place.hypothesis}
+            if uncertainty > 1 or is_aliased(
+                world, observations, hypotheses, self.keyframes, s.tracking, self.seed, admits
+            ):
+                return None
+        return InitialPose(place.T_cam_world, place.matches, candidate.keyframe, True, place.share, uncertainty)
+
+    def _within_bound(self, estimate: PoseEstimate) -> bool:
+        """Whether the camera can be at a pose in the map where it was tracked last."""
+        return self.bound().admits(self.atlas.active, estimate.T_cam_world)

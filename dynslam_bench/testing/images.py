@@ -1,0 +1,329 @@
+"""Conformance of what is done to an image: feature extractors, optical flows and segmenters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
+from dynslam_bench.contracts.flow import FlowEstimator, FlowResult, stats_names_of
+from dynslam_bench.contracts.segmenter import Instances, Segmenter
+from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.geometry.camera import inside
+from dynslam_bench.testing.report import (
+    ConformanceReport,
+    NotApplicable,
+    require,
+    require_arrays,
+    require_methods,
+    require_unchanged,
+)
+from dynslam_bench.testing.scenes import CornerSequence, grey, hard_frames
+
+Image = NDArray[np.uint8]
+SHIFT_PX = (3, -2)
+"""The shift of the flow's accuracy check: small, so that any flow finds it, and not zero."""
+
+
+def check_features(construct: Callable[[], FeatureExtractor], *, descriptor_bytes: int | None = None) -> None:
+    """Check that a feature extractor keeps its contract.
+
+    Args:
+        construct: Builds an extractor.
+        descriptor_bytes: The length of a descriptor in its spec; None without a spec.
+
+    Raises:
+        ConformanceError: Names every failed check, the fault and the likely cause.
+    """
+    features_report(construct, descriptor_bytes=descriptor_bytes).raise_for_failures()
+
+
+def features_report(
+    construct: Callable[[], FeatureExtractor], *, descriptor_bytes: int | None = None
+) -> ConformanceReport:
+    """Run all checks of `check_features` and report each."""
+    scene = CornerSequence(2)
+    image, other = grey(scene[0]), grey(scene[1])
+
+    def results(image: Image, least: int = 0) -> None:
+        keypoints = construct().extract(image.copy())
+        check_keypoints(keypoints, image.shape, descriptor_bytes)
+        require(len(keypoints) >= least, f"only {len(keypoints)} keypoints in a textured image")
+
+    report = ConformanceReport.of("extractor", construct)
+    if not report.run("construction", lambda: require_methods(construct(), "extract")):
+        return report
+    if not report.run("results", lambda: results(image, least=20)):
+        return report
+    report.run(
+        "images are left alone", lambda: require_unchanged(lambda: construct().extract(image), image, what="the image")
+    )
+    report.run("determinism", lambda: _extractor_determinism(construct, image, other))
+    report.run("beside a mask", lambda: _masked_extraction(construct(), image))
+    for name, frame in hard_frames(scene[0]).items():
+        report.run(f"{name} image", lambda frame=frame: results(grey(frame)))  # type: ignore[misc]
+    return report
+
+
+def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_bytes: int | None = None) -> None:
+    """Check the keypoints of one image.
+
+    Args:
+        keypoints: The extractor's result.
+        shape: Of the image, ``(H, W)``.
+        descriptor_bytes: The length that the spec states, if it is known.
+
+    Raises:
+        ConformanceError: Something in it breaks the contract.
+    """
+    require(isinstance(keypoints, Keypoints), f"extract() gave a {type(keypoints).__name__}, not Keypoints")
+    count, descriptors = len(keypoints.xy), keypoints.descriptors
+    scalar = (count,)
+    require_arrays(
+        keypoints,
+        {"xy": (np.float32, (count, 2)), "octave": (np.int32, scalar), "angle": (np.float32, scalar)}
+        | {"response": (np.float32, scalar)},
+    )
+    require(
+        descriptors.dtype == np.uint8 and descriptors.ndim == 2 and len(descriptors) == count,
+        f"descriptors are {descriptors.dtype} {descriptors.shape}, expected uint8 [{count}, bytes]",
+        "bits are packed: eight in a byte",
+    )
+    require(
+        descriptor_bytes is None or not count or descriptors.shape[1] == descriptor_bytes,
+        f"descriptors have {descriptors.shape[1]} bytes, the spec says {descriptor_bytes}",
+    )
+    require(np.isfinite(keypoints.xy).all(), "a keypoint is not finite")
+    outside = ((keypoints.xy < -0.5) | (keypoints.xy > np.array(shape[::-1]) - 0.5)).any(axis=1)
+    require(
+        not outside.any(),
+        f"{int(outside.sum())} of {count} keypoints lie outside the image",
+        "pixels of the full resolution, x first",
+    )
+    require((keypoints.octave >= 0).all(), "a pyramid level is negative")
+    degrees = (keypoints.angle >= 0) & (keypoints.angle < 360)
+    require(degrees.all(), "an angle lies outside [0, 360)", "degrees, not radians")
+
+
+def _extractor_determinism(construct: Callable[[], FeatureExtractor], image: Image, other: Image) -> None:
+    first, second = construct(), construct()
+    first.extract(other)  # an earlier image has no influence
+    a, b = first.extract(image), second.extract(image)
+    require(
+        np.array_equal(a.xy, b.xy) and np.array_equal(a.descriptors, b.descriptors),
+        "the same image gives other keypoints",
+        "unseeded randomness, or state that outlives an image",
+    )
+
+
+def _masked_extraction(extractor: FeatureExtractor, image: Image) -> None:
+    if not isinstance(extractor, MaskedExtractor):
+        raise NotApplicable("it has no extract_masked(): features on people take the place of others")
+    mask = np.zeros(image.shape, bool)
+    mask[:, : image.shape[1] * 3 // 4] = True
+    masked, plain = extractor.extract_masked(image, mask, 1.0), extractor.extract(image)
+    check_keypoints(masked, image.shape)
+    more, fewer = (int((~inside(mask, keypoints.xy)).sum()) for keypoints in (masked, plain))
+    require(more >= fewer, f"{more} keypoints beside the mask, {fewer} without asking for any")
+
+
+def check_flow(construct: Callable[[], FlowEstimator], *, points: int = 200) -> None:
+    """Check that an optical flow keeps its contract.
+
+    Args:
+        construct: Builds a flow.
+        points: How many points are tracked.
+
+    Raises:
+        ConformanceError: Names every failed check, the fault and the likely cause.
+    """
+    flow_report(construct, points=points).raise_for_failures()
+
+
+def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) -> ConformanceReport:
+    """Run all checks of `check_flow` and report each."""
+    scene = CornerSequence(2)
+    first, second = grey(scene[0]), grey(scene[1])
+    grid = _grid(first.shape, points)
+
+    def results(target: Image, points: NDArray[np.float32], guess: NDArray[np.float32] | None = None) -> FlowResult:
+        flow = construct()
+        result = flow.track(flow.prepare(first.copy()), flow.prepare(target.copy()), points.copy(), guess=guess)
+        check_flow_result(result, points, stats_names_of(flow))
+        return result
+
+    def left_alone() -> None:
+        flow = construct()
+        reference, target = first.copy(), second.copy()
+        require_unchanged(
+            lambda: flow.track(flow.prepare(reference), flow.prepare(target), grid),
+            reference, target, grid, what="an image, or the points,",
+        )  # fmt: skip
+
+    def outside() -> None:
+        strange = np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)
+        result = results(second, np.concatenate([grid, strange]))
+        require(not result.valid[-3:].any(), "a point outside the reference image is valid in the target")
+
+    guess = grid.copy()
+    guess[::2] = np.nan
+    report = ConformanceReport.of("flow", construct)
+    if not report.run("construction", lambda: require_methods(construct(), "prepare", "track")):
+        return report
+    if not report.run("results", lambda: results(second, grid)):
+        return report
+    report.run("images are left alone", left_alone)
+    report.run("no points", lambda: results(second, grid[:0]))
+    report.run("points outside", outside)
+    report.run("guesses", lambda: results(second, grid, guess))
+    report.run("determinism", lambda: _flow_determinism(construct, first, second, grid))
+    report.run("a small shift is found", lambda: _flow_finds_shift(results, first, grid))
+    for name, frame in hard_frames(scene[0]).items():
+        report.run(f"{name} image", lambda frame=frame: results(grey(frame), grid))  # type: ignore[misc]
+    return report
+
+
+def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tuple[str, ...] = ()) -> None:
+    """Check the result of a flow.
+
+    Args:
+        result: What ``track`` returned.
+        points: float32 ``[N, 2]``, the points in the reference image.
+        names: The stats that the flow declares.
+
+    Raises:
+        ConformanceError: Something in it breaks the contract.
+    """
+    count = len(points)
+    require(isinstance(result, FlowResult), f"track() gave a {type(result).__name__}, not a FlowResult")
+    expected = {"xy": (np.float32, (count, 2)), "valid": (np.bool_, (count,)), "cost": (np.float32, (count,))}
+    require_arrays(result, expected, cause="one row a point, in the order of the points")
+    require(np.isfinite(result.xy[result.valid]).all(), "a valid row is not finite", "mark it as not valid")
+    require(not np.isnan(result.cost[result.valid]).any(), "a valid row has no cost")
+    missing = [name for name in names if name not in result.stats]
+    require(not missing, f"stats lack {missing}", "stats_names declares them")
+
+
+def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
+    across = max(2, int(np.sqrt(points * shape[1] / shape[0])))
+    x, y = np.meshgrid(np.linspace(40, shape[1] - 41, across), np.linspace(40, shape[0] - 41, max(2, points // across)))
+    return np.stack([x, y], -1).reshape(-1, 2).astype(np.float32)
+
+
+def _flow_determinism(
+    construct: Callable[[], FlowEstimator], first: Image, second: Image, points: NDArray[np.float32]
+) -> None:
+    results = []
+    for flow in (construct(), construct()):
+        results.append(flow.track(flow.prepare(first), flow.prepare(second), points, seed=7))
+    a, b = results
+    same = np.array_equal(a.valid, b.valid) and np.array_equal(a.xy[a.valid], b.xy[b.valid])
+    require(same, "the same images and seed give another flow", "unseeded randomness, or state that outlives an image")
+
+
+def _flow_finds_shift(results: Callable[..., FlowResult], image: Image, points: NDArray[np.float32]) -> None:
+    matrix = np.array([[1, 0, SHIFT_PX[0]], [0, 1, SHIFT_PX[1]]], np.float64)
+    target = cv2.warpAffine(image, matrix, image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+    result = results(np.asarray(target, np.uint8), points)
+    share = float(result.valid.mean())
+    require(share > 0.2, f"only {100 * share:.0f} % of the points are found after a shift of {SHIFT_PX} pixels")
+    errors = np.linalg.norm(result.xy - points - np.array(SHIFT_PX, np.float32), axis=1)
+    error = float(np.median(errors[result.valid]))
+    require(
+        error < 1.0,
+        f"after a shift of {SHIFT_PX} pixels the median error of the valid points is {error:.1f} px",
+        "xy are positions in the target, x first, not displacements",
+    )
+
+
+def check_segmenter(construct: Callable[[], Segmenter], *, sequence: Sequence | None = None, frames: int = 2) -> None:
+    """Check that a segmenter keeps its contract.
+
+    Args:
+        construct: Builds a segmenter.
+        sequence: Whose frames to segment; the built-in scene by default.
+        frames: How many.
+
+    Raises:
+        ConformanceError: Names every failed check, the fault and the likely cause.
+    """
+    segmenter_report(construct, sequence=sequence, frames=frames).raise_for_failures()
+
+
+def segmenter_report(
+    construct: Callable[[], Segmenter], *, sequence: Sequence | None = None, frames: int = 2
+) -> ConformanceReport:
+    """Run all checks of `check_segmenter` and report each."""
+    scene = sequence if sequence is not None else CornerSequence(frames)
+    inputs = [scene[index] for index in range(min(frames, len(scene)))]
+
+    def results(frames: list[Frame]) -> None:
+        segmenter = construct()
+        for frame in frames:
+            check_instances(segmenter.segment(frame), frame)
+
+    def left_alone() -> None:
+        frame = inputs[0]
+        require_unchanged(lambda: construct().segment(frame), frame.rgb, frame.depth, what="the frame")
+
+    report = ConformanceReport.of("segmenter", construct)
+    if not report.run("construction", lambda: require_methods(construct(), "segment")):
+        return report
+    if not report.run("results", lambda: results(inputs)):
+        return report
+    report.run("frames are left alone", left_alone)
+    report.run("determinism", lambda: _segmenter_determinism(construct, inputs))
+    for name, frame in hard_frames(inputs[0]).items():
+        report.run(f"{name} frame", lambda frame=frame: results([frame]))  # type: ignore[misc]
+    return report
+
+
+def check_instances(instances: Instances, frame: Frame) -> None:
+    """Check the objects that a segmenter gave for one frame.
+
+    Raises:
+        ConformanceError: Something in it breaks the contract.
+    """
+    where = f"frame {frame.index}: "
+    require(
+        isinstance(instances, Instances),
+        f"{where}segment() gave a {type(instances).__name__}, not Instances",
+        "a frame without objects is Instances.empty(height, width)",
+    )
+    count = len(instances.class_names)
+    masks = {"masks": (np.bool_, (count, *frame.depth.shape))}
+    require_arrays(instances, masks, where, "masks have to be at the frame's resolution and thresholded")
+    require_arrays(instances, {"boxes": (np.float32, (count, 4)), "scores": (np.float32, (count,))}, where)
+    scores = (instances.scores >= 0) & (instances.scores <= 1)
+    require(scores.all(), f"{where}a score lies outside [0, 1]", "logits, not scores")
+    names = [isinstance(name, str) and bool(name) for name in instances.class_names]
+    require(all(names), f"{where}a class has no name")
+    require(np.isfinite(instances.boxes).all(), f"{where}a box is not finite")
+    ordered = instances.boxes[:, :2] <= instances.boxes[:, 2:]
+    require(ordered.all(), f"{where}a box ends before it begins", "boxes are x0, y0, x1, y1, not x, y, w, h")
+    for mask, box, name in zip(instances.masks, instances.boxes, instances.class_names, strict=True):
+        rows, columns = np.nonzero(mask)
+        within = (columns >= box[0] - 1) & (columns <= box[2] + 1) & (rows >= box[1] - 1) & (rows <= box[3] + 1)
+        outside = 100 * (1 - float(within.mean())) if len(rows) else 0.0
+        require(
+            outside < 10,
+            f"{where}{outside:.0f} % of the mask of a {name} lie outside its box",
+            "boxes of another resolution, or y before x",
+        )
+    moving = instances.moving
+    require(moving is None or moving.shape == (count,), f"{where}moving does not fit the objects")
+
+
+def _segmenter_determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> None:
+    first, second = construct(), construct()
+    for frame in frames:
+        a, b = first.segment(frame), second.segment(frame)
+        same = np.array_equal(a.masks, b.masks) and np.array_equal(a.scores, b.scores)
+        require(
+            same and a.class_names == b.class_names,
+            f"frame {frame.index} gives other objects when it is segmented again",
+            "a network in training mode, or unseeded randomness",
+        )

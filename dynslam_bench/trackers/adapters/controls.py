@@ -1,0 +1,171 @@
+"""Controls, which measure little or nothing of the images, and the replay of a trajectory file."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory_files import read_tum
+from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
+
+MAX_CORNERS = 400
+MIN_INLIERS = 12
+REPROJECTION_PX = 2.0
+
+
+class NeverMove:
+    """The static-camera baseline: the identity pose on every frame.
+
+    Its error is the spread of the ground truth: a tracker that is not better gains nothing from the images.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Begin a new sequence; there is nothing to prepare."""
+
+    def track(self, frame: Frame) -> TrackResult:
+        """The identity pose, state ``ok``."""
+        return TrackResult(T_world_cam=np.eye(4), state="ok")
+
+
+class ConstantVelocity:
+    """The motion model of a SLAM system without its measurements.
+
+    The first `frames` frames are aligned to their predecessors (corners tracked by Lucas-Kanade, P3P with RANSAC on
+    their depth). The velocity is their mean twist: the last pose relative to the first over the time between. Every
+    later pose is extrapolated with it, by time stamp. Where a frame cannot be aligned, the velocity so far is kept,
+    zero at first.
+    """
+
+    def __init__(self, settings: ConstantVelocitySettings) -> None:
+        self.settings = settings
+        self._camera: Camera | None = None
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Begin a new sequence; nothing here is random."""
+        self._camera = camera
+        self._velocity: NDArray[np.float64] = np.zeros(6)
+        self._pose: NDArray[np.float64] = np.eye(4)
+        self._count = 0
+        self._previous: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
+
+    def track(self, frame: Frame) -> TrackResult:
+        """The measured pose of one of the first frames, the extrapolated one of any other; state ``ok`` throughout.
+
+        Raises:
+            TrackerError: `reset` was not called.
+        """
+        if self._camera is None:
+            raise TrackerError("constant-velocity was given a frame before reset()")
+        start = time.perf_counter()
+        if self._count == 0:
+            self._first_stamp = self._stamp = frame.timestamp
+        motion, inliers = None, 0
+        measured = self._count < self.settings.frames
+        if measured:
+            grey = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+            if self._previous is not None:
+                motion, inliers = relative_motion(self._camera, *self._previous, grey)
+            self._previous = grey, frame.depth
+        if motion is None:
+            motion = se3.exp(self._velocity * (frame.timestamp - self._stamp))
+        self._pose = self._pose @ motion
+        if measured and self._count:
+            self._velocity = se3.log(self._pose) / max(frame.timestamp - self._first_stamp, 1e-6)
+        self._stamp = frame.timestamp
+        self._count += 1
+        timings = {"tracking": time.perf_counter() - start}
+        return TrackResult(self._pose.copy(), "ok", {"inliers": float(inliers)}, timings)
+
+
+def relative_motion(
+    camera: Camera, grey_a: NDArray[np.uint8], depth_a: NDArray[np.float32], grey_b: NDArray[np.uint8]
+) -> tuple[NDArray[np.float64] | None, int]:
+    """Pose of camera b in the frame of camera a.
+
+    Args:
+        camera: Of both images.
+        grey_a: First image ``[H, W]``.
+        depth_a: Its depth ``[H, W]`` in metres, 0 where missing.
+        grey_b: Second image ``[H, W]``.
+
+    Returns:
+        ``T_a_b`` ``[4, 4]`` and the number of inliers; None and their number if fewer than 12 points agree.
+    """
+    detected: object = cv2.goodFeaturesToTrack(grey_a, MAX_CORNERS, 0.01, 8)  # None if there are none
+    corners = np.zeros((0, 2), np.float32) if detected is None else np.asarray(detected, np.float32).reshape(-1, 2)
+    height, width = depth_a.shape
+    column, row = np.rint(corners).astype(np.intp).T
+    depth = depth_a[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
+    corners, depth = corners[depth > 0], depth[depth > 0]
+    if len(corners) < MIN_INLIERS:
+        return None, 0
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(grey_a, grey_b, corners[:, None], corners[:, None].copy())
+    good = status.reshape(-1) == 1
+    if good.sum() < MIN_INLIERS:
+        return None, 0
+    points = camera.unproject(camera.undistort_points(corners[good]), depth[good])
+    pixels = camera.undistort_points(tracked.reshape(-1, 2)[good])
+    success, rotation, translation, agreeing = cv2.solvePnPRansac(
+        points,
+        pixels,
+        camera.matrix,
+        np.zeros(5),
+        iterationsCount=200,
+        reprojectionError=REPROJECTION_PX,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    inliers = 0 if agreeing is None else len(agreeing)
+    if not success or inliers < MIN_INLIERS:
+        return None, inliers
+    chosen = np.asarray(agreeing).reshape(-1)
+    rotation, translation = cv2.solvePnPRefineLM(
+        points[chosen], pixels[chosen], camera.matrix, np.zeros(5), rotation, translation
+    )
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3] = cv2.Rodrigues(rotation)[0]
+    T_b_a[:3, 3] = np.asarray(translation).reshape(3)
+    return (se3.inverse(T_b_a), inliers) if se3.is_pose(T_b_a) else (None, inliers)
+
+
+class Replay:
+    """A trajectory file as a tracker: each frame gets the pose with the nearest stamp.
+
+    A frame without a pose within the tolerance is lost; poses are not interpolated and keep the file's world frame.
+
+    Args:
+        settings: The file and the tolerance.
+
+    Raises:
+        TrajectoryError: The file is missing, damaged, or holds no pose.
+    """
+
+    def __init__(self, settings: ReplaySettings) -> None:
+        self.settings = settings
+        self._trajectory = read_tum(Path(settings.file).expanduser())
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Begin a new sequence; the poses depend on the frames' stamps only."""
+
+    def track(self, frame: Frame) -> TrackResult:
+        """The pose of the frame's stamp, ``ok``; or ``lost`` without a pose. Stats: ``stamp_gap_s`` to the nearest."""
+        stamps = self._trajectory.timestamps
+        at = int(np.searchsorted(stamps, frame.timestamp))
+        nearest = min((i for i in (at - 1, at) if 0 <= i < len(stamps)), key=lambda i: abs(stamps[i] - frame.timestamp))
+        gap = float(abs(stamps[nearest] - frame.timestamp))
+        stats = {"stamp_gap_s": gap}
+        if gap > self.settings.tolerance_s + 1e-9:  # rounding of the difference
+            return TrackResult(T_world_cam=None, state="lost", stats=stats)
+        return TrackResult(T_world_cam=self._trajectory.T_world_cam[nearest].copy(), state="ok", stats=stats)

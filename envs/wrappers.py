@@ -1,0 +1,418 @@
+"""Wrappers: timings, trajectories, sequences, small images, degraded and dropped frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, SupportsFloat
+
+import cv2
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.envs.spaces import MAX_DEPTH_M
+from dynslam_bench.geometry.trajectory_files import write_tum
+
+
+class SlamWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Base of the wrappers of a `SlamEnv`.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not.
+        **arguments: Those of the wrapper's constructor, for the environment's spec.
+
+    Raises:
+        SettingsError: It is another environment.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], **arguments: Any) -> None:
+        RecordConstructorArgs.__init__(self, **arguments)
+        gym.Wrapper.__init__(self, env)
+        if not isinstance(env.unwrapped, SlamEnv):
+            raise SettingsError(f"{type(self).__name__} wraps a SlamEnv, not a {type(env.unwrapped).__name__}")
+        self._base = env.unwrapped
+
+
+class RecordTimings(SlamWrapper):
+    """Adds ``info["timings"]``: seconds of the frame by stage (see `FrameOutcome.timings`).
+
+    Times differ from run to run, so an environment with this wrapper is not deterministic in its ``info``.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not.
+    """
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset, with the times of frame 0 in ``info``."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, info | {"timings": self._last()}
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step, with the frame's times in ``info``."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, info | {"timings": self._last()}
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
+        frames = [frame for frame in self._base.timings if frame]
+        stages = dict.fromkeys(stage for frame in frames for stage in frame)
+        series = {stage: [frame.get(stage, 0.0) for frame in frames] for stage in stages}
+        return {
+            stage: {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
+            for stage, values in series.items()
+        }
+
+    def _last(self) -> dict[str, float]:
+        return {stage: float(seconds) for stage, seconds in self._base.episode.outcomes[-1].timings.items()}
+
+
+class RecordTrajectory(SlamWrapper):
+    """Writes the online trajectory of every episode that ends, in TUM's format.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not.
+        path: Target file; ``{episode}`` in its name becomes the episode's number, from 0. Without it, a later episode
+            replaces the file of an earlier one.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], path: str | Path) -> None:
+        super().__init__(env, path=str(path))
+        self._pattern = str(path)
+        self._episode = -1
+        self.written: list[Path] = []
+        """The files so far, in order."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        self._episode += 1
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step; the last step of an episode writes its file.
+
+        Raises:
+            DynslamError: The file cannot be written.
+        """
+        outcome = self.env.step(action)
+        if outcome[2] or outcome[3]:
+            path = Path(self._pattern.replace("{episode}", str(self._episode)))
+            comment = f"{self._base.tracker_spec.id} on {self._base.sequence.id}, online"
+            write_tum(path, self._base.online_trajectory(), comment=comment)
+            self.written.append(path)
+        return outcome
+
+
+class SequenceSampler(SlamWrapper):
+    """Begins every episode on another sequence of a list, for training agents and for evaluation.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not.
+        sequences: Ids or folders; with ``rgbd`` observations all must have the same image size.
+        mode: ``round_robin`` takes them in order; ``random`` draws from the wrapper's own generator, which a `reset`
+            with a seed seeds.
+
+    Raises:
+        SettingsError: No sequences, or an unknown mode.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        sequences: Sequence[str],
+        mode: Literal["round_robin", "random"] = "round_robin",
+    ) -> None:
+        super().__init__(env, sequences=list(sequences), mode=mode)
+        if not sequences:
+            raise SettingsError("SequenceSampler got no sequences")
+        if mode not in ("round_robin", "random"):
+            raise SettingsError(f"unknown mode '{mode}'", "known: round_robin, random")
+        self._sequences = tuple(sequences)
+        self._mode = mode
+        self._next = 0
+        self._rng = gym.utils.seeding.np_random(None)[0]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode on the next sequence; ``options["sequence"]`` wins over the sampler.
+
+        A seed also sets the sampler back: to the first sequence, or to the seed's first draw.
+        """
+        if seed is not None:
+            self._next = 0
+            self._rng = gym.utils.seeding.np_random(seed)[0]
+        chosen = self._draw()
+        options = {"sequence": chosen} | (options or {})
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, info | {"sequence": str(options["sequence"])}
+
+    def _draw(self) -> str:
+        if self._mode == "random":
+            return self._sequences[int(self._rng.integers(len(self._sequences)))]
+        chosen = self._sequences[self._next % len(self._sequences)]
+        self._next += 1
+        return chosen
+
+
+class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
+    """Makes ``rgbd`` observations small 8-bit images, colour and depth, as stable-baselines3 expects images.
+
+    ``rgb`` becomes uint8 ``[height, width, 3]``, averaged over the pixels that fall together; ``depth`` becomes uint8
+    ``[height, width, 1]``, the nearest pixel's, in steps of 20 m / 254: 0 is missing, 255 is 20 m or more. ``stats``
+    stays.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not, made with ``observation="rgbd"``.
+        width: Of the images, pixels; stable-baselines3's convolutions need 36 at least.
+        height: Likewise.
+
+    Raises:
+        SettingsError: The environment shows no images, or an image would have no pixels.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], width: int = 80, height: int = 60) -> None:
+        super().__init__(env, width=width, height=height)
+        space = env.observation_space
+        if not isinstance(space, spaces.Dict):
+            raise SettingsError("SmallImages needs images, the observation is 'stats'", 'use observation="rgbd"')
+        if min(width, height) < 1:
+            raise SettingsError(f"an image of {width} x {height} pixels has none")
+        self._size = (width, height)
+        images = {name: spaces.Box(0, 255, (height, width, depth), np.uint8) for name, depth in _CHANNELS.items()}
+        self.observation_space = spaces.Dict({**space.spaces, **images})
+
+    def observation(self, observation: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The observation with small images in place of its own."""
+        rgb = cv2.resize(observation["rgb"], self._size, interpolation=cv2.INTER_AREA)
+        depth = cv2.resize(observation["depth"], self._size, interpolation=cv2.INTER_NEAREST)
+        steps = np.where(depth > 0, 1 + np.rint(254 * (depth / MAX_DEPTH_M)), 0)
+        return {**observation, "rgb": rgb, "depth": steps.astype(np.uint8)[..., None]}
+
+
+_CHANNELS = {"rgb": 3, "depth": 1}
+
+
+class DegradeFrames(SlamWrapper):
+    """Adds seeded lighting changes, glare, shadow, motion blur and noise to every frame.
+
+    The degradation of a frame depends on the seed, the strengths and the frame's index only, so all trackers see the
+    same images. Strength 0 leaves the frame alone, 1 is the worst. Colour is degraded; depth only by `depth_noise`.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not.
+        lighting: Brightness and colour balance drift slowly and flicker: gain between 1 and ``1 - 0.75 * lighting``.
+        glare: A bright blob that wanders over the image and saturates it: up to ``0.45 * glare`` of the image's width.
+        shadow: A soft-edged half plane that sweeps over the image and darkens it to ``1 - 0.85 * shadow``.
+        blur: Linear motion blur of up to ``25 * blur`` pixels, in a direction that changes from frame to frame.
+        noise: Gaussian noise of standard deviation ``40 * noise`` grey levels.
+        depth_noise: Depth noise of standard deviation ``0.02 * depth_noise * z^2`` metres (z in metres), and a share
+            ``0.3 * depth_noise`` of the pixels loses its depth.
+        seed: Seed of the degradation, apart from the tracker's.
+
+    Raises:
+        SettingsError: A strength lies outside [0, 1].
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        *,
+        lighting: float = 0.0,
+        glare: float = 0.0,
+        shadow: float = 0.0,
+        blur: float = 0.0,
+        noise: float = 0.0,
+        depth_noise: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        strengths = {"lighting": lighting, "glare": glare, "shadow": shadow, "blur": blur, "noise": noise}
+        super().__init__(env, **strengths, depth_noise=depth_noise, seed=seed)
+        self.degradation = Degradation(**strengths, depth_noise=depth_noise, seed=seed)
+        self._base.frame_transforms.append(self.degradation)
+
+
+@dataclasses.dataclass(frozen=True)
+class Degradation:
+    """Degrades frames; see `DegradeFrames` for the meaning of the strengths in [0, 1]."""
+
+    lighting: float = 0.0
+    glare: float = 0.0
+    shadow: float = 0.0
+    blur: float = 0.0
+    noise: float = 0.0
+    depth_noise: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name != "seed" and not 0.0 <= value <= 1.0:
+                raise SettingsError(f"degradation '{field.name}' is {value}, expected a strength in [0, 1]")
+
+    def __call__(self, frame: Frame) -> Frame:
+        """The degraded copy of a frame."""
+        image = frame.rgb.astype(np.float32)
+        if self.lighting:
+            image *= self._gain(frame.index)
+        if self.shadow:
+            image *= self._shade(frame.index, *image.shape[:2])[..., None]
+        if self.glare:
+            image += self._blob(frame.index, *image.shape[:2])[..., None]
+        rng = stream(self.seed, "degrade", frame.index)
+        if self.blur:
+            kernel = _motion_kernel(25.0 * self.blur, rng)
+            image = np.asarray(cv2.filter2D(np.clip(image, 0, 255), -1, kernel), dtype=np.float32)
+        if self.noise:
+            image = image + rng.normal(0.0, 40.0 * self.noise, image.shape).astype(np.float32)
+        depth = self._noisy_depth(frame.depth, rng) if self.depth_noise else frame.depth
+        rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return dataclasses.replace(frame, rgb=rgb, depth=depth)
+
+    def _phase(self, name: str, count: int) -> NDArray[np.float64]:
+        return stream(self.seed, "degrade", name).uniform(0.0, 2.0 * math.pi, count)
+
+    def _gain(self, index: int) -> NDArray[np.float32]:
+        slow, colour, flicker = self._phase("lighting", 3)
+        level = 0.5 + 0.4 * math.sin(2 * math.pi * index / 90.0 + slow) + 0.1 * math.sin(1.9 * index + flicker)
+        tint = 0.1 * self.lighting * math.sin(2 * math.pi * index / 150.0 + colour)
+        gain = 1.0 - 0.75 * self.lighting * level
+        return np.array([gain * (1 + tint), gain, gain * (1 - tint)], np.float32)
+
+    def _shade(self, index: int, height: int, width: int) -> NDArray[np.float32]:
+        sweep, turn = self._phase("shadow", 2)
+        angle = turn + 2 * math.pi * index / 400.0
+        offset = 0.35 * math.sin(2 * math.pi * index / 120.0 + sweep) * width
+        y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+        side = (x - width / 2) * math.cos(angle) + (y - height / 2) * math.sin(angle) - offset
+        dark = 1.0 / (1.0 + np.exp(np.clip(-side / (0.02 * width), -30, 30)))
+        return np.asarray(1.0 - 0.85 * self.shadow * dark, dtype=np.float32)
+
+    def _blob(self, index: int, height: int, width: int) -> NDArray[np.float32]:
+        along, up, pulse = self._phase("glare", 3)
+        centre_x = width * (0.5 + 0.4 * math.sin(2 * math.pi * index / 140.0 + along))
+        centre_y = height * (0.5 + 0.35 * math.sin(2 * math.pi * index / 100.0 + up))
+        radius = 0.45 * self.glare * width * (0.75 + 0.25 * math.sin(2 * math.pi * index / 60.0 + pulse)) / 2
+        y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+        distance = ((x - centre_x) ** 2 + (y - centre_y) ** 2) / max(radius, 1.0) ** 2
+        return np.asarray(510.0 * np.exp(-distance), dtype=np.float32)
+
+    def _noisy_depth(self, depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+        noisy = depth + rng.normal(size=depth.shape) * (0.02 * self.depth_noise) * depth.astype(np.float64) ** 2
+        lost = (rng.random(depth.shape) < 0.3 * self.depth_noise) | (depth <= 0)
+        return np.where(lost, 0.0, np.maximum(noisy, 1e-3)).astype(np.float32)
+
+
+def _motion_kernel(length: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """A line of up to `length` pixels through the centre, in a random direction, that sums to 1."""
+    extent = length * rng.uniform(0.5, 1.0)
+    angle = rng.uniform(0.0, math.pi)
+    half = max(math.ceil(extent / 2), 1)
+    y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
+    along = x * math.cos(angle) + y * math.sin(angle)
+    across = np.abs(-x * math.sin(angle) + y * math.cos(angle))
+    kernel = np.clip(1.0 - across, 0.0, 1.0) * np.clip(extent / 2 + 0.5 - np.abs(along), 0.0, 1.0)
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)
+
+
+WARM_UP_FRAMES = 12
+"""Tracked off the clock: enough for keyframes and bundle adjustment, so every kernel and network has run once."""
+
+
+class DropFrames(SlamWrapper):
+    """Feeds the tracker only the frames that a live camera would have left it, or drops frames at random.
+
+    Real-time mode: frame i arrives at its stamp. When the tracker is done with a frame it takes the newest one that
+    has arrived, or waits for the next; those in between are dropped. They count as not tracked (coverage) and cost
+    what lost ones do, added to the reward of the step that dropped them. The last frame is never dropped. With
+    measured times the episode depends on the machine; `frame_time_s` makes it reproducible.
+
+    Compiling kernels and loading networks is no work of a frame: before the first measured episode the tracker tracks
+    the first `WARM_UP_FRAMES` frames off the clock and is reset.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not.
+        speed: Playback speed; 2 halves the time between frames.
+        frame_time_s: What the tracker's step counts as, seconds; None for the measured time.
+        share: In place of the real-time mode, drop each frame with this probability.
+        seed: Seed of the random drops.
+
+    Raises:
+        SettingsError: A value lies outside its range.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        *,
+        speed: float = 1.0,
+        frame_time_s: float | None = None,
+        share: float | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(env, speed=speed, frame_time_s=frame_time_s, share=share, seed=seed)
+        if not speed > 0:
+            raise SettingsError(f"speed is {speed}, expected a number > 0")
+        if frame_time_s is not None and not frame_time_s >= 0:
+            raise SettingsError(f"frame_time_s is {frame_time_s}, expected seconds >= 0")
+        if share is not None and not 0 <= share < 1:
+            raise SettingsError(f"share is {share}, expected a probability in [0, 1)")
+        self._speed, self._frame_time_s, self._share, self._seed = speed, frame_time_s, share, seed
+        self._free_at = 0.0
+        self._warm = share is not None or frame_time_s is not None
+
+    @property
+    def dropped(self) -> int:
+        """Frames dropped in this episode so far."""
+        return sum(outcome.state == "dropped" for outcome in self._base.episode.outcomes)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; the clock starts when frame 0 arrives, and the tracker is warm then."""
+        if not self._warm:
+            self._warm_up(options)
+            self._warm = True
+        outcome = self.env.reset(seed=seed, options=options)
+        self._free_at = self._arrivals()[0] + self._busy_s()
+        return outcome
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Drop what the tracker missed, then track the next frame."""
+        index = self._base.episode.next_index
+        target = self._next_frame(index)
+        charged = self._base.drop_frames(target - index)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._free_at = max(self._free_at, self._arrivals()[target]) + self._busy_s()
+        return observation, float(reward) + charged, terminated, truncated, info
+
+    def _warm_up(self, options: dict[str, Any] | None) -> None:
+        """Track the first frames; the environment's random numbers are afterwards where they were."""
+        base = self._base
+        numbers = base.np_random
+        base.reset(seed=0, options=options)
+        while not base.episode.over and base.episode.next_index < WARM_UP_FRAMES:
+            base.step(base.neutral_action)
+        base.np_random = numbers
+
+    def _next_frame(self, index: int) -> int:
+        last = len(self._base.sequence) - 1
+        if self._share is not None:
+            target = index
+            while target < last and stream(self._seed, "drop", target).random() < self._share:
+                target += 1
+            return target
+        newest = int(np.searchsorted(self._arrivals(), self._free_at, side="right")) - 1
+        return min(max(newest, index), last)
+
+    def _arrivals(self) -> Any:
+        return self._base.sequence.timestamps / self._speed
+
+    def _busy_s(self) -> float:
+        if self._frame_time_s is not None:
+            return self._frame_time_s
+        return float(self._base.episode.outcomes[-1].timings["total"])

@@ -1,1 +1,0 @@
-"""The report's figures as plotly-like specifications."""

@@ -1,0 +1,148 @@
+"""What the columns of a table are called: as short as tells them apart, parts always marked."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dynslam_bench.core.toml import label_text, setting_text
+from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
+
+
+def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
+    """A name for every column, no two alike.
+
+    Recordings that share a name are distinguished by the last parts of their folders' paths, then by camera, content
+    and frames: ``chess/seq-01`` and ``fire/seq-01``.
+
+    Returns:
+        Column id (see `RunRow.column_id`) to its name.
+    """
+    plainest = sorted(rows, key=lambda r: (r.sequence.noise is not None, r.offset, len(_name(r)), _name(r)))
+    columns = [of_column[0] for of_column in grouped(plainest, lambda row: row.column_id).values()]
+    names: dict[str, str] = {}
+    for name, group in grouped(columns, _name).items():
+        names |= _distinct(name, {row.column_id: row for row in group})
+    return names
+
+
+def shortened(names: Sequence[str]) -> dict[str, str]:
+    """Names without the folders, and without the options (``scene=...``, ``frames=...``), that all of them share.
+
+    The part of a sequence, `` [0:60]``, always stays.
+    """
+    if len(names) < 2:
+        return {name: name for name in names}
+    folders = [_split(name)[0].split("/")[:-1] for name in names]
+    shared = 0
+    while all(len(parts) > shared and parts[shared] == folders[0][shared] for parts in folders):
+        shared += 1
+    common = set[str].intersection(*(set(_split(name)[1]) for name in names))
+    short = {}
+    for name in names:
+        stem, options, part = _split(name)
+        kept = "&".join(option for option in options if option not in common)
+        short[name] = "/".join(stem.split("/")[shared:]) + (f"?{kept}" if kept else "") + part
+    return short if len(set(short.values())) == len(names) else {name: name for name in names}
+
+
+def _split(name: str) -> tuple[str, list[str], str]:
+    """Stem, the options behind the ``?``, and `` [part] (words)`` of a name."""
+    whole = min((name.partition(mark)[0] for mark in (" [", " (")), key=len)
+    stem, _, query = whole.partition("?")
+    return stem, query.split("&") if query else [], name[len(whole) :]
+
+
+def _name(row: RunRow) -> str:
+    """Sequence without its noise, and part of it."""
+    base, _, query = row.sequence.id.partition("?")
+    kept = "&".join(word for word in query.split("&") if word and not word.startswith("noise="))
+    return base + (f"?{kept}" if kept else "") + (f" [{row.frame_words}]" if row.frame_words else "")
+
+
+def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
+    """Names of columns that would all have one name."""
+    names = dict.fromkeys(group, name)
+    if len(group) == 1:
+        return names
+    places = {column: Path(row.place).parts for column, row in group.items()}
+    if all(places.values()):
+        for length in range(1, max(map(len, places.values())) + 1):
+            tails = {column: "/".join(parts[-length:]) for column, parts in places.items()}
+            if len(set(tails.values())) == len(set(places.values())):
+                part = _split(name)[2]
+                names = {column: tail + part for column, tail in tails.items()}
+                break
+    marks: tuple[Callable[[str, RunRow], str], ...] = (
+        lambda _, row: _camera_words(row),
+        lambda _, row: f"content {row.sequence.content[:6]}" if row.sequence.content else "",
+        lambda column, _: f"frames {column[:6]}",
+        lambda column, _: column,
+    )
+    for mark in marks:
+        words = {column: mark(column, row) for column, row in group.items()}
+        if len(set(names.values())) < len(names) and len(set(words.values())) > 1:
+            names = {column: f"{name} ({words[column]})" if words[column] else name for column, name in names.items()}
+    return names
+
+
+def _camera_words(row: RunRow) -> str:
+    """The camera in a few words, empty if the record does not name it."""
+    camera = row.identity.get("camera")
+    if not isinstance(camera, dict) or not {"width", "height", "fx", "fy"} <= camera.keys():
+        return ""
+    width, height, fx, fy = (
+        f"{value:g}" if isinstance(value, int | float) else str(value)
+        for value in (camera[name] for name in ("width", "height", "fx", "fy"))
+    )
+    return f"camera {width}x{height}, f {fx} {fy}"
+
+
+ALWAYS = ("map", "backend.map.localisation_only")
+"""Named in any table: a run that begins in a map knows more than one that begins without."""
+OF_ALL = {"device", "threads"}
+"""What every run has a value of, asked for or not."""
+
+
+def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
+    """A name for every variant: the tracker's label and what sets it apart from the tracker's other variants.
+
+    What one tracker alone was asked for is named though it has no other variant; what several were, as all that a suite
+    runs, is not.
+    Behind it stands `SEEN` if any of its runs had masks of a network that was trained on the scene.
+    """
+    in_training = {row.variant_key for row in rows if row.seen_in_training}
+    variants = {key: of_key[0] for key, of_key in grouped(rows, lambda row: row.variant_key).items()}
+    by_tracker = grouped(variants.values(), lambda row: row.tracker.id)
+    by_label = grouped(variants.values(), lambda row: row.label)
+    shown = {tracker: {*ALWAYS, *_differing(others)} for tracker, others in by_tracker.items()}
+    asked = {tracker: {name for row in others for name in row.variant} for tracker, others in by_tracker.items()}
+    for tracker, names in asked.items():  # what this tracker alone was asked for
+        shown[tracker] |= names.difference(OF_ALL, *(others for other, others in asked.items() if other != tracker))
+    texts = _short_texts(value for row in variants.values() for value in row.variant.values())
+    labels = {}
+    for key, row in variants.items():
+        tracker = row.tracker.id
+        settings = {name: value for name, value in sorted(row.variant.items()) if name in shown[tracker]}
+        parts = [f"{name}={texts[setting_text(value)]}" for name, value in settings.items()]
+        parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
+        if row.imported and not all(other.imported for other in by_tracker[tracker]):
+            parts.append("imported")
+        name = f"{row.label} <{tracker}>" if len({other.tracker.id for other in by_label[row.label]}) > 1 else row.label
+        labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
+    return labels
+
+
+def _short_texts(values: Iterable[Any]) -> dict[str, str]:
+    """Values as texts, each with its short form; whole where two values have the same short form."""
+    short = {text: label_text(text) for text in map(setting_text, values)}
+    counts = Counter(short.values())
+    return {text: label if counts[label] == 1 else text for text, label in short.items()}
+
+
+def _differing(variants: Sequence[RunRow]) -> list[str]:
+    """The settings that set the variants of one tracker apart."""
+    names = sorted({name for row in variants for name in row.variant})
+    return [name for name in names if len({str(row.variant.get(name)) for row in variants}) > 1]

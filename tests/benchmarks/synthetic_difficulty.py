@@ -1,0 +1,182 @@
+"""How hard rendered sequences are for a reference system: ORB-SLAM3, repeated, with controls.
+
+Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--controls moving none frozen masked persons]
+           [--runs 5] [--cache DIR] [--out FILE.jsonl] [--table]
+
+Each line of the output file is one run; a run that is in the file already is not repeated; the runs of one row go in
+step. `--table` only prints the Markdown table of the file. Controls: `none` renders the room without people, `frozen`
+with people and chairs frozen at their first pose, `masked` takes the moving sequence, removes the depth of people (and
+of everything while it moves) and fills their pixels smoothly from outside, so that no feature is left on them;
+`persons` does so with people alone, which is what a class label gives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.geometry.association import associate
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
+from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
+from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
+
+VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
+CONTROLS = ("moving", "none", "frozen", "masked", "persons")
+
+
+def without(frame: Frame, hidden: np.ndarray) -> Frame:
+    """The frame with the hidden pixels' depth removed and their colours filled from around them."""
+    grown = cv2.dilate(hidden.astype(np.uint8), np.ones((15, 15), np.uint8))
+    keep = (1 - grown).astype(np.float32)
+    rgb, weight = frame.rgb * keep[..., None], keep
+    small = (80, 60)
+    fill = cv2.resize(rgb, small, interpolation=cv2.INTER_AREA)
+    mass = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
+    total, amount = np.zeros_like(fill), np.full_like(mass, 1e-6)
+    for sigma, trust in ((2, 1.0), (6, 1e-2), (20, 1e-4)):
+        total += trust * cv2.GaussianBlur(fill, (0, 0), sigma)
+        amount += trust * cv2.GaussianBlur(mass, (0, 0), sigma)
+    smooth = cv2.resize(total / amount[..., None], frame.rgb.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    alpha = cv2.GaussianBlur(grown.astype(np.float32), (0, 0), 3)[..., None]
+    alpha = np.maximum(alpha, cv2.erode(grown, np.ones((9, 9), np.uint8))[..., None])
+    mixed = np.clip(frame.rgb * (1 - alpha) + smooth * alpha + 0.5, 0, 255).astype(np.uint8)
+    return Frame(frame.index, frame.timestamp, mixed, np.where(grown > 0, np.float32(0), frame.depth))
+
+
+def trajectory(poses: list[tuple[float, np.ndarray]]) -> Trajectory:
+    """Of stamps and camera-to-world poses; there may be none."""
+    return Trajectory(np.array([stamp for stamp, _ in poses]), np.reshape([pose for _, pose in poses], (-1, 4, 4)))
+
+
+def error(estimate: Trajectory, truth: Trajectory) -> float | None:
+    """RMSE of the positions at common stamps after the best rigid alignment, m; None for fewer than three poses."""
+    ours, theirs = associate(estimate.timestamps, truth.timestamps, 1e-4)
+    if len(ours) < 3:
+        return None
+    poses, expected = estimate.T_world_cam[ours], truth.T_world_cam[theirs]
+    offset = align(poses, expected, "se3").apply(poses)[:, :3, 3] - expected[:, :3, 3]
+    return round(float(np.sqrt((offset**2).sum(axis=1).mean())), 5)
+
+
+class SideBySide:
+    """Several runs of ORB-SLAM3: each frame is read once and given to one run after the other.
+
+    Args:
+        sequence: What its frames are of.
+        runs: The seed of each.
+        fps: Frames a second, where not all of the sequence's are given.
+    """
+
+    def __init__(self, sequence: SyntheticSequence, runs: list[int], fps: float) -> None:
+        settings = OrbSlam3Settings(vocabulary=str(VOCABULARY))
+        self.runs, self._truth = runs, sequence.ground_truth
+        self._trackers = [OrbSlam3(settings, TrackerContext(sequence_id=sequence.id, fps=fps)) for _ in runs]
+        for tracker, run in zip(self._trackers, runs, strict=True):
+            tracker.reset(sequence.camera, rng=np.random.default_rng(run))
+        self._online: list[list[tuple[float, np.ndarray]]] = [[] for _ in runs]
+        self._frames = 0
+
+    def track(self, frame: Frame) -> None:
+        """One frame for each."""
+        self._frames += 1
+        for online, tracker in zip(self._online, self._trackers, strict=True):
+            result = tracker.track(frame)
+            if result.T_world_cam is not None and result.state == "ok":
+                online.append((frame.timestamp, result.T_world_cam))
+
+    def results(self) -> list[dict[str, object]]:
+        """Of each run its number, the RMSE of the final and the online trajectory in metres, and the coverage."""
+        rows: list[dict[str, object]] = []
+        for run, online, tracker in zip(self.runs, self._online, self._trackers, strict=True):
+            try:
+                final = error(tracker.finalize(), self._truth)
+            except TrackerError:  # with no keyframe left it dies while it saves
+                final = None
+            tracker.close()
+            rows.append({
+                "run": run, "final": final, "online": error(trajectory(online), self._truth),
+                "coverage": round(len(online) / self._frames, 4),
+            })  # fmt: skip
+        return rows
+
+
+def settings_of(control: str) -> RenderSettings:
+    """The renderer's settings of a control."""
+    return RenderSettings(people=control if control in ("none", "frozen") else "moving")
+
+
+def measure(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str, object]]:
+    """Several runs of ORB-SLAM3 on one control of one sequence."""
+    sequence = open_synthetic(id, cache, settings=settings_of(control))
+    sequence.render()
+    together = SideBySide(sequence, runs, sequence.fps)
+    for index in range(len(sequence)):
+        frame = sequence[index]
+        if control in ("masked", "persons"):
+            masks = sequence.masks[index]
+            names = masks.class_names
+            ids = [k for k in names if names[k] == "person" or (control == "masked" and k in masks.moving)]
+            frame = without(frame, np.isin(masks.instances, ids))
+        together.track(frame)
+    truth = sequence.ground_truth
+    never = float(np.sqrt(((truth.positions - truth.positions.mean(0)) ** 2).sum(1).mean()))
+    about = {"id": id, "control": control, "digest": sequence.digest(), "frames": len(sequence)}
+    return [about | row | {"never": round(never, 4)} for row in together.results()]
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: one line an id and control, the final and online ATE of every run."""
+    lines = [
+        "| sequence | control | runs | without a trajectory | final ATE, m: min | median | max | online: median "
+        "| coverage | static camera |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for (id, control), runs in pd.DataFrame(rows).groupby(["id", "control"], sort=False):
+        final = runs["final"].astype(float)
+        lines.append(
+            f"| {id} | {control} | {len(runs)} | {final.isna().sum()} | {final.min():.4f} | {final.median():.4f} "
+            f"| {final.max():.4f} | {runs['online'].astype(float).median():.4f} | {runs['coverage'].min():.3f} "
+            f"| {runs['never'].iloc[0]:.3f} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ids", nargs="*", default=list(REPLICA_IDS))
+    parser.add_argument("--controls", nargs="+", default=list(CONTROLS[:4]), choices=CONTROLS)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_difficulty")
+    parser.add_argument("--out", type=Path, default=Path("synthetic_difficulty.jsonl"))
+    parser.add_argument("--table", action="store_true")
+    arguments = parser.parse_args()
+    rows = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
+    if not arguments.table:
+        for id in arguments.ids:
+            for control in arguments.controls:
+                digest = open_synthetic(id, None, settings=settings_of(control)).digest()
+                done = {r["run"] for r in rows if (r["id"], r["control"], r["digest"]) == (id, control, digest)}
+                todo = sorted(set(range(arguments.runs)) - done)
+                new = measure(id, control, todo, arguments.cache) if todo else []
+                rows += new
+                with arguments.out.open("a") as file:
+                    file.writelines(json.dumps(row) + "\n" for row in new)
+                print(*new, sep="\n", file=sys.stderr, flush=True)
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,6 +1,0 @@
-"""What an error of the command line looks like."""
-
-
-def one_line(err):
-    assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
-    return err

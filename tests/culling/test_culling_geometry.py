@@ -1,0 +1,231 @@
+"""Rules on motion and depth, and the geometry behind them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import ACROSS, CAMERA, ROTATION, SIDEWAYS, Scene, box_instance, keyframe, on_rectangle, scene
+
+from dynslam_bench.contracts.filter import FilterState
+from dynslam_bench.culling.correlation_graph import CorrelationFilter, depth_variance, point_covariance
+from dynslam_bench.culling.ego_motion import CORRELATION, coherent, depth_sigma, prior_information, refine_prediction
+from dynslam_bench.culling.epipolar import EpipolarFilter
+from dynslam_bench.culling.free_space import MAX_AGE_S, FreeSpaceFilter
+from dynslam_bench.culling.matches import Estimator, epipolar_distance, fundamental_matrix
+from dynslam_bench.culling.multiview_depth import refine_by_matches
+from dynslam_bench.culling.rigid_motion import RigidMotionFilter
+from dynslam_bench.culling.settings import (
+    CorrelationSettings,
+    EpipolarSettings,
+    FreeSpaceSettings,
+    RigidMotionSettings,
+)
+from dynslam_bench.geometry import se3
+
+FORWARD = se3.exp(np.array([0, 0, 0.05, 0, 0, 0]))
+
+
+def test_epipolar_culls_exactly_the_moving_points() -> None:
+    made, still = scene(SIDEWAYS, motion=ACROSS), scene(SIDEWAYS)
+    verdict = EpipolarFilter(EpipolarSettings(min_share=0.0)).apply(made.frame, made.state)
+    np.testing.assert_array_equal(verdict.keep, ~made.moving)
+    assert verdict.stats["degenerate"] == 0
+    assert EpipolarFilter(EpipolarSettings()).apply(still.frame, still.state).keep.all()
+
+
+@pytest.mark.parametrize("motion", [ROTATION, np.eye(4)], ids=["pure rotation", "static camera"])
+def test_epipolar_is_skipped_where_it_is_degenerate(motion: np.ndarray) -> None:
+    made = scene(motion, motion=ACROSS)
+    verdict = EpipolarFilter(EpipolarSettings()).apply(made.frame, made.state)
+    assert verdict.keep.all() and verdict.stats["degenerate"] == 1
+
+
+def test_epipolar_is_skipped_where_depth_contradicts_f() -> None:
+    """People who fill most of the image own the largest set of matches that agree on an F; the walls then fail it."""
+    motion = se3.exp(np.array([0.05, 0, 0.01, 0, 0.01, 0]))
+    made = scene(motion, n_static=120, n_moving=600, motion=np.array([0, 0.05, 0]))
+    settings = EpipolarSettings(min_share=0.0, homography_share=1.0)
+    fooled = EpipolarFilter(settings.model_copy(update={"max_contradiction": 1.0})).apply(made.frame, made.state)
+    assert (~fooled.keep[~made.moving]).mean() > 0.5, "the scene does fool the plain test"
+    verdict = EpipolarFilter(settings).apply(made.frame, made.state)
+    assert verdict.keep.all() and verdict.stats["degenerate"] == 1.0 and verdict.stats["contradiction"] > 0.5
+    made = scene(motion, motion=np.array([0, 0.1, 0]))
+    verdict = EpipolarFilter(settings).apply(made.frame, made.state)
+    assert (verdict.keep == ~made.moving).all() and verdict.stats["contradiction"] < 0.05
+
+
+@pytest.mark.parametrize("left", [200, 400])
+def test_epipolar_object_mode_drops_whole_objects_and_nothing_else(left: int) -> None:
+    made = scene(SIDEWAYS, motion=ACROSS)
+    rectangle = (left, 100, left + 131, 381)
+    made.frame.instances = box_instance(*rectangle)
+    keep = EpipolarFilter(EpipolarSettings(mode="object")).apply(made.frame, made.state).keep
+    moves = left == 200
+    np.testing.assert_array_equal(keep, ~(on_rectangle(made, *rectangle) & moves))
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "age_s", "violated"), [(4.5, 0.5, True), (4.5, MAX_AGE_S + 1, False), (0, 0.5, False)]
+)
+def test_free_space_culls_what_stands_where_a_recent_keyframe_measured_further(
+    depth_m: float, age_s: float, violated: bool
+) -> None:
+    made = scene(SIDEWAYS)
+    depth = np.full((CAMERA.height, CAMERA.width), depth_m, np.float32) if depth_m else made.state.previous.depth
+    view = keyframe(np.eye(4), depth, made.frame.timestamp - age_s)
+    state = FilterState(CAMERA, made.state.keep, T_world_pred=SIDEWAYS, keyframes=(view,))
+    keep = FreeSpaceFilter(FreeSpaceSettings(min_votes=1, min_share=0.0)).apply(made.frame, state).keep
+    assert keep[made.frame.z < 3.9].any() != violated and keep.all() != violated
+
+
+@pytest.mark.parametrize(
+    ("camera_motion", "motion"),
+    [(FORWARD, np.array([0, 0, -0.1])), (ROTATION, ACROSS), (np.eye(4), ACROSS)],
+    ids=["along epipolar lines", "rotation", "camera at rest"],
+)
+def test_rigid_motion_detects_what_the_epipolar_test_cannot(camera_motion: np.ndarray, motion: np.ndarray) -> None:
+    made, still = scene(camera_motion, motion=motion), scene(camera_motion)
+    rule = RigidMotionFilter(RigidMotionSettings(min_share=0.0))
+    np.testing.assert_array_equal(rule.apply(made.frame, made.state).keep, ~made.moving)
+    if (camera_motion == np.eye(4)).all():  # evidence is carried over: people who pause for a moment stay culled
+        paused = ~rule.apply(still.frame, still.state).keep
+        assert paused[still.moving].mean() > 3 * paused[~still.moving].mean()
+    rule.reset(CAMERA)
+    assert rule.apply(still.frame, still.state).keep.all()
+
+
+def far_wall_and_walker(n_static: int, n_moving: int) -> Scene:
+    """A camera at rest, a wall 3 m away, of one depth within the sensor's noise, and a person at 1 m with 1 m/s."""
+    made = scene(np.eye(4), n_static=n_static, n_moving=n_moving, seed=3)
+    rng = np.random.default_rng(3)
+    z = np.where(made.moving, rng.uniform(0.9, 1.1, len(made.frame)), rng.uniform(2.9, 3.1, len(made.frame)))
+    made.frame.z[:] = z
+    made.state.previous.depth[:] = 0.0  # the flow alone decides
+    before = CAMERA.unproject(made.frame.xy, z)
+    before[made.moving] -= (0.03, 0.0, 0.0)
+    made.state.flow.xy[:] = CAMERA.project(before) + rng.normal(0, 0.3, (len(z), 2))
+    return made
+
+
+CERTAIN = np.diag([2.5e-3**2] * 3 + [0.012**2] * 3)
+"""Covariance of the back end's motion model once it knows the camera's speed."""
+
+
+@pytest.mark.parametrize(("n_static", "n_moving", "covariance"), [(250, 120, None), (100, 600, CERTAIN)])
+def test_a_walker_before_a_far_wall_does_not_bias_the_camera(n_static: int, n_moving: int, covariance) -> None:  # type: ignore[no-untyped-def]
+    made = far_wall_and_walker(n_static, n_moving)
+    if covariance is not None:  # a moving majority biases the estimate unless the speed is known
+        assert np.linalg.norm(refine_prediction(made.frame, made.state)[:3, 3]) > 0.02
+    made.state.motion_covariance = covariance
+    made.state.T_world_pred = refine_prediction(made.frame, made.state)
+    assert np.linalg.norm(made.state.T_world_pred[:3, 3]) < 4e-3
+    keep = RigidMotionFilter(RigidMotionSettings()).apply(made.frame, made.state).keep
+    assert not keep[made.moving].any() and keep[~made.moving].mean() > 0.97
+
+
+def test_the_motion_model_does_not_hold_back_a_camera_that_accelerates() -> None:
+    jerk = se3.exp(np.array([0.004, -0.003, 0.002, 0.01, -0.02, 0.005]))
+    made = scene(jerk)
+    made.state.T_world_pred, made.state.motion_covariance = np.eye(4), CERTAIN
+    made.state.T_world_pred = refine_prediction(made.frame, made.state)
+    error = se3.inverse(jerk) @ made.state.T_world_pred
+    assert se3.rotation_angle(error) < 3e-3 < se3.rotation_angle(jerk) / 5
+    assert RigidMotionFilter(RigidMotionSettings()).apply(made.frame, made.state).keep.all()
+
+
+def test_ego_motion_resists_a_large_moving_object() -> None:
+    made = scene(SIDEWAYS, n_static=200, n_moving=180, motion=ACROSS)
+    made.state.T_world_pred = se3.exp(np.array([0.05, 0.02, 0.03, 0.01, -0.008, 0.005]))
+    error = se3.inverse(SIDEWAYS) @ refine_prediction(made.frame, made.state)
+    assert np.linalg.norm(error[:3, 3]) < 2e-3 and se3.rotation_angle(error) < 1e-3
+
+
+def test_descriptor_matches_refine_a_poor_prediction() -> None:
+    made = scene(SIDEWAYS, motion=ACROSS)
+    descriptors = np.random.default_rng(3).integers(0, 255, (len(made.frame), 32), dtype=np.uint8)
+    for frame in (made.frame, made.state.previous):
+        frame.keypoints = replace(frame.keypoints, descriptors=descriptors)
+    poor = SIDEWAYS @ se3.exp(np.array([0.01, -0.01, 0.01, 0.005, 0.005, 0.0]))
+    made.state.flow, made.state.T_world_pred, made.state.keep = None, poor, ~made.moving
+    errors = [se3.inverse(SIDEWAYS) @ pose for pose in (poor, refine_by_matches(made.frame, made.state))]
+    assert np.linalg.norm(errors[1][:3, 3]) < 0.2 * np.linalg.norm(errors[0][:3, 3])
+    made.state.keep = np.zeros(len(made.frame), bool)
+    np.testing.assert_array_equal(refine_by_matches(made.frame, made.state), poor)
+    made.state.previous = None
+    np.testing.assert_array_equal(refine_by_matches(made.frame, made.state), poor)
+
+
+def test_information_is_rotated_with_the_camera() -> None:
+    rotated = se3.exp(np.array([0, 0, 0, 0, np.pi / 2, 0]))
+    covariance = np.diag([1.0, 4.0, 9.0, 1.0, 1.0, 1.0])
+    state = FilterState(CAMERA, np.ones(0, bool), T_world_prev=rotated, motion_covariance=covariance)
+    information = prior_information(state, np.eye(4))
+    expected = CORRELATION / np.array([9.0, 4.0, 1.0])  # x and z of the world have changed places
+    np.testing.assert_allclose(np.diag(information)[:3], expected, rtol=1e-6)
+    assert information == pytest.approx(information.T)
+    assert prior_information(FilterState(CAMERA, np.ones(0, bool)), np.eye(4)) is None
+
+
+def test_epipolar_distance_agrees_with_the_definition() -> None:
+    rng = np.random.default_rng(0)
+    matrix, (first, second) = rng.normal(size=(3, 3)), rng.uniform(0, 600, (2, 20, 2))
+    expected = []
+    for (u1, v1), (u2, v2) in zip(first, second, strict=True):
+        x, y, w = matrix @ (u1, v1, 1)
+        expected.append(abs(x * u2 + y * v2 + w) / np.hypot(x, y))
+    np.testing.assert_allclose(epipolar_distance(matrix, first, second), expected, rtol=1e-12)
+
+
+def test_fundamental_matrix_is_that_of_the_true_motion() -> None:
+    made, clean = scene(SIDEWAYS, n_moving=0, noise_px=0.05), scene(SIDEWAYS, n_moving=0, noise_px=0.0, seed=5)
+    matrix = fundamental_matrix(made.state.flow.xy.astype(float), made.frame.xy, Estimator())
+    T_cur_prev, inverse = se3.inverse(SIDEWAYS), np.linalg.inv(CAMERA.matrix)
+    true = inverse.T @ se3.hat(T_cur_prev[:3, 3]) @ T_cur_prev[:3, :3] @ inverse
+    matches = clean.state.flow.xy.astype(float), clean.frame.xy
+    assert epipolar_distance(true, *matches).max() < 1e-3 and np.median(epipolar_distance(matrix, *matches)) < 0.1
+    assert fundamental_matrix(matches[0][:15], matches[1][:15], Estimator()) is None
+
+
+def test_a_region_that_fails_moves_and_a_lone_point_is_noise() -> None:
+    rng = np.random.default_rng(0)
+    xy, noise = rng.uniform((0, 0), (640, 480), (1000, 2)), rng.random(1000) < 0.05
+    away = np.abs(xy - (320, 240)).max(axis=1)
+    moving = coherent((away < 60) | noise, np.ones(1000, bool), xy, 0.4, (480, 640))
+    assert moving[away < 40].all() and moving[(away > 120) & noise].mean() < 0.05
+    np.testing.assert_array_equal(coherent(noise, np.ones(1000, bool), xy, 0.0, (480, 640)), noise)
+
+
+def test_correlation_separates_the_moving_body_of_known_and_of_new_keypoints() -> None:
+    rule = CorrelationFilter(CorrelationSettings(window=1, pixel_sigma=0.5))
+    for motion, missed in ((np.array([0.15, 0.1, 0.0]), False), (None, False), (np.array([0.15, 0.1, 0.0]), True)):
+        made = scene(SIDEWAYS, motion=motion)
+        before = made.state.previous
+        rows = np.flatnonzero(np.arange(len(before)) % (1 + missed) == 0)  # other points are detected only now
+        previous = replace(before, keypoints=before.keypoints.select(rows), xy=before.xy[rows], z=before.z[rows])
+        made.state.previous, made.state.previous_keep = previous, np.ones(len(rows), bool)
+        rule.reset(CAMERA)
+        rule.apply(previous, FilterState(CAMERA, np.ones(len(rows), bool), T_world_pred=np.eye(4)))
+        verdict = rule.apply(made.frame, made.state)
+        new = ~np.isin(np.arange(len(before)), rows) if missed else np.ones(len(before), bool)
+        share = (~verdict.keep)[made.moving & new].mean()
+        assert (~verdict.keep)[~made.moving & new].mean() < 0.05 and (
+            share > 0.9 if motion is not None else share < 0.02
+        )
+        assert verdict.stats["tracked"] > 0.9 * len(made.frame)
+
+
+def test_depth_edges_are_uncertain_and_covariance_is_that_of_the_unprojection() -> None:
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[:, 320:] = 3.0
+    flat, edge, far = depth_variance(depth, np.array([[100.0, 100], [319, 100], [500, 200]]))
+    sigma = depth_sigma(np.array([2.0, 3.0]))
+    np.testing.assert_allclose(sigma, 0.0012 + 0.0019 * np.array([1.6, 2.6]) ** 2)  # Nguyen et al. 2012
+    np.testing.assert_allclose([flat, far], sigma**2)
+    assert edge > 0.18  # a quarter of the weight lies one metre further
+    rng = np.random.default_rng(0)
+    xy, z = np.array([[500.0, 100.0]]), np.array([2.5])
+    covariance = point_covariance(xy, z, np.array([0.02**2]), CAMERA, 0.8)[0]
+    noisy = CAMERA.unproject(xy + rng.normal(0, 0.8, (200_000, 2)), z + rng.normal(0, 0.02, 200_000))
+    np.testing.assert_allclose(covariance, np.cov(noisy.T), atol=4e-6)

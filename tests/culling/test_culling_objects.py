@@ -1,0 +1,236 @@
+"""Rules on masks and boxes: each drops what moves or what its classes name, and nothing else."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scenes import (
+    ACROSS,
+    BOX,
+    CAMERA,
+    SEGMENTATION,
+    SIDEWAYS,
+    at_rest,
+    box_instance,
+    bundle,
+    moved_patch,
+    on_rectangle,
+    scene,
+)
+
+from dynslam_bench.contracts.filter import FilterState, FrameBundle
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.settings import build
+from dynslam_bench.culling.box_depth import BoxDepthFilter
+from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
+from dynslam_bench.culling.class_rule import ClassRuleFilter
+from dynslam_bench.culling.depth_blocks import DepthBlockFilter, covered_blocks
+from dynslam_bench.culling.depth_ransac import DepthRansacFilter
+from dynslam_bench.culling.moving_probability import ProbabilityFilter, expand
+from dynslam_bench.culling.moving_vote import MovingVoteFilter
+from dynslam_bench.culling.residual_clusters import ResidualFilter
+from dynslam_bench.culling.semantic import SemanticFilter
+from dynslam_bench.culling.settings import (
+    BoxDepthSettings,
+    BoxEpipolarSettings,
+    ClassRuleSettings,
+    DepthBlockSettings,
+    DepthRansacSettings,
+    MovingVoteSettings,
+    ProbabilitySettings,
+    ResidualSettings,
+    TemplateSettings,
+)
+from dynslam_bench.culling.template_matching import TemplateFilter
+
+PERSON = (220, 100, 330, 380)
+
+
+def test_semantic_drops_the_features_on_people_only() -> None:
+    made = scene(SIDEWAYS)
+    for name, dropped in (("person", on_rectangle(made, *BOX)), ("chair", np.zeros(len(made.frame), bool))):
+        made.frame.instances = box_instance(*BOX, name=name)
+        np.testing.assert_array_equal(SemanticFilter(SEGMENTATION).apply(made.frame, made.state).keep, ~dropped)
+
+
+def test_box_epipolar_has_a_limit_of_its_own_inside_boxes() -> None:
+    slow = np.array([0.0, 0.0022, 0.0])  # about 0.8 px at 1.5 m
+    made = scene(SIDEWAYS, motion=slow, noise_px=0.02)
+    made.frame.instances = box_instance(*BOX)
+    strict = BoxEpipolarFilter(BoxEpipolarSettings(inside_px=0.3, outside_px=50.0), SEGMENTATION)
+    keep = strict.apply(made.frame, made.state).keep
+    assert not keep[made.moving].any() and keep[~on_rectangle(made, *BOX)].all()
+    lenient = BoxEpipolarFilter(BoxEpipolarSettings(inside_px=3.0, outside_px=3.0), SEGMENTATION)
+    assert lenient.apply(made.frame, made.state).keep.all()
+
+
+def test_f_is_fitted_outside_the_previous_frame_s_boxes_where_sg_slam_does() -> None:
+    made = scene(SIDEWAYS, n_static=200, n_moving=250, motion=ACROSS)  # more moving points than static ones in the box
+    made.state.previous.instances = box_instance(180, 80, 350, 400)
+    made.frame.instances = box_instance(0, 0, 1, 1)
+    x, y = made.state.previous.keypoints.xy.T
+    outside = ~((x >= 180) & (x < 350) & (y >= 80) & (y < 400))
+    for fit, count in (("outside previous", np.count_nonzero(outside)), ("kept", len(made.frame))):
+        rule = BoxEpipolarFilter(BoxEpipolarSettings(inside_px=1.0, fit=fit), SEGMENTATION)
+        verdict = rule.apply(made.frame, made.state)
+        assert verdict.stats["matches"] == count
+        assert np.array_equal(verdict.keep, ~made.moving) == (fit == "outside previous")
+
+
+def test_class_rule_drops_people_and_only_those_movable_objects_that_move() -> None:
+    rule = ClassRuleFilter(ClassRuleSettings(), SEGMENTATION)
+    moving, still = scene(SIDEWAYS, motion=ACROSS), scene(SIDEWAYS)
+    for made in (moving, still):
+        made.frame.instances = box_instance(*BOX, name="chair")
+    keep = rule.apply(moving.frame, moving.state).keep
+    assert not keep[moving.moving].any() and keep[~on_rectangle(moving, *BOX)].all()
+    assert rule.apply(still.frame, still.state).keep.all()
+    still.frame.instances = box_instance(*BOX)
+    np.testing.assert_array_equal(rule.apply(still.frame, still.state).keep, ~on_rectangle(still, *BOX))
+
+
+def test_class_rule_fits_f_to_static_labelled_points_only() -> None:
+    made = scene(SIDEWAYS, n_static=160, n_moving=300, motion=ACROSS)
+    made.frame.instances = box_instance(*BOX, name="chair")
+    keep = ClassRuleFilter(ClassRuleSettings(), SEGMENTATION).apply(made.frame, made.state).keep
+    assert not keep[made.moving].any(), "a chair with most of the points does not become the reference"
+    only_tv = ClassRuleFilter(ClassRuleSettings(movable="tv"), SEGMENTATION).apply(made.frame, made.state)
+    assert only_tv.keep.all() and only_tv.stats["on_movable"] == 0
+    with pytest.raises(DynslamError, match="char"):
+        build(ClassRuleSettings, {"movable": "char"})
+
+
+def person_before_a_wall() -> tuple[FrameBundle, np.ndarray]:
+    rng = np.random.default_rng(1)
+    depth = np.full((480, 640), 3.0, np.float32)
+    depth[100:380, 220:330] = 1.5
+    depth[300:460, 400:520] = 2.2  # a cupboard
+    xy = rng.uniform((30, 30), (610, 450), (500, 2))
+    z = depth[np.rint(xy[:, 1]).astype(int), np.rint(xy[:, 0]).astype(int)]
+    return bundle(xy, z, depth, 1.0), z < 1.8
+
+
+def blocks(frame: FrameBundle):  # type: ignore[no-untyped-def]
+    return DepthBlockFilter(DepthBlockSettings(), SEGMENTATION).apply(frame, at_rest(frame))
+
+
+@pytest.mark.parametrize(("bottom", "whole"), [(240, True), (140, False)], ids=["half of the person", "a seventh"])
+def test_depth_blocks_complete_a_mask_that_covers_enough_of_the_person(bottom: int, whole: bool) -> None:
+    frame, on_person = person_before_a_wall()
+    frame.instances = box_instance(220, 100, 330, bottom)
+    x, y = frame.keypoints.xy.T
+    clear = (np.abs(x - 220) > 3) & (np.abs(x - 330) > 3) & (np.abs(y - 100) > 3) & (np.abs(y - 380) > 3)
+    dropped = on_person if whole else on_rectangle(frame, 220, 100, 330, bottom)
+    np.testing.assert_array_equal(blocks(frame).keep[clear], ~dropped[clear])
+    frame.instances = box_instance(220, 100, 330, 380, name="chair")
+    assert blocks(frame).keep.all()
+
+
+@pytest.mark.parametrize(("other", "touched"), [((330, 300, 380, 380), True), ((450, 100, 500, 200), False)])
+def test_depth_blocks_drop_what_a_person_touches(other: tuple[int, int, int, int], touched: bool) -> None:
+    frame, _ = person_before_a_wall()
+    person, chair = box_instance(*PERSON), box_instance(*other, name="chair")
+    masks, boxes_ = np.concatenate([person.masks, chair.masks]), np.concatenate([person.boxes, chair.boxes])
+    frame.instances = type(person)(masks, boxes_, ("person", "chair"), np.ones(2, np.float32))
+    verdict, on_other = blocks(frame), on_rectangle(frame, *other)
+    assert on_other.sum() > 3 and verdict.keep[on_other].all() != touched and verdict.stats["touched"] == touched
+
+
+def test_depth_beyond_the_limit_belongs_to_no_block() -> None:
+    depth, mask = np.full((40, 40), 7.0, np.float32), np.ones((40, 40), bool)
+    assert not covered_blocks(mask, depth, DepthBlockSettings())[0].any()
+    assert covered_blocks(mask, depth, DepthBlockSettings(max_depth_m=8.0))[0].all()
+    assert not covered_blocks(mask, np.full_like(depth, np.nan), DepthBlockSettings())[0].any()
+
+
+def test_box_depth_segments_the_person_in_the_box() -> None:
+    frame, on_person = person_before_a_wall()
+    frame.instances = box_instance(200, 80, 350, 400)
+    verdict = BoxDepthFilter(BoxDepthSettings(dilation_px=0), SEGMENTATION).apply(frame, at_rest(frame))
+    np.testing.assert_array_equal(verdict.keep, ~on_person)
+    frame.depth[:] = 0
+    assert BoxDepthFilter(BoxDepthSettings(), SEGMENTATION).apply(frame, at_rest(frame)).stats["ignored"] == 1
+
+
+def test_depth_ransac_drops_the_person_and_keeps_the_wall_behind() -> None:
+    rng = np.random.default_rng(1)
+    xy = rng.uniform((210, 110), (320, 370), (100, 2))
+    z = np.concatenate([rng.normal(1.5, 0.05, 70), rng.normal(4.0, 0.05, 30)])
+    frame = bundle(xy, z, np.ones((480, 640), np.float32), 1.0)
+    frame.instances = box_instance(*BOX)
+    rule = DepthRansacFilter(DepthRansacSettings(variance_m2=0.05), SEGMENTATION)
+    np.testing.assert_array_equal(rule.apply(frame, at_rest(frame)).keep, np.arange(100) >= 70)
+    frame.instances = box_instance(400, 100, 500, 200)
+    assert rule.apply(frame, at_rest(frame)).keep.all()
+
+
+def test_probability_rises_on_masks_and_follows_the_flow() -> None:
+    made = scene(SIDEWAYS)
+    rule = ProbabilityFilter(ProbabilitySettings(), SEGMENTATION)
+    made.state.previous.instances = box_instance(*BOX)
+    first = FilterState(camera=CAMERA, keep=made.state.keep)
+    was_on = on_rectangle(made.state.previous, *BOX)
+    np.testing.assert_array_equal(rule.apply(made.state.previous, first).keep, ~was_on)
+    made.frame.instances = None  # no segmentation on this frame
+    assert (rule.apply(made.frame, made.state).keep == ~was_on).mean() > 0.99
+    assert ProbabilityFilter(ProbabilitySettings(), SEGMENTATION).apply(made.frame, first).keep.all()
+
+
+def test_expansion_gives_new_features_a_share_of_near_certain_ones() -> None:
+    xy = np.array([[0.0, 0], [100, 0], [200, 0], [4, 0], [104, 0], [204, 0], [150, 0]])
+    probability = np.array([0.9, 0.1, 0.6, 0.5, 0.5, 0.5, 0.5])
+    expanded = expand(xy, probability, np.arange(7) < 3, 32.0)
+    influence = np.exp(-0.5 * (4 / 16) ** 2)
+    expected = [0.9, 0.1, 0.6, 0.5 + 0.4 * influence, 0.5 - 0.4 * influence, 0.5, 0.5]
+    np.testing.assert_allclose(expanded, expected)
+
+
+@pytest.mark.parametrize("shift", [0, 12])
+def test_moving_vote_drops_all_people_or_nobody(shift: int) -> None:
+    before, after = moved_patch(shift)
+    made = scene(np.eye(4))
+    made.frame.gray, made.state.previous.gray = np.roll(after, 3, axis=1), before  # the camera pans by 3 px
+    made.frame.instances = box_instance(*BOX)
+    verdict = MovingVoteFilter(MovingVoteSettings(threshold_px=1.0), SEGMENTATION).apply(made.frame, made.state)
+    np.testing.assert_array_equal(verdict.keep, ~(on_rectangle(made, *BOX) & bool(shift)))
+
+
+def test_moving_vote_tracks_the_corners_that_the_authors_code_chooses(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    previous = cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (640, 480), interpolation=cv2.INTER_CUBIC)
+    harris = cv2.goodFeaturesToTrack(
+        previous, 1000, 0.01, 8, mask=None, blockSize=3, gradientSize=3, useHarrisDetector=True, k=0.04
+    )
+    given: list[np.ndarray] = []
+    refine = cv2.cornerSubPix
+    monkeypatch.setattr(cv2, "cornerSubPix", lambda i, c, *rest: (given.append(c.copy()), refine(i, c, *rest))[1])
+    MovingVoteFilter(MovingVoteSettings(), SEGMENTATION)._moving_corners(previous, np.roll(previous, 3, 1), CAMERA)
+    np.testing.assert_array_equal(given[0], harris)
+
+
+def test_residual_clusters_find_the_part_that_the_camera_does_not_explain() -> None:
+    before, after = moved_patch(12)
+    xy = np.random.default_rng(4).uniform((30, 30), (610, 450), (300, 2))
+    depth = np.full((480, 640), 3.0, np.float32)
+    depth[BOX[1] : BOX[3], BOX[0] : BOX[2]] = 1.5
+    frame, previous = (bundle(xy, np.full(300, 2.0), depth, stamp) for stamp in (1.0, 0.9))
+    frame.gray, previous.gray, frame.instances = after, before, box_instance(*BOX)
+    rule, on = ResidualFilter(ResidualSettings(), SEGMENTATION), on_rectangle(frame, *BOX)
+    keep = rule.apply(frame, at_rest(frame, previous)).keep
+    assert keep[~on].mean() > 0.95 and keep[on].mean() < 0.05
+    frame.gray, frame.instances = before, None
+    assert rule.apply(frame, at_rest(frame, previous)).keep.all()
+
+
+@pytest.mark.parametrize("shift", [0, 12])
+def test_template_keeps_what_matches_where_the_camera_predicts_it(shift: int) -> None:
+    before, after = moved_patch(shift)
+    xy = np.random.default_rng(3).uniform((30, 30), (610, 450), (300, 2))
+    depth = np.full((480, 640), 2.0, np.float32)
+    frame, previous = (bundle(xy, np.full(300, 2.0), depth, stamp) for stamp in (1.0, 0.9))
+    frame.gray, previous.gray, frame.instances = after, before, box_instance(*BOX)
+    keep = TemplateFilter(TemplateSettings(), SEGMENTATION).apply(frame, at_rest(frame, previous)).keep
+    inner = on_rectangle(frame, BOX[0] + 8, BOX[1] + 8, BOX[2] - 8, BOX[3] - 8)  # no patch across the box's edge
+    assert keep[~on_rectangle(frame, *BOX)].all()
+    assert not keep[inner].any() if shift else keep.all()

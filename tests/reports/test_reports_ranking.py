@@ -1,0 +1,92 @@
+"""Who is ranked: systems that beat a static camera, real-time runs among themselves, monocular runs by scale."""
+
+import json
+
+import numpy as np
+import pytest
+from reports_fake_store import MACHINE, add_run
+from reports_rows import PROTOCOL, crashed, row
+
+from dynslam_bench.cli.reports import show_top
+from dynslam_bench.core.errors import ReportError
+from dynslam_bench.evaluation.protocol import MONOCULAR, get_protocol
+from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.reports.tables.leaderboard import leaderboard
+from dynslam_bench.runs import RunStore, score
+
+LIVE = {"realtime": True, "machine": MACHINE}
+
+
+def names(board, keys):
+    return [board.first(key).tracker.id for key in keys]
+
+
+def test_what_is_worse_than_a_static_camera_is_never_first(capsys):
+    """On the page and on the terminal, though it alone came to its end everywhere, or it alone is there."""
+    rows = [row("bad", s, 2.16) for s in "st"] + [row("still", s, 0.3, provenance="control") for s in "st"]
+    alone = make_board(rows)
+    assert alone.ranked == [] and names(alone, alone.no_better) == ["bad"]
+    assert names(alone, alone.trackers) == ["still", "bad"]
+    board = make_board([*rows, row("good", "s", 0.1), crashed("good", "t")])
+    assert names(board, board.trackers) == ["good", "still", "bad"]
+    table = leaderboard(board, PROTOCOL)
+    ranks = {cells[2].text: cells[0].text for cells in table.rows}
+    assert ranks == {"GOOD": "1", "STILL": "\u2013", "BAD": "\u2013"}
+    show_top(table)
+    lines = capsys.readouterr().out.splitlines()[1:4]
+    assert [name in line for name, line in zip(("GOOD", "STILL", "BAD"), lines, strict=True)] == [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("s", "t", "ranked"), [(0.1, 0.8, True), (0.2, 0.5, False), (0.3, 0.3, False), (0.29, 0.3, True)]
+)
+def test_worse_than_a_static_camera_is_a_geometric_mean(s, t, ranked):
+    board = make_board([row("one", "s", s), row("one", "t", t), row("best", "s", 0.01), row("best", "t", 0.01)])
+    (key,) = (key for key in board.labels if board.first(key).tracker.id == "one")
+    assert board.static_ratio(key) == pytest.approx(np.sqrt(s * t) / 0.3)
+    assert (key in board.ranked) == ranked != (key in board.no_better)
+
+
+def test_a_reference_worse_than_a_static_camera_stays_the_reference():
+    board = make_board([row("orb-slam2", s, 0.6) for s in "st"] + [row("good", s, 0.1) for s in "st"])
+    assert names(board, [board.reference]) == ["orb-slam2"] and names(board, board.ranked) == ["good"]
+
+
+def test_real_time_runs_are_shown_apart_and_are_never_the_reference():
+    """What they dropped is the machine's doing."""
+    slow = [row("orb-slam2", name, 0.01, **LIVE) for name in "stu"]
+    others = [row(tracker, name, error) for tracker, error in (("a", 0.1), ("b", 0.2)) for name in "stu"]
+    board = make_board([*others, *slow])
+    assert names(board, board.ranked) == ["a", "b"] and len(board.trackers) == 3 and board.reference is None
+    board = make_board([*others, *slow, *(row("orb-slam2", name, 0.05) for name in "stu")])
+    (live,) = (key for key in board.labels if board.first(key).realtime)
+    assert names(board, [board.reference]) == ["orb-slam2"] and board.reference != live not in board.ranked
+    assert board.labels[board.reference] != board.labels[live]
+    board = make_board([row(name, s, 0.1, **LIVE) for name in ("orb-slam2", "b") for s in "st"])
+    assert len(board.ranked) == 2 and board.reference is None
+
+
+def mixed(root, trackers=("orb-slam2", "orb-slam2-mono")):
+    """A store of one run a tracker; those called ``-mono`` are monocular."""
+    store = RunStore(root)
+    for tracker in trackers:
+        path = store.folder(add_run(store, tracker, "synthetic/sitting_xyz")) / "run.json"
+        record = json.loads(path.read_text())
+        record["tracker"]["sensors"] = "rgb" if tracker.endswith("-mono") else "rgbd"
+        path.write_text(json.dumps(record))
+    return store
+
+
+def test_a_protocol_without_scale_leaves_monocular_runs_out_and_counts_them(tmp_path):
+    store = mixed(tmp_path / "both")
+    metric, scaled = (load_runs([store], get_protocol(name)) for name in ("tum-rgbd/v1", MONOCULAR))
+    assert [row.tracker.id for row in metric.rows] == ["orb-slam2"] and metric.without_scale == 1
+    assert {row.tracker.id for row in scaled.rows} == {"orb-slam2", "orb-slam2-mono"} and not scaled.without_scale
+    assert all(row.metrics["ate_rmse_m"] > 0 for row in scaled.rows)
+    alone = mixed(tmp_path / "alone", ("orb-slam2-mono",))
+    with pytest.raises(ReportError, match=f"--protocol {MONOCULAR}"):
+        load_runs([alone], get_protocol("tum-rgbd/v1"))
+    (record,) = alone.all()[0]
+    assert MONOCULAR in score(alone, record, "tum-rgbd/v1").reasons["online"]
+    assert score(alone, record, MONOCULAR).online is not None

@@ -1,0 +1,214 @@
+"""Every tunable setting acts, and an online one acts in mid-episode as it does from the beginning.
+
+An episode that is configured before its first frame equals, bit for bit, that of a tracker built with those settings.
+After `reset` the settings that the tracker was built with are in force again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+
+import numpy as np
+import pytest
+from quick_dense import quick
+from steering_scene import FRAMES, SmallScene, construct, difference, differing, play, settings_for
+
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.core.errors import DynslamError, SettingsError
+from dynslam_bench.core.settings import OnlineSettings, Parameter, Settings, apply_overrides, online_parameters, tunable
+from dynslam_bench.trackers.registry import all_specs
+from dynslam_bench.trackers.systems.composition import SystemSettings
+from dynslam_bench.tuning import SpaceSpec, search_space
+
+SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)}
+SHORT = 6
+"""Frames of the episodes in which all settings of a tracker change at once."""
+AFTER = 3
+"""Frames that an episode continues after the first on which a setting acts."""
+
+
+def offered() -> dict[str, tuple[str, Parameter]]:
+    """Every setting that a study of some system draws on rendered sequences, with the first such system."""
+    settings: dict[str, tuple[str, Parameter]] = {}
+    for spec in SYSTEMS.values():
+        for parameter in search_space(spec.settings, SpaceSpec(), ["synthetic/walking_xyz"]):
+            settings.setdefault(parameter.name, (spec.id, parameter))
+    return settings
+
+
+OFFERED = offered()
+KEYFRAMES = {"backend.keyframes.tracked_share": 1.0, "free_space.min_share": 0.0}
+CASES: dict[str, tuple[str, dict[str, object]]] = {
+    "backend.keyframes.view_share": ("orb-slam2", {
+        "backend.keyframes.tracked_share": 0.4, "backend.keyframes.new_close": 400,
+        "backend.keyframes.moved_share": 0.8,
+    }),
+    "backend.keyframes.moved_share": ("orb-slam2", {
+        "backend.keyframes.tracked_share": 0.95, "backend.keyframes.new_close": 400,
+        "backend.keyframes.established": 5, "backend.keyframes.view_share": 0.5,
+    }),
+    "epipolar.threshold_px": ("emfoa-oft?masks=vote&depth=none", {}),
+    "epipolar.vote_share": ("emfoa-oft?masks=vote&depth=none", {}),
+    "backend.relocalisation.min_inliers": ("emfoa-oft", {}),
+    "epipolar.min_share": ("emfoa-oft-paper?masks=none", {}),
+    "free_space.threshold_m": ("emfoa-oft?masks=none", {
+        **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_sigma": 0.0,
+    }),
+    "free_space.threshold_sigma": ("emfoa-oft?masks=none", {
+        **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_m": 0.01,
+    }),
+    "free_space.min_votes": ("emfoa-oft?masks=none", {
+        **KEYFRAMES, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
+    }),
+    "motion.enabled": ("emfoa-oft?masks=none", {}),
+    "free_space.enabled": ("emfoa-oft?masks=none", {
+        **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_m": 0.01, "free_space.threshold_sigma": 0.0,
+    }),
+    "multiview.tau_m": ("dynaslam-g", {
+        "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
+    }),
+    "class_rule.depth_m": ("seg-slam", {"segmentation.classes": "chair", "class_rule.movable": "person"}),
+}  # fmt: skip
+"""The tracker in which a setting acts on the excerpt, if not in the first that has it, and what else is set."""
+MANY = {
+    "backend.keyframes.tracked_share": 0.95,
+    "backend.keyframes.established": 1,
+    "backend.keyframes.moved_share": 1.0,
+    "backend.keyframes.view_share": 0.98,
+}
+"""A keyframe nearly every frame."""
+JUDGED = ("emfoa-oft?masks=none&depth=none", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
+"""F judges every frame."""
+NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
+CASES |= {
+    "backend.mapping.neighbours": ("orb-slam2", MANY),
+    "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
+    "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
+    "multiview.order": ("dynaslam-g", {
+        "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
+    }),
+    "segmentation.mask_threshold": NETWORK,
+    "epipolar.parallax_share": (JUDGED[0], {"epipolar.min_parallax_px": 0.0}),
+    **{f"epipolar.{name}": JUDGED for name in ("homography_share", "max_contradiction")},
+    **{
+        f"epipolar.{name}": ("emfoa-oft-paper?flow=sparse", {})
+        for name in ("estimator", "confidence", "inlier_px", "mode")
+    },
+}  # fmt: skip
+SHOWN_ALONE = frozenset({
+    "epipolar.confidence", "free_space.max_age_s", "correlation.largest", "moving_vote.corners",
+    "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
+    "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
+    "backend.keyframes.max_gap", "backend.keyframes.redundant_share", "backend.bundle_adjustment.window",
+    *(f"backend.relocalisation.{name}" for name in ("candidates", "iterations", "max_distance")),
+})  # fmt: skip
+"""Settings that change nothing on these few frames: they act in long maps, at long ages, or when lost."""
+
+
+class Scene(SmallScene):
+    """The small scene with black frames, after which a system has to relocalise."""
+
+    def __init__(self) -> None:
+        super().__init__(frames=FRAMES)
+        for number in (8, 9):
+            frame = self.frames[number]
+            self.frames[number] = Frame(number, frame.timestamp, np.zeros_like(frame.rgb), np.zeros_like(frame.depth))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene()
+
+
+@pytest.fixture(scope="module")
+def unsteered(scene: Scene) -> Callable[..., list[TrackResult]]:
+    """The first frames of a tracker that nobody steers, played once for all that compare with them."""
+    played: dict[object, tuple[list[TrackResult], Iterator[TrackResult]]] = {}
+
+    def episode(name: str, frames: int, others: dict[str, object]) -> list[TrackResult]:
+        key = (name, *others.items())
+        if key not in played:
+            played[key] = [], play(construct(SYSTEMS[name], scene, **others), scene)
+        results, rest = played[key]
+        results += islice(rest, max(0, frames - len(results)))
+        return results[:frames]
+
+    return episode
+
+
+def at_first(tracker, settings: Settings):
+    """Steers before the first frame."""
+    return lambda number: tracker.configure(settings) if number == 0 else None
+
+
+def until_it_acts(unsteered: list[TrackResult], episode: Iterator[TrackResult]) -> list[TrackResult]:
+    """An episode's results to `AFTER` frames behind the first that is not as unsteered; none if none differs."""
+    results = []
+    for before, result in zip(unsteered, episode, strict=True):
+        results.append(result)
+        if differing(before, result):
+            return results + list(islice(episode, AFTER))
+    return []
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_all_settings_at_once_act_and_are_restored(name: str, scene: Scene, unsteered) -> None:
+    spec = SYSTEMS[name]
+    tracker = construct(spec, scene)
+    settings = settings_for(spec)
+    ends = {p.name: p.low if number % 2 else p.high for number, p in enumerate(online_parameters(settings))}
+    ends |= {"features.fast_threshold": 12, "features.fast_threshold_min": 3}
+    extreme = apply_overrides(settings, ends)
+    frames = SHORT // 2 if quick(spec.settings) else SHORT  # dense flow costs ten times as much
+    fresh = unsteered(name, frames, {})
+    steered = list(play(tracker, scene, frames, before=at_first(tracker, extreme)))
+    again = play(tracker, scene, frames)
+    static = list(play(construct(spec, scene, **ends), scene, frames))
+    assert difference(fresh, static), "the extremes change nothing at all"
+    assert not difference(static, steered), "steered is not what building with the same values gives"
+    assert not difference(fresh, again), "reset() leaves something of the steered episode"
+
+
+@pytest.mark.parametrize("name", [name for name in OFFERED if name not in SHOWN_ALONE and "preprocessing" not in name])
+def test_every_setting_that_a_study_may_draw_acts(name: str, scene: Scene, unsteered) -> None:
+    system, parameter = OFFERED[name]
+    system, others = CASES.get(name, (system, {}))
+    others = {condition: allowed[0] for condition, allowed in parameter.when} | others
+    frames = 3 if quick(SYSTEMS[system].settings) else FRAMES
+    for value in parameter.choices or (parameter.low, parameter.high):
+        try:
+            built = construct(SYSTEMS[system], scene, **others, **{name: value})
+        except DynslamError:
+            continue  # the value does not go with the others
+        expected = until_it_acts(unsteered(system, frames, others), play(built, scene, frames))
+        if not expected:
+            continue
+        if parameter.online:
+            tracker = construct(SYSTEMS[system], scene, **others)
+            changed = apply_overrides(settings_for(SYSTEMS[system], **others), {name: value})
+            steered = play(tracker, scene, len(expected), before=at_first(tracker, changed))
+            assert not difference(expected, steered), f"{system}: {name} = {value}"
+        return
+    pytest.fail(f"{name} changes nothing in {system}, at any of {parameter.choices or (parameter.low, parameter.high)}")
+
+
+def test_only_what_differs_is_handed_on() -> None:
+    class Part(Settings):
+        value: float = tunable(1.0, low=0.0, high=2.0, online=True, meaning="x")
+
+    class Whole(Settings):
+        one: Part = Part()
+        two: Part = Part()
+
+    given: list[tuple[str, float]] = []
+    takers = [(name, lambda s, name=name: given.append((name, s.value))) for name in ("one", "two")]
+    steering = OnlineSettings(Whole(), takers)
+    steering.configure(Whole(two=Part(value=2.0)))
+    steering.configure(Whole(two=Part(value=2.0)))
+    assert given == [("two", 2.0)]
+    steering.restore()
+    assert given[1:] == [("one", 1.0), ("two", 1.0)]
+    with pytest.raises(SettingsError, match=r"'two.value' of Whole is taken by no part .*configure\(settings\)"):
+        OnlineSettings(Whole(), takers[:1])

@@ -1,0 +1,123 @@
+"""Problem instances: what a study file names, what is refused, and which instances a study takes for what."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import toy_tracker
+
+from dynslam_bench.core.errors import DynslamError, StudyError
+from dynslam_bench.tuning.instances import ProblemInstance, parse_instances, scenes
+from dynslam_bench.tuning.splits import check_splits, design_of, fresh_starts, with_more_starts
+from dynslam_bench.tuning.study_file import StudySpec
+
+WALK = "synthetic/walking_xyz"
+
+
+def test_a_text_names_scenes_lengths_and_starts() -> None:
+    instances = parse_instances(f"{WALK}?scene=0-1,7&frames=80&offsets=0-4")
+    assert len(instances) == 15
+    assert instances[0] == ProblemInstance(f"{WALK}?scene=0&frames=80")
+    assert instances[-1] == ProblemInstance(f"{WALK}?scene=7&frames=80", offset=4)
+    assert list(scenes(instances)) == [f"{WALK}?scene=0", f"{WALK}?scene=1", f"{WALK}?scene=7"]
+    assert parse_instances(f"{WALK}@0-1,7?frames=80&offsets=0-4") == instances
+
+
+@pytest.mark.parametrize("text", [
+    "bonn/crowd[0:120]", "bonn/crowd[40:]?offsets=2,5&stride=2", "bonn/crowd?frames=120&degrade=blur:0.5,glare:0.2",
+    f"{WALK}[10:40]?scene=3&frames=60&noise=7&seeds=0-1", "tum/fr1/xyz", "some/folder[0:9]?offsets=1",
+])  # fmt: skip
+def test_the_text_of_an_instance_names_it(text: str) -> None:
+    instances = parse_instances(text)
+    assert [parse_instances(str(instance)) for instance in instances] == [(instance,) for instance in instances] != []
+
+
+def test_parts_strides_and_degradation_reach_the_run() -> None:
+    (instance,) = parse_instances("bonn/crowd[20:120]?offsets=3&stride=2&degrade=blur:0.5&seeds=4")
+    run = instance.run_spec("orb-slam2", threads=2)
+    assert (run.frames, run.offset, run.stride, run.seed, run.threads) == ((20, 120), 3, 2, 4, 2)
+    assert run.degrade == {"blur": 0.5}
+    assert parse_instances("bonn/crowd?frames=120")[0].frames == (0, 120)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("bonn/crowd[0:10", "names no instances"),
+        ("bonn/crowd[9:3]", "9:3"),
+        (f"{WALK}?scene=5-2", "'5-2'"),
+        (f"{WALK}?scene=1,0-2", "a number twice"),
+        ("bonn/crowd?offset=3", "'offset=3'.*offsets"),
+        ("bonn/crowd?stride=2&stride=3", "stride twice"),
+        ("bonn/crowd?noise=3", "noise"),
+        ("bonn/crowd?scene=3", "scene"),
+        (f"{WALK}@3?scene=3", "scenes twice"),
+        ("bonn/crowd[0:9]?frames=3", "frames twice"),
+        ("bonn/crowd?degrade=blurr:0.3", "'blurr'.*'blur'"),
+        ("bonn/crowd?degrade=blur:3", "'blur' is 3.0"),
+        ("bonn/crowd?degrade=blur:much", "'much'"),
+    ],
+)
+def test_what_cannot_be_read_is_one_clear_line(text: str, named: str) -> None:
+    with pytest.raises(DynslamError, match=named) as caught:
+        parse_instances(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> str:
+    return str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
+
+
+def test_instances_are_measured_against_their_sequence(folder: str) -> None:
+    assert len(ProblemInstance(folder, (2, 10), offset=1, stride=3).open()) == 3
+    for instance, named in (
+        (ProblemInstance(folder, (0, 20)), r"0 to 19.* 12 frames"),
+        (ProblemInstance(folder, offset=11), "1 frames, it needs 2"),
+    ):
+        with pytest.raises(StudyError, match=named):
+            instance.open()
+    (Path(folder) / "groundtruth.txt").unlink()
+    with pytest.raises(StudyError, match="no ground truth"):
+        ProblemInstance(folder).open()
+
+
+def test_instances_of_one_recording_are_apart_or_repeats(folder: str) -> None:
+    one, later = ProblemInstance(folder, (0, 6)), ProblemInstance(folder, (6, 12))
+    assert check_splits("s", {"tune": [one, replace(one, offset=1), later]}) == []
+    for instances, named in (
+        ([one, ProblemInstance(folder, (4, 12))], "share 2 frames"),
+        ([one, one], "is named twice"),
+        ([ProblemInstance(folder), ProblemInstance(folder, (0, 12))], "are the same frames"),
+    ):
+        with pytest.raises(StudyError, match=named):
+            check_splits("s", {"tune": instances})
+    with pytest.raises(StudyError, match=f"{re.escape(folder)}' held out are the same sequence"):
+        check_splits("s", {"tune": [one], "held_out": [later]})
+
+
+def test_the_default_runs_from_three_starts_and_the_choice_is_made_on_unseen_instances() -> None:
+    few = parse_instances(f"{WALK}?scene=0-3&frames=20&offsets=0,3")
+    first = [instance.offset for instance in with_more_starts(few) if instance.scene.endswith("?scene=0")]
+    assert sorted(first) == [0, 1, 3]
+    fresh = [instance.offset for instance in fresh_starts(few)]
+    assert fresh[:2] == [1, 2] and not set(fresh) & {0, 3}
+    spec = StudySpec(name="s", tracker="orb-slam2", tune=(f"{WALK}?scene=0-3&frames=20",), recorded=())
+    design = design_of(spec)
+    assert {instance.scene for instance in design.confirm} == {instance.scene for instance in design.tune}
+    many = design_of(spec.model_copy(update={"tune": (f"{WALK}?scene=0-11&frames=20",)}))
+    confirm, tune = ({instance.scene for instance in instances} for instances in (many.confirm, many.tune))
+    assert len(confirm) == 4 and len(tune) == 8 and not confirm & tune
+    assert len({instance.scene for instance in many.tune[:8]}) == 8, "a growing set takes one of each scene in turn"
+
+
+def test_a_recording_that_is_here_is_in_the_check(folder: str, tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    toy_tracker.make_sequence(root / "bonn" / "rgbd_bonn_crowd", 0.2)
+    recorded = design_of(StudySpec(name="s", tune=(folder,), data_root=str(root))).recorded
+    assert recorded == tuple(ProblemInstance("bonn/crowd", recorded[0].frames, offset) for offset in range(4))
+    assert design_of(StudySpec(name="s", tune=(folder,), recorded=(), data_root=str(root))).recorded == ()
+    assert design_of(StudySpec(name="s", tune=(folder,), data_root=str(tmp_path / "empty"))).recorded == ()

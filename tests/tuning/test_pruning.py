@@ -1,0 +1,187 @@
+"""Pruning and workers: who is pruned, true values, no claims by luck. Runs are drawn, see `simulated`."""
+
+from __future__ import annotations
+
+import math
+import socket
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import optuna
+import pytest
+from optuna.trial import FrozenTrial, TrialState, create_trial
+from simulated import SimulatedTuner, make_spec, nothing, valley
+
+from dynslam_bench.core.errors import StudyError
+from dynslam_bench.tuning import finish
+from dynslam_bench.tuning.objectives import ACCURACY
+from dynslam_bench.tuning.pruning import is_dominated, step_name, steps
+from dynslam_bench.tuning.trials import errors_of
+from dynslam_bench.tuning.tuner import CRASHED_WORKER, StudyEvent
+
+
+@pytest.mark.parametrize(
+    ("pruner", "count", "expected"),
+    [
+        ("halving", 24, [3, 6, 12, 24]),
+        ("halving", 16, [3, 6, 12, 16]),
+        ("halving", 2, [2]),
+        ("wilcoxon", 6, [3, 4, 5, 6]),
+        ("none", 24, [24]),
+    ],
+)
+def test_steps(pruner: Any, count: int, expected: list[int]) -> None:
+    assert steps(pruner, count) == expected
+
+
+def test_a_trial_of_several_objectives_ends_once_two_dominate_it() -> None:
+    def trial(number: int, *values: float) -> FrozenTrial:
+        made = create_trial(state=TrialState.RUNNING, user_attrs={step_name(3): list(values)})
+        made.number = number
+        return made
+
+    rivals = [trial(0, 0.1, 0.5), trial(1, 0.2, 0.4), create_trial(state=TrialState.RUNNING)]
+    assert is_dominated([*rivals, trial(9, 0.5, 0.6)], 9, 3)
+    assert not is_dominated([*rivals, trial(9, 0.5, 0.1)], 9, 3), "on the front"
+    assert not is_dominated([rivals[0], trial(9, 0.5, 0.6)], 9, 3), "one alone does not end it"
+
+
+@pytest.mark.parametrize(
+    ("pruner", "objectives"),
+    [("halving", ["accuracy"]), ("wilcoxon", ["accuracy"]), ("halving", ["accuracy", "speed"])],
+)
+def test_values_are_of_the_instances_that_ran(pruner: str, objectives: list[str], tmp_path: Path) -> None:
+    tuner = SimulatedTuner(make_spec(pruner=pruner, objectives=objectives, trials=16), tmp_path, effect=valley)
+    trials = tuner.run().get_trials()
+    states = [trial.state for trial in trials]
+    assert states[0] == TrialState.COMPLETE and TrialState.PRUNED in states
+    for trial in trials:
+        instances = list(errors_of(trial))
+        value = ACCURACY.value(tuner.evaluate(tuner.settings_of(trial), instances), tuner.reference())
+        if trial.state == TrialState.COMPLETE:
+            assert instances == list(tuner.design.tune), "a value is one of all instances"
+            assert trial.values[0] == pytest.approx(value, abs=1e-12)
+        else:
+            assert trial.state == TrialState.PRUNED and len(instances) < len(tuner.design.tune)
+            if len(objectives) > 1:
+                assert trial.user_attrs[step_name(len(instances))][0] == pytest.approx(value, abs=1e-12)
+            elif pruner == "halving":
+                assert trial.value == pytest.approx(value, abs=1e-12)
+            else:
+                assert len(trial.intermediate_values) == len(instances)
+
+
+def test_wilcoxon_takes_one_objective(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match="wilcoxon"):
+        SimulatedTuner(make_spec(pruner="wilcoxon", objectives=["accuracy", "speed"]), tmp_path)
+
+
+def test_pruning_takes_half_the_runs_at_the_same_regret(tmp_path: Path) -> None:
+    runs: dict[str, int] = {"none": 0, "halving": 0}
+    regret: dict[str, list[float]] = {"none": [], "halving": []}
+    for pruner in runs:
+        for seed in range(5):
+            spec = make_spec(pruner=pruner, trials=24, sampler_seed=seed)
+            tuner = SimulatedTuner(spec, tmp_path / f"{pruner}{seed}", effect=valley, seed=seed)
+            regret[pruner].append(valley(tuner.run().best_trial.params))
+            runs[pruner] += tuner.runs
+    assert runs["halving"] <= 0.5 * runs["none"]
+    assert np.mean(regret["halving"]) <= np.mean(regret["none"]) + 0.01
+
+
+def test_nothing_is_claimed_where_nothing_is_better(tmp_path: Path) -> None:
+    """Forty studies; a single comparison of the best trial on its own instances would claim a gain in most of them."""
+    chosen = claims = lucky = 0
+    for seed in range(40):
+        tuner = SimulatedTuner(make_spec(sampler_seed=seed), tmp_path / str(seed), effect=nothing, seed=seed)
+        lucky += tuner.run().best_value < math.log(0.95)
+        summary = finish(tuner)
+        chosen += summary.chosen is not None
+        claims += summary.improves
+    assert claims <= 2, "5 % of 40"
+    assert chosen <= 4, "5 % of 40, and its chance"
+    assert lucky >= 20, "what the trials alone say"
+
+
+def test_an_injected_regression_is_found_and_judged(tmp_path: Path) -> None:
+    spec = make_spec(space={"include": ["gain"], "fixed": {}}, trials=20, top=1)
+    tuner = SimulatedTuner(spec, tmp_path, effect=lambda settings: 4 * valley(settings), seed=3)
+    tuner.run()
+    summary = finish(tuner)
+    held = summary.candidates[0].held_out
+    assert summary.improves and held is not None and held.high < 1
+    injected = 4 * valley({"gain": 1.5})
+    assert -math.log(held.ratio) > 0.8 * injected - 0.2, "most of the injected loss, within the noise"
+
+
+def test_eight_workers_and_a_resume_repeat_no_trial(tmp_path: Path) -> None:
+    spec = make_spec(trials=40, sampler="tpe")
+
+    def work(count: int) -> int:
+        tuner = SimulatedTuner(spec.model_copy(update={"trials": count}), tmp_path, effect=valley, in_memory=False)
+        return len(tuner.run().get_trials())
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(work, [32] * 8))
+    assert work(40) == 40, "one of them goes on later"
+    tuner = SimulatedTuner(spec, tmp_path, in_memory=False)
+    drawn = [tuple(sorted(trial.params.items())) for trial in tuner.study.get_trials()]
+    assert len(set(drawn)) == len(drawn) == 40
+    assert drawn[0] == (("gain", 1.5), ("wobble", 2)), "the default, once"
+    journal = optuna.storages.journal.JournalFileBackend(str(tuner.folder / "journal.log"))
+    study = optuna.load_study(study_name="simulated", storage=optuna.storages.JournalStorage(journal))
+    assert study.best_value == tuner.study.best_value and study.metric_names == ["accuracy"]
+    assert any(trial.intermediate_values for trial in study.trials), "for Optuna's dashboard"
+
+
+@pytest.fixture
+def dead() -> str:
+    """The name of a worker that has ended."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    return f"{socket.gethostname()}:{ended.pid}"
+
+
+def test_a_trial_of_a_dead_worker_is_repeated(tmp_path: Path, dead: str) -> None:
+    tuner, other = (SimulatedTuner(make_spec(trials=6), tmp_path, in_memory=False) for _ in range(2))
+
+    def dies_later(event: StudyEvent) -> None:
+        if event.kind == "finished" and event.number == 2:
+            other.study.ask().set_user_attr("worker", dead)
+
+    reasons = [trial.user_attrs.get("reason") for trial in tuner.run(on_event=dies_later).get_trials()]
+    assert (len(reasons), reasons.count(CRASHED_WORKER)) == (7, 1)
+
+
+def test_two_workers_may_fail_the_same_trial_at_the_same_time(tmp_path: Path, dead: str) -> None:
+    tuner, other = (SimulatedTuner(make_spec(trials=3), tmp_path, in_memory=False) for _ in range(2))
+    lost = other.study.ask()
+    lost.set_user_attr("worker", dead)
+    get_trials = tuner.study.get_trials
+
+    def then_the_other_is_quicker(*args: Any, **named: Any) -> list[FrozenTrial]:
+        trials = get_trials(*args, **named)
+        with suppress(ValueError):  # it has done so before
+            other.study.tell(lost, state=TrialState.FAIL)
+        return trials
+
+    with patch.object(tuner.study, "get_trials", then_the_other_is_quicker):
+        tuner.run()
+    assert [trial.state for trial in tuner.study.get_trials()].count(TrialState.FAIL) == 1
+
+
+def test_one_worker_makes_the_same_trials_again(tmp_path: Path) -> None:
+    def drawn(name: str, seed: int) -> list[dict[str, object]]:
+        tuner = SimulatedTuner(make_spec(sampler="tpe", sampler_seed=seed), tmp_path / name, effect=valley)
+        tuner.study.enqueue_trial({"gain": 1.0, "wobble": 0})
+        return [trial.params for trial in tuner.run().get_trials()]
+
+    first = drawn("a", 1)
+    assert first == drawn("b", 1) != drawn("c", 2)
+    assert first[:2] == [{"gain": 1.5, "wobble": 2}, {"gain": 1.0, "wobble": 0}], "the default stays the first"
