@@ -1,1 +1,1 @@
-"""The ground floor: errors, annotated settings, plug-in discovery, seeding and atomic records."""
+"""The lowest layer: errors, annotated settings, plug-in discovery, seeding and atomic records."""

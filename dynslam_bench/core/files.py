@@ -195,7 +195,7 @@ def atomic_folder(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def claimed(path: Path) -> Iterator[bool]:
-    """Hold a name while the block lasts, if nobody else does; its file is removed afterwards.
+    """Hold a name while the block lasts, if no other process does; its file is removed afterwards.
 
     Args:
         path: Of the lock's file; its folder exists.
@@ -215,7 +215,7 @@ def claimed(path: Path) -> Iterator[bool]:
         try:
             yield mine
         finally:
-            if mine:  # while it is locked, so that nobody locks a file that goes away unseen
+            if mine:  # while it is locked, so that no process locks a file that is being removed
                 with contextlib.suppress(OSError):  # it is harmless if it stays
                     path.unlink()
     finally:
@@ -234,7 +234,7 @@ def hold(path: Path) -> int:
 
 
 def is_abandoned(path: Path) -> bool:
-    """Whether a file or folder is there and nobody holds it; False where the file system knows no locks."""
+    """Whether a file or folder is there and no process holds it; False where the file system knows no locks."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:

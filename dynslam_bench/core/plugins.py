@@ -230,7 +230,7 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {text[-1]}" if text else type(error).__name__
 
 
-# Whether a plug-in's module can be imported at all: asked in a process of its own, which the import may end.
+# -- whether a module can be imported at all: tried in a process of its own, which that may end ------------------------
 
 ISOLATED_VARIABLE = "DYNSLAM_BENCH_ISOLATED"
 """Set in processes that may end by an import without harm: the children of runs, and the probes themselves."""

@@ -57,7 +57,7 @@ class Settings(BaseModel):
     def unused(self) -> Mapping[str, str]:
         """Fields, or groups, without effect, each with the reason; see `idle` for all of a group at once.
 
-        As `idle`, it asks fields only that nobody tunes; what depends on a tunable field says ``when``.
+        As `idle`, it depends on fields only that are not tunable; for conditions on a tunable field there is ``when``.
         """
         return {}
 
@@ -392,7 +392,7 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-# Changing settings in mid-episode: the one contract of everything that has online settings.
+# -- online reconfiguration -------------------------------------------------------------------------------------------
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ from functools import cache
 from importlib import metadata
 
 UNKNOWN = "0+unknown"
-"""What a checkout that is not installed is; `core.machine.git_revision` says more of it."""
+"""What a checkout that is not installed is; see `core.fingerprint.git_revision`."""
 
 
 @cache

@@ -170,7 +170,7 @@ class _Recorder:
             )
 
     def finish(self) -> dict[str, Any]:
-        """Write what is known at the end; what the record says of it."""
+        """Write what is known at the end, and return what goes into the record."""
         env, folder = self._env, self._folder
         began = time.perf_counter()
         final = env.final_trajectory()

@@ -36,7 +36,7 @@ class TrackerInfo(Record):
     """The tracker, as its spec described it; see `TrackerSpec`.
 
     Beside that `given`: what it was named by where its id alone does not find it, ``/path/file.py:Attr`` or
-    ``module:Attr``; empty for an id, and in older records.
+    ``module:Attr``; empty for an id.
     """
 
     id: str
@@ -61,7 +61,7 @@ class SequenceInfo(Record):
         content: Digest of its content.
         part: Digest of content and frames: names the folder with the stamps and the ground truth.
         block: Digest of what is filmed, camera, frames and stride, without the start offset and the noise seed: one
-            column of a table. Empty in records of older versions, whose `part` stands for it.
+            column of a table. Empty for imported trajectories whose record does not say it.
         noise: Seed of the sensors' noise; None for the sequence's own.
         frames: Frames of the run's part.
         duration_s: Time between its first and last frame.
@@ -126,7 +126,7 @@ class RunRecord(Record):
     """The outcome of a run.
 
     Attributes:
-        schema_version: Of this record; older ones stay loadable.
+        schema_version: Of this record.
         kind: ``run`` (made here) or ``imported`` (a trajectory from elsewhere).
         run_id: Digest of `identity`.
         status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`); ``crashed``,
@@ -164,7 +164,7 @@ class RunRecord(Record):
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
             where either is missing.
         timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded;
-            ``processor`` the processor time of the run's own process in it (missing in older runs).
+            ``processor`` the processor time of the run's own process in it.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
         wall_s: Wall-clock time of the whole run.
@@ -178,7 +178,7 @@ class RunRecord(Record):
         provenance: For imported trajectories: where it came from.
         place: Folder of the sequence where it was named by its path; empty for an id.
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
-        study: Study that made it and nobody else asked for; empty for any other run, and in older records.
+        study: Study that made it, if it was not asked for without the study; else empty.
         notes: Anything a reader should know, one line each.
     """
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -114,7 +114,7 @@ class RunIndex:
             return {str(name) for (name,) in connection.execute("SELECT DISTINCT name FROM computed")}
         return set()
 
-    def _change(self, command: str, rows: list[tuple[str, ...]]) -> None:
+    def _change(self, command: str, rows: Sequence[tuple[str, ...]]) -> None:
         for _ in range(2):
             try:
                 with self._opened(create=True) as connection, connection:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -12,6 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from dynslam_bench.contracts.tracker import TrackerSpec, TrackResult
 from dynslam_bench.core.settings import Settings
@@ -104,6 +106,23 @@ class Hostile:
                 os._exit(0)
             self.note(pid)
         time.sleep(0.7)
+
+
+def alive(pids: list[int]) -> list[int]:
+    """Those that still run; a zombie does not."""
+    running = []
+    for pid in pids:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+                running.append(pid)
+    return running
+
+
+def until(condition, seconds: float = 120.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {seconds} s"
+        time.sleep(0.05)
 
 
 HOG = "import time; hoard = [b'x' * 2**24 for _ in range(100)]; time.sleep(300)"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import hostile
 import pytest
+from hostile import alive, until
 
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_one
 from dynslam_bench.runs.process import tree as memory_module
@@ -33,15 +34,6 @@ def attack(store: RunStore, toy_folder: str, tmp_path: Path):
         return record, [int(line) for line in pids.read_text().split()] if pids.is_file() else []
 
     return run
-
-
-def alive(pids: list[int]) -> list[int]:
-    """Those that still run; a dead one that nobody has buried yet does not."""
-    return [pid for pid in pids if Path(f"/proc/{pid}").exists() and _state(pid) != "Z"]
-
-
-def _state(pid: int) -> str:
-    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
 
 
 @pytest.mark.parametrize(
@@ -112,7 +104,9 @@ def test_a_flooded_log_keeps_its_ends(attack, store: RunStore) -> None:
     assert b"of 16.8 MB were cut here" in log
 
 
-def test_the_parent_ends_and_all_end_with_it(toy_folder: str, tmp_path: Path) -> None:
+@linux
+@pytest.mark.parametrize("start", ["fork", "fresh"])
+def test_the_parent_ends_and_all_end_with_it(toy_folder: str, tmp_path: Path, start: str) -> None:
     """The program is killed in mid-run, without a chance to clean up."""
     here = Path(hostile.__file__).parent
     settings = {"mode": "hog-child", "pids": str(tmp_path / "pids")}
@@ -123,17 +117,14 @@ def test_the_parent_ends_and_all_end_with_it(toy_folder: str, tmp_path: Path) ->
         f"spec = RunSpec(tracker={hostile.TARGET!r}, sequence={toy_folder!r}, frames=(0, 6), settings={settings!r})\n"
         "run_one(spec, store)\n"
     )
-    parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path)
-    _until(lambda: (tmp_path / "pids").is_file() and (tmp_path / "pids").read_text().endswith("\n"), 60)
+    environment = os.environ | {"DYNSLAM_BENCH_START": start}
+    parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, env=environment)
+    until(lambda: (tmp_path / "pids").is_file() and (tmp_path / "pids").read_text().endswith("\n"), 60)
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert alive(pids) == pids
     parent.kill()
     parent.wait()
-    _until(lambda: alive(pids) == [], 10)
-
-
-def _until(condition, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {seconds} s"
-        time.sleep(0.05)
+    until(lambda: alive(pids) == [], 20)
+    store = RunStore(tmp_path / "results")
+    store.prepare()
+    assert list(store.runs.iterdir()) == []

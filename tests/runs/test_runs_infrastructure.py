@@ -14,6 +14,7 @@ from pathlib import Path
 
 import hostile
 import pytest
+from hostile import alive, until
 
 from dynslam_bench.core.errors import InfrastructureError
 from dynslam_bench.core.files import SHARED_MEMORY
@@ -62,25 +63,6 @@ def started(pids: Path, count: int) -> list[int]:
     """The processes, once there are so many."""
     until(lambda: pids.is_file() and len(pids.read_text().splitlines()) >= count)
     return [int(line) for line in pids.read_text().split()]
-
-
-def alive(pids: list[int]) -> list[int]:
-    found = []
-    for pid in pids:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except OSError:
-            continue
-        if state != "Z":
-            found.append(pid)
-    return found
-
-
-def until(condition, seconds: float = 120.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {seconds} s"
-        time.sleep(0.05)
 
 
 def in_background(spec: RunSpec, store: RunStore) -> tuple[threading.Thread, list[BaseException]]:

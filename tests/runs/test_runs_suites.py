@@ -114,14 +114,7 @@ def test_frames_of_a_run_are_read_however_they_are_written() -> None:
         RunSpec(tracker="x", sequence="y", frames="5:2")
 
 
-def test_dynamic_has_the_yardstick_with_exact_masks(tmp_path: Path) -> None:
-    specs = load_suite("dynamic").specs()
-    yardstick = [spec for spec in specs if spec.settings.get("segmentation.source") == "oracle"]
-    assert len(yardstick) == 16 and {spec.tracker for spec in yardstick} == {"mask-rcnn"}
-    plain = [spec for spec in specs if spec.tracker == "mask-rcnn" and not spec.settings]
-    assert len(plain) == 16, "beside the row with the network's masks"
-    assert all(spec.cache for spec in specs) and not any(spec.cache for spec in load_suite("smoke").specs())
-    assert not [spec for spec in load_suite("dynamic").specs(trackers=("orb-slam2",)) if spec.tracker != "orb-slam2"]
+def test_rows_are_of_trackers_of_the_suite(tmp_path: Path) -> None:
     text = 'trackers = ["never-move"]\nsequences = ["synthetic/walking_xyz"]\n[[rows]]\ntracker = "{}"\nsettings = {}'
     stranger = write(tmp_path / "a.toml", text.format("orb-slam2", '{ "guard.min_features" = 30 }'))
     with pytest.raises(RunError, match="'orb-slam2', which is none of its trackers"):
