@@ -96,7 +96,7 @@ def _spec(
 
 
 G_FALLS_SHORT = (
-    "; worse than a camera that never moves where people fill the view from the start (Bonn from frames 80 and 120: "
+    "; worse than a static camera where people fill the view from the start (Bonn from frames 80 and 120: "
     "0.074 and 0.044 m against 0.053 and 0.029), which nobody reports of the authors' program: hence inspired"
 )
 BOTH = ("DynaSLAM N+G", "DynaSLAM")
