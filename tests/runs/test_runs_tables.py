@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -113,3 +114,20 @@ def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
     for line in store.frame().astype(object).to_dict("records"):
         row = by_id[line["run_id"]]
         assert all(row[name] == (None if line[name] is pd.NA else line[name]) or row[name] == "" for name in shared)
+
+
+def test_from_results_to_a_plot_in_three_lines(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's examples are run as they stand."""
+    page = (ROOT / "docs" / "environments.md").read_text()
+    section = page[page.index("### From `results/` to a plot") :]
+    first, second = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    (store.root / "latest").symlink_to("runs/a7abe04996a79cc4")
+    monkeypatch.chdir(store.root.parent)
+    for text, names in (
+        (first, ("ate.html", "Old Slam", "never move")),
+        (second, ("frames.html", "pose_error_trans_m")),
+    ):
+        assert len([line for line in text.splitlines() if line]) == 3
+        exec(compile(text, "environments.md", "exec"), {})
+        plot = Path(names[0]).read_text()
+        assert all(name in plot for name in names[1:])
