@@ -216,7 +216,7 @@ def claimed(path: Path) -> Iterator[bool]:
             yield mine
         finally:
             if mine:  # while it is locked, so that no process locks a file that is being removed
-                with contextlib.suppress(OSError):  # it is harmless if it stays
+                with contextlib.suppress(OSError):  # a file that stays does no damage
                     path.unlink()
     finally:
         os.close(handle)

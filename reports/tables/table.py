@@ -282,7 +282,7 @@ def to_latex(table: Table, protocol: str = "") -> str:
 
 
 def escape_latex(text: str) -> str:
-    """Text with LaTeX's special characters made harmless, on one line.
+    """Text with LaTeX's special characters escaped, on one line.
 
     Letters of other alphabets than the Latin one and pictures, which ``pdflatex`` has no glyphs for, are named by their
     code point: ``[U+1F600]``.
