@@ -15,12 +15,8 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, NEAR_M, apply_twist, cholesky_solve
-
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
-Index = NDArray[np.int64]
 
 FIXED_KEYFRAMES = 6
 """Further keyframes that observe the same points and stay where they are."""
@@ -50,8 +46,8 @@ class BundleProblem:
     poses: Array
     variable: int
     points: Array
-    obs_pose: Index
-    obs_point: Index
+    obs_pose: Slots
+    obs_point: Slots
     uv: Array
     right: Array
     info: Array
@@ -72,7 +68,7 @@ class BundleResult:
 
 @kernel
 def _cost(
-    poses: Array, points: Array, obs_pose: Index, obs_point: Index, uv: Array, right: Array, info: Array,
+    poses: Array, points: Array, obs_pose: Slots, obs_point: Slots, uv: Array, right: Array, info: Array,
     info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, chi2: Array,
 ) -> float:  # fmt: skip
     """Huber cost of all observations; fills `chi2` (inf behind the camera)."""
@@ -101,7 +97,7 @@ def _cost(
 
 @kernel
 def _step(
-    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    poses: Array, variable: int, points: Array, obs_pose: Slots, obs_point: Slots, start: Slots, uv: Array,
     right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, damping: float,
     chi2: Array, new_poses: Array, new_points: Array,
 ) -> bool:  # fmt: skip
@@ -228,7 +224,7 @@ def _step(
 
 @kernel
 def _adjust(
-    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    poses: Array, variable: int, points: Array, obs_pose: Slots, obs_point: Slots, start: Slots, uv: Array,
     right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float,
     iterations: int, chi2: Array,
 ) -> tuple[Array, Array, float, float]:  # fmt: skip

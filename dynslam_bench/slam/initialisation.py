@@ -24,13 +24,10 @@ from dynslam_bench.features.matching import rotation_consistent, search_in_radiu
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle, reprojection_chi2
-from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import NEAR_M, optimise_pose
 from dynslam_bench.slam.settings import TwoViewSettings
-
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
+from dynslam_bench.slam.tracking import Observations
 
 MAX_DISTANCE = 50
 RATIO = 0.9

@@ -23,13 +23,9 @@ from dynslam_bench.slam.bundle_adjustment import (
     full_bundle,
     local_bundle,
 )
-from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import CLOSE_BASELINES
-
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
+from dynslam_bench.slam.tracking import CLOSE_BASELINES, Observations
 
 MAX_DISTANCE = 50
 """Largest Hamming distance in fusion and triangulation (ORB-SLAM2's lower threshold)."""
@@ -123,7 +119,7 @@ class LocalMapper:
             close = int(np.count_nonzero(observations.z[free] < self.close_m))
             free = free[: max(close, MIN_DEPTH_POINTS)]
         position = se3.transform(
-            world.T_world_cam(slot), world.camera.unproject(observations.xy[free], observations.z[free])
+            se3.inverse(world.kf_pose[slot]), world.camera.unproject(observations.xy[free], observations.z[free])
         )
         self._add_points(slot, free, position, observations)
 
@@ -223,11 +219,6 @@ class LocalMapper:
         self._before_full = keyframes, world.kf_pose[keyframes], points, tables
         if self._solve(full_bundle(world), FULL_ITERATIONS) is not None:
             world.refresh(points)
-
-    @property
-    def refined(self) -> bool:
-        """Whether the map is as `adjust_all` left it."""
-        return self._before_full is not None
 
     def resume(self) -> None:
         """The run goes on: the map is again what it was before `adjust_all`."""
@@ -421,6 +412,6 @@ def triangulate(world: Map, slot: int, other: int, min_parallax_sigmas: float) -
         world.kf_words[slot], world.kf_words[other], world.scales,
         camera.fx, camera.fy, camera.cx, camera.cy, float(min_parallax_sigmas),
     )  # fmt: skip
-    pose = world.T_world_cam(slot)
+    pose = se3.inverse(world.kf_pose[slot])
     local = camera.unproject(world.kf_xy[slot, features], depth)
     return features, others, local @ pose[:3, :3].T + pose[:3, 3]

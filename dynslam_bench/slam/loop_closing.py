@@ -18,13 +18,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.local_mapping import LocalMapper
-from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.map import Array, Slots
 from dynslam_bench.slam.place_recognition import (
     PlaceHypothesis,
     PlaceMatch,
@@ -44,12 +43,8 @@ from dynslam_bench.slam.pose_graph import (
     spread_scale,
     transferred_edges,
 )
-from dynslam_bench.slam.relocalisation import InitialPose
 from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import Matches, weakly_connected
-
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
+from dynslam_bench.slam.tracking import InitialPose, Matches, Observations, weakly_connected
 
 CANDIDATES = 3
 """Best-ranked keyframes that are matched feature by feature."""

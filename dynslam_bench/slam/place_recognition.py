@@ -25,15 +25,10 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.features.matching import match_brute_force
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.motion_model import pose_covariance
-from dynslam_bench.slam.observation import Observations
-from dynslam_bench.slam.pose_optimisation import PoseEstimate
 from dynslam_bench.slam.settings import TrackingSettings
-from dynslam_bench.slam.tracking import Matches, match_map, solve
-
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
+from dynslam_bench.slam.tracking import Matches, Observations, PoseCandidate, match_map, solve
 
 MAX_DISTANCE = 60
 RATIO = 0.85
@@ -193,18 +188,9 @@ def ransac_matches(
     return ransac[0], matches.select(ransac[1])
 
 
-@dataclass(frozen=True, eq=False)
-class PnpPose:
-    """A pose found without prediction, the keyframe and matches it rests on and its inliers among them."""
-
-    keyframe: int
-    matches: Matches
-    estimate: PoseEstimate
-
-
 def pnp_poses(
     world: Map, keyframes: list[int], observations: Observations, rng: np.random.Generator, min_inliers: int
-) -> Iterator[PnpPose]:
+) -> Iterator[PoseCandidate]:
     """Poses by descriptor matches: a good one at once, the others after all candidates, the best first.
 
     Args:
@@ -218,7 +204,7 @@ def pnp_poses(
         return
     matched = [(match_keyframe(world, keyframe, observations), keyframe) for keyframe in keyframes]
     matched.sort(key=lambda pair: (-len(pair[0]), -int(world.kf_id[pair[1]])))
-    others: list[PnpPose] = []
+    others: list[PoseCandidate] = []
     for matches, keyframe in matched[:PNP_CANDIDATES]:
         if len(matches) < max(MIN_PNP_INLIERS, min_inliers // 3):
             break
@@ -226,7 +212,7 @@ def pnp_poses(
         if ransac is None:
             continue
         pose, inliers = ransac
-        candidate = PnpPose(keyframe, inliers, solve(world.camera, observations, inliers, pose))
+        candidate = PoseCandidate(keyframe, inliers, solve(world.camera, observations, inliers, pose))
         if candidate.estimate.count >= 2 * min_inliers:
             yield candidate
         else:

@@ -18,8 +18,7 @@ from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.motion_model import MAX_GAP_S
-from dynslam_bench.slam.observation import Observations, right_coordinates
-from dynslam_bench.slam.tracking import MapFit, TrackedFrame
+from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, right_coordinates
 
 Array = NDArray[np.float64]
 
