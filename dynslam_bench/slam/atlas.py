@@ -204,11 +204,8 @@ def packed(atlas: Atlas) -> dict[str, NDArray[Any]]:
     arrays = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
     arrays |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
     arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
-    row_of_point = np.full(world.alive.size + 1, -1, np.int32)  # the last one stands for "no point"
-    row_of_point[points] = np.arange(len(points))
     row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
-    arrays["kf_point"] = row_of_point[arrays["kf_point"]]
     arrays["obs_kf"] = row_of_keyframe[world.obs_kf[observations]]
     arrays["obs_ft"] = world.obs_ft[observations]
     submaps = atlas.submaps.values()
@@ -234,7 +231,8 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
         rows = arrays[name]
         tables[name] = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
         tables[name][in_use] = rows
-    tables["kf_point"][~in_use] = -1
+    tables["kf_point"] = np.full(in_use.shape, -1, np.int32)
+    tables["kf_point"][arrays["obs_kf"], arrays["obs_ft"]] = np.repeat(np.arange(len(n_obs)), n_obs)
     tables["obs_at"], tables["obs_capacity"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
     tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)

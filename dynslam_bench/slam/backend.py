@@ -17,7 +17,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.slam.atlas import open_atlas, save_atlas
-from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser, View
+from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser
 from dynslam_bench.slam.keyframes import DEPTH_IMAGES, KeyframePolicy, MapView, MapViews
 from dynslam_bench.slam.local_mapping import LocalMapper
 from dynslam_bench.slam.loop_closing import LoopCloser
@@ -488,7 +488,7 @@ class MonocularBackend(RgbdBackend):
     def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
         """Frames are ``initialising`` until one determines the motion together with an earlier one."""
         begin = perf_counter()
-        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
+        initial = self._initialiser.add(frame, observations, self.camera, self.settings.two_views)
         if initial is None:
             return self._result(None)
         return self._begin_from_two(initial, np.eye(4), perf_counter() - begin)
@@ -498,7 +498,7 @@ class MonocularBackend(RgbdBackend):
         begin = perf_counter()
         if self._unrecognised == self.settings.relocalisation.new_map_after:
             self._initialiser = TwoViewInitialiser()
-        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
+        initial = self._initialiser.add(frame, observations, self.camera, self.settings.two_views)
         if initial is None:
             return None
         seconds = perf_counter() - begin

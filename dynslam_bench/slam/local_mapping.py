@@ -19,7 +19,6 @@ from dynslam_bench.slam.bundle_adjustment import (
     Bundle,
     BundleResult,
     adjust_bundle,
-    adjust_bundle_gtsam,
     full_bundle,
     local_bundle,
 )
@@ -235,8 +234,7 @@ class LocalMapper:
         """Put refined poses and points into the map; None if there are none."""
         if bundle is None:
             return None
-        solver = adjust_bundle_gtsam if self.settings.bundle_adjustment.solver == "gtsam" else adjust_bundle
-        result = solver(bundle.problem, iterations)
+        result = adjust_bundle(bundle.problem, iterations)
         if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
             return None
         for k in range(bundle.problem.variable):

@@ -15,7 +15,6 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.descriptor_index import DescriptorIndex
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.tracking import Observations
@@ -50,7 +49,7 @@ class Map:
         many observations it has, where they begin in obs_kf and obs_ft, and how many fit there).
 
     Attributes (others):
-        index: Sorted substrings of the keyframes' descriptors.
+        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors (`place_recognition`).
 
     Attributes (observations ``[O]``, those of each point in a row, oldest first):
         obs_kf, obs_ft (observing keyframe slots and feature numbers).
@@ -66,7 +65,7 @@ class Map:
         self._top = 0
         self._observations = 0
         self._features = 0
-        self.index = DescriptorIndex()
+        self.substrings: dict[int, tuple[int, NDArray[np.uint16]]] = {}
         self._allocate()
 
     def _grow(self, names: tuple[str, ...], length: int, axis: int = 0) -> None:
