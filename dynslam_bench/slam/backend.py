@@ -19,7 +19,7 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.slam.atlas import open_atlas, save_atlas
 from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser
 from dynslam_bench.slam.keyframes import DEPTH_IMAGES, KeyframePolicy, MapView, MapViews
-from dynslam_bench.slam.local_mapping import LocalMapper
+from dynslam_bench.slam.local_mapping import LocalMapper, MapState
 from dynslam_bench.slam.loop_closing import LoopCloser
 from dynslam_bench.slam.map import Array
 from dynslam_bench.slam.map_files import MapFeatures
@@ -147,6 +147,7 @@ class RgbdBackend:
         self._reference = -1
         self._last: TrackedFrame | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
+        self._before_full: MapState | None = None
         self._ready = True
 
     # ------------------------------------------------------------------ one frame
@@ -164,7 +165,7 @@ class RgbdBackend:
         """
         assert self._ready, "reset() comes before track()"
         begin = perf_counter()
-        self.mapper.resume()
+        self._resume()
         observations = observe(frame, keep, weight, self.camera, self._scales)
         result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
         tracking = perf_counter() - begin - sum(result.timings.values())
@@ -439,7 +440,7 @@ class RgbdBackend:
 
     def view(self) -> MapView:
         """What filters may read of the map that the camera is in, as it was before a `finalize`."""
-        self.mapper.resume()
+        self._resume()
         return self._views.of(self.atlas.active)
 
     def outputs(self) -> MapOutputs:
@@ -459,14 +460,20 @@ class RgbdBackend:
         """
         save_atlas(path, self.atlas, self._features, depth=self.uses_depth, made_by=made_by)
 
+    def _resume(self) -> None:
+        """The run goes on after a `finalize`: the map is again what it was before."""
+        if self._before_full is not None:
+            self.mapper.restore(self._before_full)
+            self._before_full = None
+
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
 
         With `bundle_adjustment.full` the whole map is refined first, unless the run only localises in it; the next
         frame undoes that.
         """
-        if self._grows and self.settings.bundle_adjustment.full:
-            self.mapper.adjust_all()
+        if self._grows and self.settings.bundle_adjustment.full and self._before_full is None:
+            self._before_full = self.mapper.adjust_all()
         return trajectory(self.history, self.world, self.settings.motion)
 
 

@@ -133,8 +133,9 @@ def match_views(first: Observations, second: Observations, expected: Array, radi
     windows = expected, np.full(count, np.nan), np.full(count, radius_px)
     octaves = first.octave - 1, first.octave + 1
     free = np.ones(len(second), bool)
+    arrays = second.xy, second.right, second.octave, second.words
     feature, _ = search_in_radius(
-        second.grid, second.arrays, free, windows, octaves, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
+        second.grid, arrays, free, windows, octaves, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
     )
     rows = np.flatnonzero(feature >= 0)
     rows = rows[rotation_consistent(first.angle[rows], second.angle[feature[rows]])]

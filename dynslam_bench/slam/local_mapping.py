@@ -26,6 +26,9 @@ from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.slam.tracking import CLOSE_BASELINES, Observations
 
+MapState = tuple[Slots, Array, Slots, dict[str, NDArray[Any]]]
+"""Keyframes and their poses, points and what refinement changes of them."""
+
 MAX_DISTANCE = 50
 """Largest Hamming distance in fusion and triangulation (ORB-SLAM2's lower threshold)."""
 MIN_PARALLAX = np.deg2rad(1.0)
@@ -61,7 +64,6 @@ class LocalMapper:
         self.settings = settings
         self.close_m = CLOSE_BASELINES * world.camera.baseline_m
         self.culled: list[tuple[int, int, Array]] = []
-        self._before_full: tuple[Slots, Array, Slots, dict[str, NDArray[Any]]] | None = None
         points = world.points
         self._young: Slots = points[world.next_keyframe - 1 - world.born[points] < YOUNG]
 
@@ -209,22 +211,18 @@ class LocalMapper:
             world.unobserve(bundle.poses[bundle.problem.obs_pose[out]], bundle.features[out])
             world.refresh(points[world.alive[points]])
 
-    def adjust_all(self) -> None:
-        """Full bundle adjustment, as at the end of a run; `resume` undoes it."""
-        if self._before_full is not None:
-            return
+    def adjust_all(self) -> MapState:
+        """Full bundle adjustment, as at the end of a run; returns what `restore` needs to undo it."""
         world, keyframes, points = self.world, self.world.keyframes, self.world.points
         tables = {name: getattr(world, name)[points] for name in ("position", "normal", "far", "words")}
-        self._before_full = keyframes, world.kf_pose[keyframes], points, tables
+        before = keyframes, world.kf_pose[keyframes], points, tables
         if self._solve(full_bundle(world), FULL_ITERATIONS) is not None:
             world.refresh(points)
+        return before
 
-    def resume(self) -> None:
+    def restore(self, before: MapState) -> None:
         """The run goes on: the map is again what it was before `adjust_all`."""
-        if self._before_full is None:
-            return
-        keyframes, poses, points, tables = self._before_full
-        self._before_full = None
+        keyframes, poses, points, tables = before
         for slot, pose in zip(keyframes.tolist(), poses, strict=True):
             self.world.set_pose(slot, pose)
         for name, values in tables.items():

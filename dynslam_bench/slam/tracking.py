@@ -84,11 +84,6 @@ class Observations:
     def __len__(self) -> int:
         return len(self.xy)
 
-    @property
-    def arrays(self) -> tuple[Array, Array, Slots, Words]:
-        """Input of `search_in_radius`: pixels, right coordinates, octaves, descriptors."""
-        return self.xy, self.right, self.octave, self.words
-
 
 def observe(
     frame: FrameBundle,
@@ -255,7 +250,7 @@ def pose_from_last_frame(
     ):
         radius = widen * settings.radius_px
         matches = match_last_frame(world, last, observations, prediction, radius, depth_m, settings.max_distance)
-        if len(matches) < enough:
+        if len(matches.feature) < enough:
             continue
         estimate = solve(world.camera, observations, matches, prediction, rounds=3)
         if estimate.count >= MIN_MATCHES and (best is None or estimate.count > best.estimate.count):
@@ -313,7 +308,7 @@ def match_last_frame(
     windows, octaves = (uv, right, radius_px * world.scales[octave]), (octave - 1, octave + 1)
     feature, _ = search_in_radius(
         observations.grid,
-        observations.arrays,
+        (observations.xy, observations.right, observations.octave, observations.words),
         free,
         windows,
         octaves,
@@ -361,7 +356,14 @@ def match_map(
     windows, octaves = (uv[rest], right[rest], radius[rest]), (octave[rest] - 1, octave[rest] + 1)
     words, bits = world.words[wanted], settings.max_distance
     feature, _ = search_in_radius(
-        observations.grid, observations.arrays, free, windows, octaves, words, max_distance=bits, ratio=MAP_RATIO
+        observations.grid,
+        (observations.xy, observations.right, observations.octave, observations.words),
+        free,
+        windows,
+        octaves,
+        words,
+        max_distance=bits,
+        ratio=MAP_RATIO,
     )
     hit = feature >= 0
     return Matches(feature[hit], wanted[hit], world.position[wanted[hit]]), points

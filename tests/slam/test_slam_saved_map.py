@@ -50,7 +50,7 @@ def test_a_loaded_map_is_the_saved_one_to_the_last_bit(made, tmp_path):
 def test_localisation_only_relocalises_and_leaves_the_map_unchanged(made, tmp_path):
     room, poses, file, _ = made
     backend = make_backend(room, map__file=str(file), map__localisation_only=True)
-    assert backend.predict(0.0) is None
+    assert backend.predict(0.0) == (None, None)
     elsewhere = [PointWorld(seed=9).see(pose, i) for i, pose in enumerate(poses[:8])]
     order = [*range(2 * HALF - 1, HALF // 2, -1)]  # from the end of the path, which the map does not know
     here = [room.see(poses[i], 8 + number) for number, i in enumerate(order)]
@@ -85,7 +85,7 @@ def test_a_loaded_map_continues_to_grow(made, tmp_path, loops):
 @pytest.mark.parametrize(
     ("change", "features", "words"),
     [
-        ({"monocular": True}, {}, "RGB-D .*monocular"),
+        ({"monocular": True}, {}, "rgbd.* rgb"),
         ({}, {"levels": 4}, "8 levels .* 4 levels"),
         ({}, {"extractor": "mine"}, "mine"),
         ({"size": (320, 240)}, {}, "width 640.0 instead of 320.0"),
@@ -120,7 +120,7 @@ def put(index, value):
 
 
 FAULTS = {
-    "kf_point": (lambda a: put(np.flatnonzero(a >= 0)[0], -1)(a), "do not agree"),
+    "kf_words": (lambda a: a.resize((len(a), 65), refcheck=False), "shape"),
     "obs_ft": (put(0, 30000), "features that the keyframe does not have"),
     "obs_kf": (put(0, 99), "values above"),
     "n_obs": (lambda a: put(0, a[0] + 1)(a), "does not add up"),
