@@ -5,7 +5,7 @@ Keyframes and points live in numbered slots; a freed slot is used again, after t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +23,25 @@ Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
 Ints = NDArray[np.int32]
 
+KEYFRAME_TABLES = {
+    "kf_alive": (bool,), "kf_id": (np.int64,), "kf_map": (np.int64,), "kf_frame": (np.int64,), "kf_stamp": (float,),
+    "kf_pose": (float, 4, 4), "kf_centre": (float, 3), "kf_count": (np.int64,),
+}  # fmt: skip
+"""Type and shape of what is stored of each keyframe, see `Map`."""
+FEATURE_TABLES = {
+    "kf_raw": (np.float32, 0, 2), "kf_response": (np.float32, 0), "kf_xy": (float, 0, 2), "kf_right": (float, 0),
+    "kf_z": (np.float32, 0), "kf_octave": (np.int8, 0), "kf_angle": (np.float32, 0), "kf_info": (float, 0),
+    "kf_info_right": (float, 0), "kf_words": (np.uint64, 0, 4), "kf_point": (np.int32, 0),
+}  # fmt: skip
+"""Of each feature of each keyframe."""
+POINT_TABLES = {
+    "alive": (bool,), "id": (np.int64,), "position": (float, 3), "normal": (float, 3), "far": (float,),
+    "words": (np.uint64, 4), "rgb": (np.uint8, 3), "visible": (np.int32,), "found": (np.int32,), "born": (np.int64,),
+    "n_obs": (np.int32,), "obs_at": (np.int64,), "obs_capacity": (np.int32,),
+}  # fmt: skip
+"""Of each point."""
+OBSERVATION_TABLES = {"obs_kf": (np.int32,), "obs_ft": (np.int32,)}
+"""Of each observation."""
 MIN_CAPACITY = 4
 """Observations that a point has room for when it gets its first one."""
 MIN_COSINE = 0.5
@@ -66,63 +85,19 @@ class Map:
         self._observations = 0
         self._features = 0
         self.substrings: dict[int, tuple[int, NDArray[np.uint16]]] = {}
-        self._allocate()
+        for name, (kind, *shape) in (KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES | OBSERVATION_TABLES).items():
+            setattr(self, name, np.zeros((0, *shape), kind))
 
-    def _grow(self, names: tuple[str, ...], length: int, axis: int = 0) -> None:
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> NDArray[Any]: ...
+
+    def _grow(self, names: Iterable[str], length: int, axis: int = 0) -> None:
         for name in names:
             table = getattr(self, name)
             shape = list(table.shape)
             shape[axis] = length - shape[axis]
             setattr(self, name, np.concatenate([table, np.zeros(shape, table.dtype)], axis))
-
-    def _allocate(self) -> None:
-        self.kf_alive = np.zeros(0, bool)
-        self.kf_id = np.zeros(0, np.int64)
-        self.kf_map = np.zeros(0, np.int64)
-        self.kf_frame = np.zeros(0, np.int64)
-        self.kf_stamp = np.zeros(0)
-        self.kf_pose = np.zeros((0, 4, 4))
-        self.kf_centre = np.zeros((0, 3))
-        self.kf_count = np.zeros(0, np.int64)
-        self.kf_raw = np.zeros((0, 0, 2), np.float32)
-        self.kf_response = np.zeros((0, 0), np.float32)
-        self.kf_xy = np.zeros((0, 0, 2))
-        self.kf_right = np.zeros((0, 0))
-        self.kf_z = np.zeros((0, 0), np.float32)
-        self.kf_octave = np.zeros((0, 0), np.int8)
-        self.kf_angle = np.zeros((0, 0), np.float32)
-        self.kf_info = np.zeros((0, 0))
-        self.kf_info_right = np.zeros((0, 0))
-        self.kf_words = np.zeros((0, 0, 4), np.uint64)
-        self.kf_point = np.zeros((0, 0), np.int32)
-        self.alive = np.zeros(0, bool)
-        self.id = np.zeros(0, np.int64)
-        self.position = np.zeros((0, 3))
-        self.normal = np.zeros((0, 3))
-        self.far = np.zeros(0)
-        self.words = np.zeros((0, 4), np.uint64)
-        self.rgb = np.zeros((0, 3), np.uint8)
-        self.visible = np.zeros(0, np.int32)
-        self.found = np.zeros(0, np.int32)
-        self.born = np.zeros(0, np.int64)
-        self.n_obs = np.zeros(0, np.int32)
-        self.obs_at = np.zeros(0, np.int64)
-        self.obs_capacity = np.zeros(0, np.int32)
-        self.obs_kf = np.zeros(0, np.int32)
-        self.obs_ft = np.zeros(0, np.int32)
-
-    _FEATURE_TABLES = (
-        "kf_raw", "kf_response", "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right",
-        "kf_words",
-    )  # fmt: skip
-    _KEYFRAME_TABLES = (
-        "kf_alive", "kf_id", "kf_map", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_point",
-        *_FEATURE_TABLES,
-    )  # fmt: skip
-    _POINT_TABLES = (
-        "alive", "id", "position", "normal", "far", "words", "rgb", "visible", "found", "born", "n_obs", "obs_at",
-        "obs_capacity",
-    )  # fmt: skip
 
     # ------------------------------------------------------------------ keyframes
 
@@ -161,13 +136,13 @@ class Map:
         if not self.next_keyframe:
             self.kf_words, self.words = np.zeros((0, 0, words), np.uint64), np.zeros((0, words), np.uint64)
         if n > self._features:
-            self._grow((*self._FEATURE_TABLES, "kf_point"), n, axis=1)
+            self._grow(FEATURE_TABLES, n, axis=1)
             self.kf_point[:, self._features :] = -1
             self._features = n
         free = np.flatnonzero(~self.kf_alive)
         if not len(free):
             free = np.array([self.kf_alive.size])
-            self._grow(self._KEYFRAME_TABLES, max(16, self.kf_alive.size + self.kf_alive.size // 2))
+            self._grow(KEYFRAME_TABLES | FEATURE_TABLES, max(16, self.kf_alive.size + self.kf_alive.size // 2))
         slot = int(free[0])
         self.kf_alive[slot] = True
         self.kf_id[slot] = self.next_keyframe
@@ -182,7 +157,7 @@ class Map:
             raw.xy, raw.response, observations.xy, observations.right, observations.z, observations.octave,
             observations.angle, observations.info, observations.info_right, observations.words,
         )  # fmt: skip
-        for name, values in zip(self._FEATURE_TABLES, features, strict=True):
+        for name, values in zip(FEATURE_TABLES, features, strict=False):
             getattr(self, name)[slot, :n] = values
         self.kf_point[slot] = -1
         return slot
@@ -194,7 +169,7 @@ class Map:
 
     def take_over(self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int) -> None:
         """Become the map of complete tables, in which every slot is in use; see `atlas`."""
-        for name in (*self._KEYFRAME_TABLES, *self._POINT_TABLES, "obs_kf", "obs_ft"):
+        for name in KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES | OBSERVATION_TABLES:
             setattr(self, name, tables[name])
         self._features = self.kf_words.shape[1]
         self._top, self._observations = self.alive.size, self.obs_kf.size
@@ -257,7 +232,7 @@ class Map:
         reused = [self._free_points.pop() for _ in range(min(n, len(self._free_points)))]
         fresh = n - len(reused)
         if self._top + fresh > self.alive.size:
-            self._grow(self._POINT_TABLES, max(2048, self._top + fresh, self.alive.size + self.alive.size // 2))
+            self._grow(POINT_TABLES, max(2048, self._top + fresh, self.alive.size + self.alive.size // 2))
         slots = np.concatenate([np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)])
         self._top += fresh
         self.alive[slots] = True

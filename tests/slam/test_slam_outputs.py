@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
-from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.slam.map_files import write_keyframes_csv, write_ply
@@ -53,12 +52,6 @@ def test_binary_ply_byte_by_byte(tmp_path, points):
     for i, (x, y, z, r, g, b, n) in enumerate(struct.iter_unpack("<fffBBBi", body)):
         assert np.allclose((x, y, z), map_outputs.positions[i], atol=1e-6)
         assert (r, g, b) == tuple(map_outputs.colours[i]) and n == map_outputs.observations[i]
-
-
-def test_an_unwritable_folder_is_an_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DynslamError):
-        write_ply(tmp_path / "file" / "map.ply", outputs())
 
 
 def test_the_figure_of_a_run_has_five_filled_panels(tmp_path):
