@@ -177,7 +177,7 @@ class RgbdBackend:
         last, stamp, tracking = self._last_frame(frame, raw), frame.timestamp, self.settings.tracking
         rolling = bool(tracking.rolling_shutter and self.camera.readout_s and self._tracked)
         observations = self.shutter.predicted(raw, last, stamp) if rolling else raw
-        prediction = self.motion.predicted(last, stamp)
+        prediction, _ = self.motion.expected(last, stamp)
         initial, root = self._initial_pose(frame, raw, observations, last, prediction)
         if initial is None:
             return self._lose(frame, raw, last, prediction)
@@ -268,7 +268,8 @@ class RgbdBackend:
     ) -> BackendResult:
         """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
         self.state, self._first = "lost", None
-        textured = self._usable_features(observations) >= MIN_INITIAL
+        usable = np.count_nonzero(observations.z > 0) if self.uses_depth else len(observations)
+        textured = bool(usable >= MIN_INITIAL)
         if self._tracked:
             self._gate.lose(last, observations, textured=textured)
         self._tracked = False
@@ -281,7 +282,7 @@ class RgbdBackend:
         return begun or self._result(None if self._last is None else prediction)
 
     def _forget_motion(self) -> None:
-        self.motion.forget()
+        self.motion.state = None
         self.shutter.velocity = None
 
     def _update_state(self) -> None:
@@ -312,10 +313,6 @@ class RgbdBackend:
         rolling = self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked
         self._first = (frame, observations) if rolling else None
         return result
-
-    def _usable_features(self, observations: Observations) -> int:
-        """How many features a map could begin with."""
-        return int(np.count_nonzero(observations.z > 0)) if self.uses_depth else len(observations)
 
     def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> BackendResult:
         """The frame becomes the first keyframe of the active map."""

@@ -465,17 +465,13 @@ class Edge:
     T_other_one: Array
     weight: float = 1.0
 
-    def scaled(self, factor: float) -> Edge:
-        """The same edge after lengths were multiplied by a factor."""
-        pose = self.T_other_one.copy()
-        pose[:3, 3] *= factor
-        return Edge(self.one, self.other, pose, self.weight)
-
 
 def rescaled_edges(edges: Sequence[Edge], ids: Slots, factors: Array) -> list[Edge]:
     """The edges after lengths at keyframes were multiplied by factors."""
     by_id = dict(zip(ids.tolist(), factors.tolist(), strict=True))
-    return [edge.scaled(by_id.get(edge.one, 1.0)) for edge in edges]
+    poses = np.array([edge.T_other_one for edge in edges]).reshape(-1, 4, 4)
+    poses[:, :3, 3] *= np.reshape([by_id.get(edge.one, 1.0) for edge in edges], (-1, 1))
+    return [replace(edge, T_other_one=pose) for edge, pose in zip(edges, poses, strict=True)]
 
 
 def transferred_edges(edges: Sequence[Edge], culled: int, replacement: int, T_culled_replacement: Array) -> list[Edge]:

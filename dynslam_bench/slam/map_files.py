@@ -89,9 +89,6 @@ class MapFeatures(Record):
         """Scale of each level."""
         return np.asarray(self.scale_factor ** np.arange(self.levels, dtype=np.float64))
 
-    def __str__(self) -> str:
-        return f"{self.extractor}, {self.levels} levels of {self.scale_factor:g}"
-
 
 class MapHeader(Record):
     """What a map file says of the map.

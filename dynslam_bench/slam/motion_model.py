@@ -213,10 +213,6 @@ class CameraMotion:
         self.state: MotionState | None = None
         self.intervals: deque[float] = deque(maxlen=INTERVALS)
 
-    def forget(self) -> None:
-        """The camera was lost: nothing is known of its motion."""
-        self.state = None
-
     def relocated(self, T_cam_world: Array) -> None:
         """The same motion at another pose, as after bundle adjustment."""
         if self.state is not None:
@@ -234,12 +230,10 @@ class CameraMotion:
         if self.state is not None:
             self.state = self.state.transformed(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], scale)
 
-    def predicted(self, last: TrackedFrame, timestamp: float) -> Array:
-        """World-to-camera pose at a time; that of the last tracked frame where nothing is known of the gap."""
-        return self.expected(last, timestamp)[0]
-
     def expected(self, last: TrackedFrame, timestamp: float, *, jitter: float = 0.0) -> tuple[Array, Array | None]:
-        """`predicted`, and the covariance of the motion since the last frame (`MotionState.motion_covariance`).
+        """World-to-camera pose at a time, and the covariance of the motion since the last frame.
+
+        Where nothing is known of the gap it is the pose of the last tracked frame, and no covariance.
 
         Args:
             last: The last tracked frame.

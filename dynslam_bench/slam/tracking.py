@@ -5,7 +5,7 @@ All functions are pure: they read the map and never change it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -401,10 +401,6 @@ class MapFit:
     def count(self) -> int:
         """Number of inliers."""
         return int(np.count_nonzero(self.inliers))
-
-    def refit(self, observations: Observations, camera: Camera) -> MapFit:
-        """The pose fitted again to the same matches, the features of which have moved a little."""
-        return replace(self, estimate=solve(camera, observations, self.matches, self.estimate.T_cam_world))
 
 
 def track_local_map(

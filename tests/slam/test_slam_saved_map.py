@@ -86,7 +86,7 @@ def test_a_loaded_map_continues_to_grow(made, tmp_path, loops):
     ("change", "features", "words"),
     [
         ({"monocular": True}, {}, "'rgbd'.* 'rgb'"),
-        ({}, {"levels": 4}, "8 levels .* 4 levels"),
+        ({}, {"levels": 4}, "levels=8 .* levels=4"),
         ({}, {"extractor": "mine"}, "mine"),
         ({"size": (320, 240)}, {}, "width 640.0 instead of 320.0"),
         ({"file": "none.npz"}, {}, "none.npz"),
