@@ -99,8 +99,8 @@ class TwoViewMotion:
     def continued(self, newest: View, camera: Camera) -> Array:
         """Pose ``[4, 4]`` from the first camera's frame to that of a newer view, which shows some of the points."""
         _, ours, theirs = np.intersect1d(self.matches[:, 0], newest.matches[:, 0], return_indices=True)
-        rows, seen = newest.matches[theirs, 1], newest.observations
-        measured = seen.xy[rows], seen.right[rows], seen.info[rows], seen.info_right[rows]
+        rows, newer = newest.matches[theirs, 1], newest.observations
+        measured = newer.xy[rows], newer.right[rows], newer.info[rows], newer.info_right[rows]
         return optimise_pose(self.T_second_first, self.points[ours], *measured, camera).T_cam_world
 
     def same_as(self, other: TwoViewMotion) -> bool:
@@ -300,8 +300,8 @@ def _adjusted(
     point_of_feature = np.full(len(first), -1, np.int64)
     point_of_feature[matches[:, 0]] = np.arange(len(matches))
     columns = []
-    seen = [(first, matches[:, [0, 0]]), *((view.observations, view.matches) for view in later)]
-    for number, (observations, rows) in enumerate(seen):
+    views = [(first, matches[:, [0, 0]]), *((view.observations, view.matches) for view in later)]
+    for number, (observations, rows) in enumerate(views):
         point = point_of_feature[rows[:, 0]]
         rows = rows[point >= 0, 1]
         columns.append((np.full(len(rows), number), point[point >= 0], observations.xy[rows], observations.info[rows]))
