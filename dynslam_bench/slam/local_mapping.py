@@ -275,7 +275,7 @@ class LocalMapper:
         older = kept[world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT_SHARE]
         distant = older[~np.isin(older, near)]
         chosen = next((slots for slots in (distant, older, kept) if len(slots)), kept)
-        return np.roll(chosen, -COMPARED * world.next_keyframe)[:COMPARED]
+        return np.asarray(np.roll(chosen, -COMPARED * world.next_keyframe)[:COMPARED])
 
     def cull_keyframe(self, slot: int) -> None:
         """Remove a keyframe; `culled` names its replacement, the most covisible keyframe or the newest of its map."""

@@ -89,6 +89,8 @@ class Map:
             setattr(self, name, np.zeros((0, *shape), kind))
 
     if TYPE_CHECKING:
+        obs_kf: Ints
+        obs_ft: Ints
 
         def __getattr__(self, name: str) -> NDArray[Any]: ...
 

@@ -136,7 +136,7 @@ class _Axes:
 
     def pixels(self, xy: Array) -> NDArray[np.int64]:
         offset = (xy - self._centre) * self._scale * (1, -1)
-        return np.rint(offset + np.array(PANEL) / 2).clip(-10000, 10000).astype(np.int64)
+        return np.asarray(np.rint(offset + np.array(PANEL) / 2).clip(-10000, 10000), np.int64)
 
     def line(self, xy: Array, colour: Colour, width: int = 1) -> None:
         self.draw.line(self.pixels(xy).ravel().tolist(), colour, width)
