@@ -92,7 +92,6 @@ instance_iou  # segmenter evaluate
 tracker_provenance  # provenance.json of an export
 checked  # record of a fetched sequence
 improves  # a study's summary
-cost_before  # BundleResult, printed by tests/benchmarks/backend_bundle.py
 cost_after  # BundleResult, the same
 frame_error_trans_m  # a column of frames.csv
 frame_error_rot_deg  # a column of frames.csv

@@ -49,7 +49,7 @@ class FrameBundle:
     mask: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
-        return len(self.keypoints)
+        return len(self.xy)
 
 
 @dataclass(frozen=True, eq=False)

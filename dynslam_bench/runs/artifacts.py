@@ -20,7 +20,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_ply
-from dynslam_bench.slam.sheet import draw_sheet, write_sheet
+from dynslam_bench.slam.run_figure import write_run_figure
 
 if TYPE_CHECKING:
     from dynslam_bench.envs.episode import FrameOutcome
@@ -244,8 +244,10 @@ class SheetWriter:
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
         truth, ate_m = aligned_truth(sequence.ground_truth, track)
-        sheet = draw_sheet(title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES)
-        write_sheet(self._path, sheet)
+        input_image = sequence[0].rgb
+        write_run_figure(
+            self._path, title, input_image, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES
+        )
 
 
 VIDEO_FILE = "video.webm"

@@ -104,7 +104,6 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
     part = part_of(sequence, spec.offset)
     installed = versions()  # another version of what computes with the run's data may give other bits
-    libraries = [*LIBRARIES, *({"gtsam"} & {str(value) for value in flatten(settings).values()})]
     datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
     dataset = datasets.get(spec.sequence.partition("/")[0])
     sequence_plugin = "" if dataset is None else plugin_digest(dataset.entry_point)
@@ -133,7 +132,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         "drop_share": spec.drop_share,
         "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
-        "libraries": {name: installed.get(name, "") for name in libraries},
+        "libraries": {name: installed.get(name, "") for name in LIBRARIES},
         **({"sequence_plugin": sequence_plugin} if sequence_plugin else {}),
     }
     return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)

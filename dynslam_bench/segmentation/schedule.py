@@ -27,7 +27,7 @@ SMOOTHING = 0.5
 
 
 class MaskScheduler:
-    """The segmentation stage of a pipeline (`slam.pipeline.MaskStage`): one call a frame, in order.
+    """The segmentation stage of a `SlamPipeline`: one call a frame, in order.
 
     Args:
         settings: When to segment, how to carry masks, how long to bridge missed detections.

@@ -1,4 +1,4 @@
-"""The atlas: the root map, submaps that begin after the camera was lost, and the trajectory of all tracked frames.
+"""The atlas: the root map and the submaps that begin after the camera was lost; saved maps.
 
 As in ORB-SLAM3 (Campos et al., 2021) a camera that is not relocalised begins a new submap, which is merged when a place
 of another map is recognised. Keyframes and points of all maps lie in one `Map` (`Map.kf_map` says which is whose; 0 is
@@ -7,7 +7,7 @@ the root map). The atlas knows where an unmerged submap may lie. Poses count in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map import Array, Map
 from dynslam_bench.slam.map_files import (
     FEATURE_ARRAYS,
     KEYFRAME_ARRAYS,
@@ -32,10 +31,6 @@ from dynslam_bench.slam.map_files import (
     read_map,
     write_map,
 )
-from dynslam_bench.slam.motion_model import pose_covariance, smooth
-from dynslam_bench.slam.settings import MotionModelSettings
-
-Array = NDArray[np.float64]
 
 MAX_UNIT_RATIO = 10.0
 """Without depth each map has its own unit of length, the median depth of its first views: their largest ratio."""
@@ -155,74 +150,6 @@ class Atlas:
         return submap.anchor, submap.bound_m + length + bound_m
 
 
-# ---------------------------------------------------------------------- the trajectory
-
-
-class TrajectoryHistory:
-    """All tracked frames: stamp, reference keyframe and pose relative to it, so that refinement moves them along."""
-
-    _TABLES = ("_stamp", "_reference", "_relative", "_information")
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._stamp = np.zeros(64)
-        self._reference = np.zeros(64, np.int32)
-        self._relative = np.zeros((64, 4, 4))
-        self._information = np.zeros((64, 6, 6), np.float32)
-
-    def append(self, stamp: float, reference: int, T_cam_ref: Array, information: Array) -> None:
-        """Add a tracked frame: stamp, reference keyframe's slot, ``T_cam_ref`` and the information of the pose."""
-        if self.count == len(self._stamp):
-            for name in self._TABLES:
-                table = getattr(self, name)
-                setattr(self, name, np.concatenate([table, np.zeros_like(table)]))
-        self._stamp[self.count] = stamp
-        self._reference[self.count] = reference
-        self._relative[self.count] = T_cam_ref
-        self._information[self.count] = information
-        self.count += 1
-
-    def reanchor_newest(self, world: Map, reference: int, T_cam_world: Array) -> None:
-        """The newest frame's pose is known from another keyframe, with its world."""
-        self._reference[self.count - 1] = reference
-        self._relative[self.count - 1] = T_cam_world @ se3.inverse(world.kf_pose[reference])
-
-    def replace_keyframe(self, culled: int, replacement: int, T_culled_replacement: Array) -> None:
-        """The frames of a culled keyframe become relative to its replacement."""
-        rows = np.flatnonzero(self._reference[: self.count] == culled)
-        self._relative[rows] = self._relative[rows] @ T_culled_replacement
-        self._reference[rows] = replacement
-
-    def rescale(self, scales: Mapping[int, float]) -> None:
-        """Lengths around keyframes, by their slots, were multiplied by scales: so are those of their frames."""
-        for reference, scale in scales.items():
-            rows = np.flatnonzero(self._reference[: self.count] == reference)
-            self._relative[rows, :3, 3] *= scale
-            self._information[rows, :3] /= scale
-            self._information[rows, :, :3] /= scale
-
-    def poses(self, world: Map) -> tuple[Array, Array, Array]:
-        """Stamps ``[N]``, ``T_cam_world`` ``[N, 4, 4]`` with the present keyframes, information ``[N, 6, 6]``.
-
-        Frames of unmerged submaps are left out: where they were taken in the root map's world is unknown.
-        """
-        rows = np.flatnonzero(world.kf_map[self._reference[: self.count]] == 0)
-        poses = self._relative[rows] @ world.kf_pose[self._reference[rows]]
-        return self._stamp[rows], poses, self._information[rows].astype(np.float64)
-
-    def trajectory(self, world: Map, motion: MotionModelSettings) -> Trajectory:
-        """Camera-to-world poses in the order of their stamps, smoothed where the settings say so."""
-        stamps, poses, information = self.poses(world)
-        order = np.argsort(stamps, kind="stable")
-        fresh = np.r_[True, np.diff(stamps[order]) > 0] if len(order) else np.zeros(0, bool)
-        rows = order[fresh]
-        stamps, poses = stamps[rows], poses[rows]
-        if motion.smooth and len(stamps) > 2:
-            covariances = [pose_covariance(*pair) for pair in zip(poses, information[rows], strict=True)]
-            poses = smooth(stamps, poses, np.array(covariances), motion)
-        return Trajectory(stamps, se3.inverse(poses))
-
-
 # ---------------------------------------------------------------------- from and to a file
 
 
@@ -277,11 +204,8 @@ def packed(atlas: Atlas) -> dict[str, NDArray[Any]]:
     arrays = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
     arrays |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
     arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
-    row_of_point = np.full(world.alive.size + 1, -1, np.int32)  # the last one stands for "no point"
-    row_of_point[points] = np.arange(len(points))
     row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
-    arrays["kf_point"] = row_of_point[arrays["kf_point"]]
     arrays["obs_kf"] = row_of_keyframe[world.obs_kf[observations]]
     arrays["obs_ft"] = world.obs_ft[observations]
     submaps = atlas.submaps.values()
@@ -307,7 +231,8 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
         rows = arrays[name]
         tables[name] = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
         tables[name][in_use] = rows
-    tables["kf_point"][~in_use] = -1
+    tables["kf_point"] = np.full(in_use.shape, -1, np.int32)
+    tables["kf_point"][arrays["obs_kf"], arrays["obs_ft"]] = np.repeat(np.arange(len(n_obs)), n_obs)
     tables["obs_at"], tables["obs_capacity"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
     tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)

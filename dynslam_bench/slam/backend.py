@@ -4,28 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FrameBundle, KeyframeView
+from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.contracts.tracker import MapOutputs, TrackingState
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.slam.atlas import TrajectoryHistory, open_atlas, save_atlas
-from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser, View
-from dynslam_bench.slam.keyframes import DEPTH_IMAGES, KeyframePolicy, MapViews
-from dynslam_bench.slam.local_mapping import LocalMapper
+from dynslam_bench.slam.atlas import open_atlas, save_atlas
+from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser
+from dynslam_bench.slam.keyframes import DEPTH_IMAGES, KeyframePolicy, MapView, MapViews
+from dynslam_bench.slam.local_mapping import LocalMapper, MapState
 from dynslam_bench.slam.loop_closing import LoopCloser
+from dynslam_bench.slam.map import Array
 from dynslam_bench.slam.map_files import MapFeatures
-from dynslam_bench.slam.motion_model import CameraMotion
-from dynslam_bench.slam.observation import Observations, observe
-from dynslam_bench.slam.relocalisation import InitialPose, MotionBound, PoseSearch, RelocalisationGate
+from dynslam_bench.slam.motion_model import JITTER, CameraMotion, FramePose, rescale, trajectory
+from dynslam_bench.slam.relocalisation import PoseSearch, RelocalisationGate
 from dynslam_bench.slam.rolling_shutter import (
     MIN_AGREEING,
     CameraVelocity,
@@ -33,9 +32,16 @@ from dynslam_bench.slam.rolling_shutter import (
     compensate_rolling_shutter,
 )
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
-from dynslam_bench.slam.tracking import LocalMap, MapFit, TrackedFrame, track_local_map
-
-Array = NDArray[np.float64]
+from dynslam_bench.slam.tracking import (
+    InitialPose,
+    LocalMap,
+    MapFit,
+    Observations,
+    TrackedFrame,
+    observe,
+    pose_from_last_frame,
+    track_local_map,
+)
 
 MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
@@ -89,18 +95,18 @@ class RgbdBackend:
 
     uses_depth = True
     """Whether depth is read; where it is not, the pipeline hides it."""
-    settings_type: type[BackendSettings] = BackendSettings
 
     def __init__(
         self,
-        settings: BackendSettings | None = None,
+        settings: BackendSettings,
         *,
         scale_factor: float = 1.2,
         levels: int = 8,
         extractor: str = "orb",
     ) -> None:
-        self.settings = settings or self.settings_type()
+        self.settings = settings
         self._features = MapFeatures(extractor=extractor, levels=max(levels, 1), scale_factor=scale_factor)
+        self._scales = self._features.scales
         self._ready = False
 
     def configure(self, settings: BackendSettings) -> None:
@@ -126,7 +132,7 @@ class RgbdBackend:
         self.atlas = open_atlas(s.map.file, self.camera, self._features, depth=self.uses_depth)
         self.world = self.atlas.world
         self.mapper = LocalMapper(self.world, s)
-        self.history = TrajectoryHistory()
+        self.history: list[FramePose] = []
         self.motion = CameraMotion(s.motion)
         self.shutter = RollingShutter(self.camera, self.motion.intervals)
         self.loops = LoopCloser(self.atlas, self.mapper, s, self.seed, scale_is_known=self.uses_depth)
@@ -141,6 +147,7 @@ class RgbdBackend:
         self._reference = -1
         self._last: TrackedFrame | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
+        self._before_full: MapState | None = None
         self._ready = True
 
     # ------------------------------------------------------------------ one frame
@@ -158,8 +165,8 @@ class RgbdBackend:
         """
         assert self._ready, "reset() comes before track()"
         begin = perf_counter()
-        self.resume()
-        observations = observe(frame, keep, weight, self.camera, self._features.scales)
+        self._resume()
+        observations = observe(frame, keep, weight, self.camera, self._scales)
         result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
         tracking = perf_counter() - begin - sum(result.timings.values())
         stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
@@ -167,23 +174,17 @@ class RgbdBackend:
 
     def _track(self, frame: FrameBundle, raw: Observations) -> BackendResult:
         """Predict, match the last frame or relocalise, track the local map, insert a keyframe."""
-        last, stamp = self._last_frame(frame, raw), frame.timestamp
-        observations = self.shutter.predicted(raw, last, stamp) if self._rolling else raw
-        prediction = self.motion.predicted(last, stamp)
-        search = self._search(frame, raw, observations, last, prediction)
-        root = search.in_root_map()
-        initial = search.from_last_frame() or search.relocalised()
-        if initial is None and root is not None:  # the camera is lost in the submap, and found in the root map
-            initial, root, self._tracked = root, None, False
-            self._gate.start(last)
-            self._forget_motion()
+        last, stamp, tracking = self._last_frame(frame, raw), frame.timestamp, self.settings.tracking
+        rolling = bool(tracking.rolling_shutter and self.camera.readout_s and self._tracked)
+        observations = self.shutter.predicted(raw, last, stamp) if rolling else raw
+        prediction, _ = self.motion.expected(last, stamp)
+        initial, root = self._initial_pose(frame, raw, observations, last, prediction)
         if initial is None:
             return self._lose(frame, raw, last, prediction)
         _, points = self._local_map.around(initial.keyframe)
-        tracking = self.settings.tracking
         fit = track_local_map(self.world, observations, initial.matches, initial.T_cam_world, points, tracking)
         velocity = None
-        if self._rolling:
+        if rolling and self._tracked:
             force = self._first is not None
             observations, fit, velocity = self.shutter.refitted(raw, observations, fit, last, stamp, force=force)
         if self._grows:
@@ -200,36 +201,50 @@ class RgbdBackend:
             result = self._update_map(frame, tracked, fit, root)
         return replace(result, matches=len(fit.matches), inliers=fit.count, relocalised=initial.relocalised)
 
-    def _search(
+    def _initial_pose(
         self, frame: FrameBundle, raw: Observations, observations: Observations, last: TrackedFrame, prediction: Array
-    ) -> PoseSearch:
-        """The search for the frame's initial pose: what the camera can see, and where it can be."""
-        bound: partial[MotionBound]
+    ) -> tuple[InitialPose | None, InitialPose | None]:
+        """The frame's initial pose, and its pose in the root map where a submap's camera is found there, too."""
+        world, reference = self.world, self._reference
+        candidate, trusted = pose_from_last_frame(
+            world, last, observations, prediction, reference, self.settings.tracking
+        )
+        initial = None
+        if candidate is not None and trusted and self._tracked:
+            initial = candidate.initial_pose(relocalised=False)
+            if not self.atlas.active:
+                return initial, None
         if self._tracked:
-            keyframes, _ = self._local_map.around(self._reference)
-            bound = partial(self._gate.while_tracked, last, raw, frame.timestamp, prediction)
+            keyframes, _ = self._local_map.around(reference)
+            bound = self._gate.while_tracked(last, raw, frame.timestamp, prediction)
         else:  # how other submaps lie to the active one is unknown
-            keyframes = self.world.keyframes
-            keyframes = keyframes[np.isin(self.world.kf_map[keyframes], (0, self.atlas.active))]
-            bound = partial(self._gate.while_lost, last, raw, frame.timestamp)
-        return PoseSearch(
-            self.atlas, observations, last, prediction, self._reference, keyframes, not self._tracked, cache(bound),
-            self.settings, self.seed, frame.index,
-        )  # fmt: skip
+            keyframes = world.keyframes
+            keyframes = keyframes[np.isin(world.kf_map[keyframes], (0, self.atlas.active))]
+            bound = self._gate.while_lost(last, raw, frame.timestamp)
+        search = PoseSearch(
+            world, observations, reference, keyframes, not self._tracked, bound, self.settings, self.seed, frame.index
+        )
+        root = search.in_root_map() if self._tracked and self.atlas.active else None
+        initial = initial or search.relocalised(candidate)
+        if initial is None and root is not None:  # the camera is lost in the submap, and found in the root map
+            self._tracked = False
+            self._gate.start(last)
+            self._forget_motion()
+            return root, None
+        return initial, root
 
     def _last_frame(self, frame: FrameBundle, observations: Observations) -> TrackedFrame:
         """The last tracked frame; an empty one before the camera is found in a loaded map."""
         if self._last is not None:
             return self._last
-        if len(observations) and 8 * observations.words.shape[1] != self.world.descriptor_bytes:
+        stored, own = (8 * words.shape[1] for words in (self.world.words, observations.words))
+        if len(observations) and own != stored:
             raise TrackerError(
-                f"the map's descriptors have {self.world.descriptor_bytes} bytes, frame {frame.index}'s "
-                f"{8 * observations.words.shape[1]}",
+                f"the map's descriptors have {stored} bytes, frame {frame.index}'s {own}",
                 "make the map with the same features",
             )
-        none = observe(
-            frame, np.zeros(len(frame), bool), np.zeros(len(frame), np.float32), self.camera, self._features.scales
-        )
+        nothing = np.zeros(len(frame.xy))
+        none = observe(frame, nothing.astype(bool), nothing.astype(np.float32), self.camera, self._scales)
         return TrackedFrame(none, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
     def _accept(self, frame: FrameBundle, observations: Observations, fit: MapFit, last: TrackedFrame) -> TrackedFrame:
@@ -237,7 +252,7 @@ class RgbdBackend:
         points = fit.matches.point[fit.inliers]
         if self._grows:
             self.world.found[points] += 1
-        point = np.full(len(observations), -1, np.int64)
+        point = np.full(len(observations.xy), -1, np.int64)
         point[fit.matches.feature[fit.inliers]] = points
         pose = self.motion.filtered(last, frame.timestamp, fit.estimate.T_cam_world, fit.estimate.information)
         self._tracked, self._unrecognised = True, 0
@@ -253,7 +268,8 @@ class RgbdBackend:
     ) -> BackendResult:
         """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
         self.state, self._first = "lost", None
-        textured = self._usable_features(observations) >= MIN_INITIAL
+        usable = np.count_nonzero(observations.z > 0) if self.uses_depth else len(observations)
+        textured = bool(usable >= MIN_INITIAL)
         if self._tracked:
             self._gate.lose(last, observations, textured=textured)
         self._tracked = False
@@ -266,13 +282,8 @@ class RgbdBackend:
         return begun or self._result(None if self._last is None else prediction)
 
     def _forget_motion(self) -> None:
-        self.motion.forget()
+        self.motion.state = None
         self.shutter.velocity = None
-
-    @property
-    def _rolling(self) -> bool:
-        """Whether the rolling shutter of the next frame can be compensated."""
-        return bool(self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked)
 
     def _update_state(self) -> None:
         """Poses count in the world of the root map alone."""
@@ -299,12 +310,9 @@ class RgbdBackend:
         if np.count_nonzero(observations.z > 0) < MIN_INITIAL:
             return self._result(None)
         result = self._begin_map(frame, observations, np.eye(4))
-        self._first = (frame, observations) if self._rolling else None
+        rolling = self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked
+        self._first = (frame, observations) if rolling else None
         return result
-
-    def _usable_features(self, observations: Observations) -> int:
-        """How many features a map could begin with."""
-        return int(np.count_nonzero(observations.z > 0)) if self.uses_depth else len(observations)
 
     def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> BackendResult:
         """The frame becomes the first keyframe of the active map."""
@@ -314,7 +322,7 @@ class RgbdBackend:
         )
         timings = self._insert_keyframe(frame, tracked)
         self._update_state()
-        self.history.append(frame.timestamp, self._reference, np.eye(4), KNOWN_POSE)
+        self._remember(frame, np.eye(4), KNOWN_POSE)
         points = int(np.count_nonzero(tracked.point >= 0))
         return replace(self._result(T_cam_world, timings), matches=points, inliers=points)
 
@@ -365,13 +373,14 @@ class RgbdBackend:
             pose = tracked.T_cam_world
             self.motion.relocated(pose)
         relative = pose @ se3.inverse(self.world.kf_pose[self._reference])
-        self.history.append(frame.timestamp, self._reference, relative, fit.estimate.information)
+        self._remember(frame, relative, fit.estimate.information)
         self._update_state()
         result = replace(self._result(tracked.T_cam_world, timings), residual_px=fit.estimate.residual_px)
         if root is None or not self.atlas.active or not self.loops.in_root_map:
             return result
         # the camera is in the root map, too: there its pose counts, and it may continue there
-        self.history.reanchor_newest(self.world, root.keyframe, root.T_cam_world)
+        self.history[-1].reference = root.keyframe
+        self.history[-1].T_cam_ref = root.T_cam_world @ se3.inverse(self.world.kf_pose[root.keyframe])
         if self.loops.leaves_submap:
             point = np.full(len(tracked.observations), -1, np.int64)
             point[root.matches.feature] = np.where(self.world.alive[root.matches.point], root.matches.point, -1)
@@ -379,6 +388,9 @@ class RgbdBackend:
             self._forget_motion()
             self._update_state()
         return replace(result, T_world_cam=se3.inverse(root.T_cam_world), state="ok")
+
+    def _remember(self, frame: FrameBundle, T_cam_ref: Array, information: Array) -> None:
+        self.history.append(FramePose(frame.timestamp, self._reference, T_cam_ref, information.astype(np.float32)))
 
     def _insert_keyframe(
         self, frame: FrameBundle, tracked: TrackedFrame, root: InitialPose | None = None
@@ -390,12 +402,13 @@ class RgbdBackend:
         )
         self._reference = slot
         for culled, replacement, relative in mapper.culled:
-            self.history.replace_keyframe(culled, replacement, relative)
+            for pose in (pose for pose in self.history if pose.reference == culled):
+                pose.reference, pose.T_cam_ref = replacement, pose.T_cam_ref @ relative
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             before = world.kf_pose[slot].copy()
             self.loops.close(slot, tracked.observations, root)
-            self.history.rescale(self.loops.rescaled)
+            rescale(self.history, self.loops.rescaled)
             if slot in self.loops.rescaled:  # the rotation by a loop with depth is within the motion's noise
                 self.motion.transformed(before, world.kf_pose[slot], self.loops.rescaled[slot])
             timings["loop_closing"] = perf_counter() - begin
@@ -408,39 +421,27 @@ class RgbdBackend:
 
     # ------------------------------------------------------------------ what filters and files read
 
-    def predict(self, timestamp: float) -> Array | None:
-        """The motion model's camera-to-world pose at a time, after a long gap the last tracked one; None while lost.
+    def predict(self, timestamp: float) -> tuple[Array | None, Array | None]:
+        """Camera-to-world pose at a time, and the covariance of the motion since the last frame; None while lost.
+
+        The covariance ``[6, 6]`` is of (position in the world in metres, rotation in the camera frame in radians). It
+        is None after a gap that nothing is assumed about; the pose is the last tracked one then.
 
         Args:
             timestamp: The stamp of the next frame, seconds.
         """
         if self._last is None or not self._tracked:
-            return None
-        return se3.inverse(self.motion.predicted(self._last, self.motion.regular(self._last, timestamp)))
+            return None, None
+        T_cam_world, covariance = self.motion.expected(self._last, timestamp, jitter=JITTER)
+        return se3.inverse(T_cam_world), covariance
 
-    def motion_covariance(self, timestamp: float) -> Array | None:
-        """Covariance ``[6, 6]`` of the camera's motion since the last frame, about the predicted one.
-
-        It is of (position in the world in metres, rotation in the camera frame in radians); None while lost, when
-        nothing is known yet, and after a gap that nothing is assumed about.
-
-        Args:
-            timestamp: The stamp of the next frame, seconds.
-        """
-        if self._last is None:
-            return None
-        return self.motion.covariance(self._last, self.motion.regular(self._last, timestamp))
-
-    def keyframe_views(self, limit: int) -> tuple[KeyframeView, ...]:
-        """The newest keyframes of the map that the camera is in, newest first, at most `limit`."""
-        return self._views.keyframes(limit, self.atlas.active)
-
-    def map_points(self) -> tuple[NDArray[np.int64], Array]:
-        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all points of the map that the camera is in."""
-        return self._views.points(self.atlas.active)
+    def view(self) -> MapView:
+        """What filters may read of the map that the camera is in, as it was before a `finalize`."""
+        self._resume()
+        return self._views.of(self.atlas.active)
 
     def outputs(self) -> MapOutputs:
-        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet."""
+        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and pictures."""
         return self._views.outputs()
 
     def save_map(self, path: Path, made_by: str = "") -> None:
@@ -456,22 +457,21 @@ class RgbdBackend:
         """
         save_atlas(path, self.atlas, self._features, depth=self.uses_depth, made_by=made_by)
 
-    def resume(self) -> None:
+    def _resume(self) -> None:
         """The run goes on after a `finalize`: the map is again what it was before."""
-        if self.mapper.refined:
-            self.mapper.resume()
-            self._views.clear()
+        if self._before_full is not None:
+            self.mapper.restore(self._before_full)
+            self._before_full = None
 
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
 
-        With `bundle_adjustment.full` the whole map is refined first, unless the run only localises in it; `resume`
-        undoes that.
+        With `bundle_adjustment.full` the whole map is refined first, unless the run only localises in it; the next
+        frame undoes that.
         """
-        if self._grows and self.settings.bundle_adjustment.full:
-            self.mapper.adjust_all()
-            self._views.clear()
-        return self.history.trajectory(self.world, self.settings.motion)
+        if self._grows and self.settings.bundle_adjustment.full and self._before_full is None:
+            self._before_full = self.mapper.adjust_all()
+        return trajectory(self.history, self.world, self.settings.motion)
 
 
 class MonocularBackend(RgbdBackend):
@@ -492,7 +492,7 @@ class MonocularBackend(RgbdBackend):
     def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
         """Frames are ``initialising`` until one determines the motion together with an earlier one."""
         begin = perf_counter()
-        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
+        initial = self._initialiser.add(frame, observations, self.camera, self.settings.two_views)
         if initial is None:
             return self._result(None)
         return self._begin_from_two(initial, np.eye(4), perf_counter() - begin)
@@ -502,7 +502,7 @@ class MonocularBackend(RgbdBackend):
         begin = perf_counter()
         if self._unrecognised == self.settings.relocalisation.new_map_after:
             self._initialiser = TwoViewInitialiser()
-        initial = self._initialiser.add(View(frame, observations), self.camera, self.settings.two_views)
+        initial = self._initialiser.add(frame, observations, self.camera, self.settings.two_views)
         if initial is None:
             return None
         seconds = perf_counter() - begin
@@ -524,7 +524,7 @@ class MonocularBackend(RgbdBackend):
         self._views.add_keyframe(first, initial.first.frame.depth)
         self._views.add_keyframe(second, frame.depth)
         self._update_state()
-        self.history.append(frame.timestamp, second, np.eye(4), KNOWN_POSE)
+        self._remember(frame, np.eye(4), KNOWN_POSE)
         count = len(initial.motion.points)
         return replace(self._result(pose, {"mapping": seconds}), matches=count, inliers=count)
 

@@ -12,22 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.core.version import install_hint
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, NEAR_M, apply_twist, cholesky_solve
-
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
-Index = NDArray[np.int64]
+from dynslam_bench.slam.map import Array, Map, Slots
+from dynslam_bench.slam.pose_optimisation import (
+    CHI2_DEPTH,
+    CHI2_MONO,
+    apply_twist,
+    cholesky_solve,
+    observation_chi2,
+)
 
 FIXED_KEYFRAMES = 6
 """Further keyframes that observe the same points and stay where they are."""
 MAX_OBSERVATIONS = 6000
 """Observations used at most: the budget that bounds the time of a keyframe."""
-FIXED_SIGMA = 1e-5
-"""For gtsam: standard deviation (rad, m) of the prior of a fixed pose; an equality constraint is seven times slower."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +48,8 @@ class BundleProblem:
     poses: Array
     variable: int
     points: Array
-    obs_pose: Index
-    obs_point: Index
+    obs_pose: Slots
+    obs_point: Slots
     uv: Array
     right: Array
     info: Array
@@ -61,47 +59,45 @@ class BundleProblem:
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
-    """Refined poses ``[P, 4, 4]`` and points ``[Q, 3]``, which observations fit, robust cost before and after."""
+    """Refined poses ``[P, 4, 4]`` and points ``[Q, 3]``, and how the observations fit them.
+
+    Attributes:
+        poses: World to camera.
+        points: World points, metres.
+        chi2: Chi-square of each observation ``[N]``; inf behind the camera.
+        inliers: bool ``[N]``, which observations fit.
+        cost: Sum of the Huber costs.
+    """
 
     poses: Array
     points: Array
+    chi2: Array
     inliers: NDArray[np.bool_]
-    cost_before: float
-    cost_after: float
+    cost: float
 
 
 @kernel
 def _cost(
-    poses: Array, points: Array, obs_pose: Index, obs_point: Index, uv: Array, right: Array, info: Array,
+    poses: Array, points: Array, obs_pose: Slots, obs_point: Slots, uv: Array, right: Array, info: Array,
     info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, chi2: Array,
 ) -> float:  # fmt: skip
     """Huber cost of all observations; fills `chi2` (inf behind the camera)."""
     total = 0.0
     for k in range(obs_pose.shape[0]):
-        pose, p = poses[obs_pose[k]], points[obs_point[k]]
-        x = pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2] + pose[0, 3]
-        y = pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2] + pose[1, 3]
-        z = pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2] + pose[2, 3]
-        depth = info_right[k] > 0.0
-        limit = CHI2_DEPTH if depth else CHI2_MONO
-        if z < NEAR_M:
-            chi2[k] = np.inf
+        _, chi2[k] = observation_chi2(
+            poses[obs_pose[k]], points[obs_point[k]], uv[k], right[k], info[k], info_right[k], fx, fy, cx, cy, bf
+        )
+        limit = CHI2_DEPTH if info_right[k] > 0.0 else CHI2_MONO
+        if chi2[k] == np.inf:
             total += 100.0 * limit
-            continue
-        u = fx * x / z + cx
-        du, dv = uv[k, 0] - u, uv[k, 1] - (fy * y / z + cy)
-        c = info[k] * (du * du + dv * dv)
-        if depth:
-            dr = right[k] - (u - bf / z)
-            c += info_right[k] * dr * dr
-        chi2[k] = c
-        total += c if c <= limit else 2.0 * np.sqrt(limit * c) - limit
+        else:
+            total += chi2[k] if chi2[k] <= limit else 2.0 * np.sqrt(limit * chi2[k]) - limit
     return total
 
 
 @kernel
 def _step(
-    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    poses: Array, variable: int, points: Array, obs_pose: Slots, obs_point: Slots, start: Slots, uv: Array,
     right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, damping: float,
     chi2: Array, new_poses: Array, new_points: Array,
 ) -> bool:  # fmt: skip
@@ -228,12 +224,11 @@ def _step(
 
 @kernel
 def _adjust(
-    poses: Array, variable: int, points: Array, obs_pose: Index, obs_point: Index, start: Index, uv: Array,
+    poses: Array, variable: int, points: Array, obs_pose: Slots, obs_point: Slots, start: Slots, uv: Array,
     right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float,
     iterations: int, chi2: Array,
-) -> tuple[Array, Array, float, float]:  # fmt: skip
+) -> tuple[Array, Array, float]:  # fmt: skip
     cost = _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, chi2)
-    before = cost
     damping = 1e-5
     trial = np.empty_like(chi2)
     for _ in range(iterations):
@@ -257,7 +252,7 @@ def _adjust(
                     break
                 continue
         damping *= 30.0
-    return poses, points, before, cost
+    return poses, points, cost
 
 
 def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
@@ -274,23 +269,11 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     guess = np.ascontiguousarray(problem.poses), problem.variable, np.ascontiguousarray(problem.points)
     measured = problem.uv, problem.right, problem.info, problem.info_right
     lens = c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m
-    poses, points, before, after = _adjust(
+    poses, points, cost = _adjust(
         *guess, problem.obs_pose, problem.obs_point, start, *measured, *lens, iterations, chi2
     )
     limit = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
-    return BundleResult(poses, points, chi2 <= limit, before, after)
-
-
-def reprojection_chi2(problem: BundleProblem, poses: Array, points: Array) -> tuple[float, Array]:
-    """Huber cost and chi-square of each observation ``[N]`` at given poses and points; inf behind the camera."""
-    c = problem.camera
-    chi2 = np.zeros(len(problem.obs_pose))
-    guess = np.ascontiguousarray(poses), np.ascontiguousarray(points)
-    measured = problem.uv, problem.right, problem.info, problem.info_right
-    cost = _cost(
-        *guess, problem.obs_pose, problem.obs_point, *measured, c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, chi2
-    )
-    return float(cost), chi2
+    return BundleResult(poses, points, chi2, chi2 <= limit, float(cost))
 
 
 # ---------------------------------------------------------------------- the bundle of a map
@@ -367,60 +350,3 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, max_observ
         world.kf_info_right[at, features], world.camera,
     )  # fmt: skip
     return Bundle(problem, poses, points, features)
-
-
-# ---------------------------------------------------------------------- the reference solver
-
-
-def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult:
-    """The same minimisation by gtsam's Levenberg-Marquardt: the reference that `adjust_bundle` is compared with.
-
-    Args:
-        problem: As for `adjust_bundle`.
-        iterations: Levenberg-Marquardt iterations at most.
-
-    Raises:
-        TrackerError: gtsam is not installed.
-    """
-    try:
-        import gtsam
-    except ImportError as error:
-        message = f"backend.bundle_adjustment.solver = gtsam needs a package that cannot be imported: {error}"
-        raise TrackerError(message, f"{install_hint('gtsam')}, or leave the setting") from error
-    camera = problem.camera
-    mono = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-    stereo = gtsam.Cal3_S2Stereo(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.baseline_m)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    pose_keys = [gtsam.symbol("x", i) for i in range(len(problem.poses))]
-    point_keys = [gtsam.symbol("l", i) for i in range(len(problem.points))]
-    prior = gtsam.noiseModel.Isotropic.Sigma(6, FIXED_SIGMA)
-    for i, pose in enumerate(np.linalg.inv(problem.poses)):
-        values.insert(pose_keys[i], gtsam.Pose3(pose))
-        if i >= problem.variable:
-            graph.add(gtsam.PriorFactorPose3(pose_keys[i], gtsam.Pose3(pose), prior))
-    for key, point in zip(point_keys, problem.points, strict=True):
-        values.insert(key, point)
-    limits = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
-    for k, limit in enumerate(limits.tolist()):
-        keys = pose_keys[problem.obs_pose[k]], point_keys[problem.obs_point[k]]
-        u, v = problem.uv[k]
-        sigma = problem.info[k] ** -0.5
-        huber = gtsam.noiseModel.mEstimator.Huber.Create(float(np.sqrt(limit)))
-        if problem.info_right[k] > 0:
-            noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma, problem.info_right[k] ** -0.5, sigma]))
-            measured = gtsam.StereoPoint2(u, problem.right[k], v)
-            robust = gtsam.noiseModel.Robust.Create(huber, noise)
-            graph.add(gtsam.GenericStereoFactor3D(measured, robust, *keys, stereo))
-        else:
-            robust = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(problem.uv[k], robust, *keys, mono))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(iterations)
-    result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    poses = problem.poses.copy()
-    for i in range(problem.variable):
-        poses[i] = np.linalg.inv(result.atPose3(pose_keys[i]).matrix())
-    points = np.array([result.atPoint3(key) for key in point_keys]).reshape(-1, 3)
-    before, _ = reprojection_chi2(problem, problem.poses, problem.points)
-    after, chi2 = reprojection_chi2(problem, poses, points)
-    return BundleResult(poses, points, chi2 <= limits, before, after)

@@ -23,14 +23,11 @@ from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.features.matching import rotation_consistent, search_in_radius
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle, reprojection_chi2
-from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import NEAR_M, optimise_pose
 from dynslam_bench.slam.settings import TwoViewSettings
-
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
+from dynslam_bench.slam.tracking import Observations
 
 MAX_DISTANCE = 50
 RATIO = 0.9
@@ -59,31 +56,18 @@ BUNDLE_ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """Matches between two views.
+class View:
+    """A frame, its features as the back end uses them, and their matches with the first view.
 
     Attributes:
-        first: int64 ``[M]``, features of the first view.
-        second: int64 ``[M]``, features of the second.
+        frame: The frame.
+        observations: Its features.
+        matches: int64 ``[M, 2]``, a feature of the first view and one of this view; none for the first view itself.
     """
 
-    first: Slots
-    second: Slots
-
-    def __len__(self) -> int:
-        return len(self.first)
-
-    def select(self, index: Slots | NDArray[np.bool_]) -> Pair:
-        """Some of the matches, by row or by mask."""
-        return Pair(self.first[index], self.second[index])
-
-
-@dataclass(frozen=True, eq=False)
-class LaterView:
-    """A view after the first, and its matches with that one."""
-
+    frame: FrameBundle
     observations: Observations
-    pair: Pair
+    matches: Slots
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +76,14 @@ class TwoViewMotion:
 
     Attributes:
         T_second_first: Pose ``[4, 4]`` from the first camera's frame to the second's.
-        pair: The matches that became points.
+        matches: int64 ``[M, 2]``, the matches of the newest view that became points.
         points: ``[M, 3]`` in the first camera's frame.
         cost: Mean chi-square of an observation, over all views.
         count: Number of observations.
     """
 
     T_second_first: Array
-    pair: Pair
+    matches: Slots
     points: Array
     cost: float
     count: int
@@ -112,10 +96,10 @@ class TwoViewMotion:
         cosine = np.sort((self.points * to_second).sum(axis=1) / np.maximum(lengths, 1e-12))
         return float(np.degrees(np.arccos(np.clip(cosine[min(WIDE_POINTS, len(cosine)) - 1], -1.0, 1.0))))
 
-    def continued(self, newer: Observations, pair: Pair, camera: Camera) -> Array:
-        """Pose ``[4, 4]`` from the first camera's frame to that of a newer view, in which `pair` shows some points."""
-        _, ours, theirs = np.intersect1d(self.pair.first, pair.first, return_indices=True)
-        rows = pair.second[theirs]
+    def continued(self, newest: View, camera: Camera) -> Array:
+        """Pose ``[4, 4]`` from the first camera's frame to that of a newer view, which shows some of the points."""
+        _, ours, theirs = np.intersect1d(self.matches[:, 0], newest.matches[:, 0], return_indices=True)
+        rows, newer = newest.matches[theirs, 1], newest.observations
         measured = newer.xy[rows], newer.right[rows], newer.info[rows], newer.info_right[rows]
         return optimise_pose(self.T_second_first, self.points[ours], *measured, camera).T_cam_world
 
@@ -133,7 +117,7 @@ class TwoViewMotion:
         return self.same_as(other) or bool(more > RIVAL_COST and other.cost > RIVAL_FACTOR * self.cost)
 
 
-def match_views(first: Observations, second: Observations, expected: Array, radius_px: float) -> Pair:
+def match_views(first: Observations, second: Observations, expected: Array, radius_px: float) -> Slots:
     """Features of two views that match by descriptor, each within a window around its last position.
 
     Args:
@@ -141,22 +125,26 @@ def match_views(first: Observations, second: Observations, expected: Array, radi
         second: The second.
         expected: Pixels ``[N, 2]`` of the first view's features in the image before the second.
         radius_px: Half side of the window.
+
+    Returns:
+        int64 ``[M, 2]``, features of the first view and of the second.
     """
     count = len(first)
     windows = expected, np.full(count, np.nan), np.full(count, radius_px)
     octaves = first.octave - 1, first.octave + 1
     free = np.ones(len(second), bool)
+    arrays = second.xy, second.right, second.octave, second.words
     feature, _ = search_in_radius(
-        second.grid, second.arrays, free, windows, octaves, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
+        second.grid, arrays, free, windows, octaves, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
     )
     rows = np.flatnonzero(feature >= 0)
     rows = rows[rotation_consistent(first.angle[rows], second.angle[feature[rows]])]
-    return Pair(rows, feature[rows])
+    return np.stack([rows, feature[rows]], axis=1)
 
 
 def possible_motions(
     first: Observations,
-    later: Sequence[LaterView],
+    later: Sequence[View],
     camera: Camera,
     settings: TwoViewSettings,
     before: Sequence[TwoViewMotion] = (),
@@ -173,12 +161,12 @@ def possible_motions(
     Returns:
         Each refined with its points, lowest cost first; none where too few matches agree with any.
     """
-    second, pair = later[-1].observations, later[-1].pair
-    xy_first, xy_second = first.xy[pair.first], second.xy[pair.second]
-    info = np.minimum(first.info[pair.first], second.info[pair.second])
+    second, matches = later[-1].observations, later[-1].matches
+    xy_first, xy_second = first.xy[matches[:, 0]], second.xy[matches[:, 1]]
+    info = np.minimum(first.info[matches[:, 0]], second.info[matches[:, 1]])
     of_homography, on_plane = _homography(xy_first, xy_second, info, camera)
     of_essential, on_lines = _essential(xy_first, xy_second, info, camera)
-    continued = [motion.continued(second, pair, camera) for motion in before]
+    continued = [motion.continued(later[-1], camera) for motion in before]
     rows = np.flatnonzero(on_plane | on_lines)
     if not len(rows):
         return []
@@ -191,7 +179,7 @@ def possible_motions(
     if most < max(settings.min_points, MIN_GOOD_SHARE * len(rows)):
         return []
     by_two = [
-        _adjusted(first, later[-1:], motion[None], pair.select(rows[good]), points[good], camera)
+        _adjusted(first, later[-1:], motion[None], matches[rows[good]], points[good], camera)
         for motion, points, good in tried
         if np.count_nonzero(good) >= RIVAL_SHARE * most
     ]
@@ -201,7 +189,7 @@ def possible_motions(
 
 def _by_cost(motions: Sequence[TwoViewMotion], settings: TwoViewSettings) -> list[TwoViewMotion]:
     """The motions with enough points, lowest cost first."""
-    enough = [motion for motion in motions if len(motion.pair) >= settings.min_points]
+    enough = [motion for motion in motions if len(motion.matches) >= settings.min_points]
     return sorted(enough, key=lambda motion: motion.cost)
 
 
@@ -294,31 +282,29 @@ def _triangulated(
 
 
 def _adjusted_by_all(
-    first: Observations, later: Sequence[LaterView], motion: TwoViewMotion, camera: Camera
+    first: Observations, later: Sequence[View], motion: TwoViewMotion, camera: Camera
 ) -> TwoViewMotion:
     """Motion and points adjusted by the views between the two, too."""
     if len(later) == 1:
         return motion
     chosen = np.unique(np.linspace(0, len(later) - 1, VIEWS).round().astype(int))
     poses = se3.exp((chosen[:, None] + 1) / len(later) * se3.log(motion.T_second_first))
-    return _adjusted(first, [later[at] for at in chosen], poses, motion.pair, motion.points, camera)
+    return _adjusted(first, [later[at] for at in chosen], poses, motion.matches, motion.points, camera)
 
 
 def _adjusted(
-    first: Observations, later: Sequence[LaterView], poses: Array, pair: Pair, points: Array, camera: Camera
+    first: Observations, later: Sequence[View], poses: Array, matches: Slots, points: Array, camera: Camera
 ) -> TwoViewMotion:
-    """Bundle adjustment of the later views' poses ``[V, 4, 4]`` and the points of the last one's `pair`."""
+    """Bundle adjustment of the later views' poses ``[V, 4, 4]`` and the points of the last one's `matches`."""
     count = len(later)
     point_of_feature = np.full(len(first), -1, np.int64)
-    point_of_feature[pair.first] = np.arange(len(pair))
+    point_of_feature[matches[:, 0]] = np.arange(len(matches))
     columns = []
-    for number, (observations, of_first, feature) in enumerate(
-        [(first, pair.first, pair.first), *((view.observations, view.pair.first, view.pair.second) for view in later)]
-    ):
-        point = point_of_feature[of_first]
-        rows = feature[point >= 0]
-        point = point[point >= 0]
-        columns.append((np.full(len(rows), number), point, observations.xy[rows], observations.info[rows]))
+    views = [(first, matches[:, [0, 0]]), *((view.observations, view.matches) for view in later)]
+    for number, (observations, rows) in enumerate(views):
+        point = point_of_feature[rows[:, 0]]
+        rows = rows[point >= 0, 1]
+        columns.append((np.full(len(rows), number), point[point >= 0], observations.xy[rows], observations.info[rows]))
     view, point, xy, info = (np.concatenate(column) for column in zip(*columns, strict=True))
     order = np.lexsort((view, point))
     view, point, xy, info = view[order], point[order], xy[order], info[order]
@@ -327,22 +313,13 @@ def _adjusted(
         xy, np.full(len(xy), np.nan), info, np.zeros(len(xy)), camera,
     )  # fmt: skip
     result = adjust_bundle(problem, BUNDLE_ITERATIONS)
-    _, chi2 = reprojection_chi2(problem, result.poses, result.points)
     kept = np.asarray(np.isfinite(result.points).all(axis=1))
     kept[point[~result.inliers & ((view == 0) | (view == count))]] = False
-    cost = float(np.minimum(chi2, CHI2_POINT).mean()) if len(chi2) else np.inf
-    return TwoViewMotion(result.poses[count - 1], pair.select(kept), result.points[kept], cost, len(chi2))
+    cost = float(np.minimum(result.chi2, CHI2_POINT).mean()) if len(result.chi2) else np.inf
+    return TwoViewMotion(result.poses[count - 1], matches[kept], result.points[kept], cost, len(result.chi2))
 
 
 # ---------------------------------------------------------------------- the initial map
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A frame, and its features as the back end uses them."""
-
-    frame: FrameBundle
-    observations: Observations
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,14 +338,14 @@ class InitialMap:
             T_first_world: Pose ``[4, 4]`` of the first view in the submap's world, world to camera.
             submap: The submap's number (`Map.kf_map`).
         """
-        pair = self.motion.pair
+        first, second = self.motion.matches.T
         slots = [
             world.add_keyframe(view.observations, pose, view.frame.index, view.frame.timestamp, submap)
             for view, pose in ((self.first, T_first_world), (self.second, self.motion.T_second_first @ T_first_world))
         ]
         position = se3.transform(se3.inverse(T_first_world), self.motion.points)
-        points = world.add_points(position, self.first.observations.rgb[pair.first], slots[0], pair.first)
-        world.observe(slots[1], pair.second, points)
+        points = world.add_points(position, self.first.observations.rgb[first], slots[0], first)
+        world.observe(slots[1], second, points)
         world.refresh(points)
         return slots[0], slots[1]
 
@@ -383,32 +360,33 @@ class TwoViewInitialiser:
     def __init__(self) -> None:
         self._first: View | None = None
         self._expected: Array = np.zeros((0, 2))
-        self.later: list[LaterView] = []
+        self.later: list[View] = []
         self._motions: list[TwoViewMotion] = []
 
-    def add(self, view: View, camera: Camera, settings: TwoViewSettings) -> InitialMap | None:
+    def add(
+        self, frame: FrameBundle, observations: Observations, camera: Camera, settings: TwoViewSettings
+    ) -> InitialMap | None:
         """Try the next frame with the first view; it becomes the first view where they have too few matches.
 
         Args:
-            view: The next frame.
+            frame: The next frame.
+            observations: Its features.
             camera: Intrinsics, without distortion.
             settings: Thresholds of the two views.
         """
-        first = self._first
-        pair = (
-            None
-            if first is None
-            else match_views(first.observations, view.observations, self._expected, settings.radius_px)
-        )
-        if first is None or pair is None or len(pair) < settings.min_matches:
-            self._first = view if len(view.observations) >= settings.min_matches else None
-            self._expected = view.observations.xy.copy()
+        first, matches = self._first, np.zeros((0, 2), np.int64)
+        if first is not None:
+            matches = match_views(first.observations, observations, self._expected, settings.radius_px)
+        view = View(frame, observations, matches)
+        if first is None or len(matches) < settings.min_matches:
+            self._first = view if len(observations) >= settings.min_matches else None
+            self._expected = observations.xy.copy()
             self.later, self._motions = [], []
             return None
-        self._expected[pair.first] = view.observations.xy[pair.second]
+        self._expected[matches[:, 0]] = observations.xy[matches[:, 1]]
         if len(self.later) >= 2 * VIEWS:
             del self.later[::2]
-        self.later.append(LaterView(view.observations, pair))
+        self.later.append(view)
         if len(self.later) < MIN_VIEWS:
             return None
         motions = possible_motions(first.observations, self.later, camera, settings, self._motions)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,11 +11,9 @@ from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import KeyframeView
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.settings import KeyframeSettings
 from dynslam_bench.slam.tracking import TrackedFrame
-
-Array = NDArray[np.float64]
 
 MIN_INLIERS = 15
 """Inliers that a keyframe needs more than (ORB-SLAM2's number)."""
@@ -25,6 +25,8 @@ VIEW_SHARE = 0.9
 """A keyframe is made when less than this share of the last keyframe's points lies in the image."""
 MOVED_SHARE = 0.97
 """The view has moved when less than this share of the last keyframe's points lies in the image."""
+VIEWS = 20
+"""Newest keyframes that filters may read (DynaSLAM's window)."""
 DEPTH_IMAGES = 8
 """Newest keyframes that keep their depth image, for filters."""
 
@@ -74,21 +76,22 @@ class KeyframePolicy:
             return True
         if inliers < s.tracked_share * established_points(world, reference):
             return True
-        view = share_in_view(world, int(world.keyframes[-1]), tracked.T_cam_world)
+        newest = int(np.where(world.kf_alive, world.kf_id, -1).argmax())
+        view = share_in_view(world, newest, tracked.T_cam_world)
         return view < VIEW_SHARE or (view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers)
 
 
 def established_points(world: Map, keyframe: int) -> int:
     """How many of a keyframe's points `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
     points = world.kf_point[keyframe]
-    required = min(ESTABLISHED, len(world.submap(int(world.kf_map[keyframe]))))
-    return int(np.count_nonzero(world.n_obs[points[points >= 0]] >= required))
+    young = np.count_nonzero(world.kf_alive & (world.kf_map == world.kf_map[keyframe]))
+    return int(np.count_nonzero(world.n_obs[points[points >= 0]] >= min(ESTABLISHED, young)))
 
 
 def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
     """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
     points = world.kf_point[keyframe]
-    local = se3.transform(T_cam_world, world.position[points[points >= 0]])
+    local = world.position[points[points >= 0]] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     if not len(local):
         return 1.0
     ahead = local[:, 2] > 0.05
@@ -97,55 +100,69 @@ def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
     return float(np.mean(inside))
 
 
+class MapView(NamedTuple):
+    """What filters may read of the map.
+
+    Attributes:
+        keyframes: The newest keyframes, newest first, at most `VIEWS`.
+        ids: int64 ``[M]``, ids of all points.
+        positions: World positions ``[M, 3]`` of the points, metres.
+    """
+
+    keyframes: tuple[KeyframeView, ...]
+    ids: Slots
+    positions: Array
+
+
 class MapViews:
-    """Keyframes and points of a map for filters, files and the sheet; filters' views are kept until `clear`.
+    """Views of a map for filters, made again after a keyframe or in another submap, and for files.
 
     Args:
         world: The map.
         depth_images: How many of the newest keyframes keep their depth image.
     """
 
-    def __init__(self, world: Map, depth_images: int = DEPTH_IMAGES) -> None:
+    def __init__(self, world: Map, depth_images: int) -> None:
         self._world = world
         self._most_images = depth_images
         self._depth_images: dict[int, NDArray[np.float32]] = {}
-        self._keyframes: dict[tuple[int, int], tuple[KeyframeView, ...]] = {}
-        self._points: dict[int, tuple[NDArray[np.int64], Array]] = {}
-
-    def clear(self) -> None:
-        """The map has changed."""
-        self._keyframes.clear()
-        self._points.clear()
+        self._made_for: tuple[int, int] | None = None
 
     def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
         """A keyframe was made; those that were culled for it lose their depth images."""
-        self.clear()
         self._depth_images[slot] = depth
         newest = self._world.keyframes[-self._most_images :].tolist() if self._most_images else []
         self._depth_images = {at: image for at, image in self._depth_images.items() if at in newest}
 
-    def keyframes(self, limit: int, submap: int) -> tuple[KeyframeView, ...]:
-        """The newest keyframes of a submap, newest first, at most `limit`."""
-        if (limit, submap) not in self._keyframes:
-            newest = self._world.submap(submap)[::-1][: max(limit, 0)].tolist()
-            self._keyframes[limit, submap] = tuple(self._keyframe(slot) for slot in newest)
-        return self._keyframes[limit, submap]
-
-    def points(self, submap: int) -> tuple[NDArray[np.int64], Array]:
-        """Ids ``[M]`` and world positions ``[M, 3]`` in metres of all map points of a submap."""
-        if submap not in self._points:
-            points = self._points_of(submap)
-            self._points[submap] = self._world.id[points], self._world.position[points]
-        return self._points[submap]
+    def of(self, submap: int) -> MapView:
+        """What filters see while the camera is in a submap."""
+        world = self._world
+        if self._made_for != (world.next_keyframe, submap):
+            self._made_for = world.next_keyframe, submap
+            newest, points = world.submap(submap)[::-1][:VIEWS].tolist(), self._points_of(submap)
+            keyframes = tuple(self._keyframe(slot) for slot in newest)
+            self._view = MapView(keyframes, world.id[points], world.position[points])
+        return self._view
 
     def outputs(self) -> MapOutputs:
-        """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and the sheet; of points the root map's alone."""
+        """Keyframes and map points for files and pictures; of points the root map's alone."""
         world, points = self._world, self._points_of(0)
-        records = tuple(self._record(slot) for slot in world.keyframes.tolist())
+        records = tuple(
+            KeyframeRecord(
+                int(world.kf_id[slot]),
+                int(world.kf_frame[slot]),
+                float(world.kf_stamp[slot]),
+                se3.inverse(world.kf_pose[slot]),
+                int(world.kf_count[slot]),
+                int(np.count_nonzero(world.kf_point[slot] >= 0)),
+                int(world.kf_map[slot]),
+            )
+            for slot in world.keyframes.tolist()
+        )
         observations = world.n_obs[points].astype(np.int64)
         return MapOutputs(records, world.id[points], world.position[points], world.rgb[points], observations)
 
-    def _points_of(self, submap: int) -> NDArray[np.int64]:
+    def _points_of(self, submap: int) -> Slots:
         world, points = self._world, self._world.points
         return np.asarray(points[world.kf_map[world.obs_kf[world.obs_at[points]]] == submap])
 
@@ -159,22 +176,10 @@ class MapViews:
             world.kf_words[slot, :n].view(np.uint8),
         )
         return KeyframeView(
-            world.T_world_cam(slot),
+            se3.inverse(world.kf_pose[slot]),
             keypoints,
             world.kf_xy[slot, :n],
             world.kf_z[slot, :n],
             self._depth_images.get(slot),
             float(world.kf_stamp[slot]),
-        )
-
-    def _record(self, slot: int) -> KeyframeRecord:
-        world, n = self._world, int(self._world.kf_count[slot])
-        return KeyframeRecord(
-            int(world.kf_id[slot]),
-            int(world.kf_frame[slot]),
-            float(world.kf_stamp[slot]),
-            world.T_world_cam(slot),
-            n,
-            int(np.count_nonzero(world.kf_point[slot, :n] >= 0)),
-            int(world.kf_map[slot]),
         )

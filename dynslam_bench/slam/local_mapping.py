@@ -19,17 +19,15 @@ from dynslam_bench.slam.bundle_adjustment import (
     Bundle,
     BundleResult,
     adjust_bundle,
-    adjust_bundle_gtsam,
     full_bundle,
     local_bundle,
 )
-from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import CLOSE_BASELINES
+from dynslam_bench.slam.tracking import CLOSE_BASELINES, Observations
 
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
+MapState = tuple[Slots, Array, Slots, dict[str, NDArray[Any]]]
+"""Keyframes and their poses, points and what refinement changes of them."""
 
 MAX_DISTANCE = 50
 """Largest Hamming distance in fusion and triangulation (ORB-SLAM2's lower threshold)."""
@@ -66,7 +64,6 @@ class LocalMapper:
         self.settings = settings
         self.close_m = CLOSE_BASELINES * world.camera.baseline_m
         self.culled: list[tuple[int, int, Array]] = []
-        self._before_full: tuple[Slots, Array, Slots, dict[str, NDArray[Any]]] | None = None
         points = world.points
         self._young: Slots = points[world.next_keyframe - 1 - world.born[points] < YOUNG]
 
@@ -123,7 +120,7 @@ class LocalMapper:
             close = int(np.count_nonzero(observations.z[free] < self.close_m))
             free = free[: max(close, MIN_DEPTH_POINTS)]
         position = se3.transform(
-            world.T_world_cam(slot), world.camera.unproject(observations.xy[free], observations.z[free])
+            se3.inverse(world.kf_pose[slot]), world.camera.unproject(observations.xy[free], observations.z[free])
         )
         self._add_points(slot, free, position, observations)
 
@@ -214,27 +211,18 @@ class LocalMapper:
             world.unobserve(bundle.poses[bundle.problem.obs_pose[out]], bundle.features[out])
             world.refresh(points[world.alive[points]])
 
-    def adjust_all(self) -> None:
-        """Full bundle adjustment, as at the end of a run; `resume` undoes it."""
-        if self._before_full is not None:
-            return
+    def adjust_all(self) -> MapState:
+        """Full bundle adjustment, as at the end of a run; returns what `restore` needs to undo it."""
         world, keyframes, points = self.world, self.world.keyframes, self.world.points
         tables = {name: getattr(world, name)[points] for name in ("position", "normal", "far", "words")}
-        self._before_full = keyframes, world.kf_pose[keyframes], points, tables
+        before = keyframes, world.kf_pose[keyframes], points, tables
         if self._solve(full_bundle(world), FULL_ITERATIONS) is not None:
             world.refresh(points)
+        return before
 
-    @property
-    def refined(self) -> bool:
-        """Whether the map is as `adjust_all` left it."""
-        return self._before_full is not None
-
-    def resume(self) -> None:
+    def restore(self, before: MapState) -> None:
         """The run goes on: the map is again what it was before `adjust_all`."""
-        if self._before_full is None:
-            return
-        keyframes, poses, points, tables = self._before_full
-        self._before_full = None
+        keyframes, poses, points, tables = before
         for slot, pose in zip(keyframes.tolist(), poses, strict=True):
             self.world.set_pose(slot, pose)
         for name, values in tables.items():
@@ -244,8 +232,7 @@ class LocalMapper:
         """Put refined poses and points into the map; None if there are none."""
         if bundle is None:
             return None
-        solver = adjust_bundle_gtsam if self.settings.bundle_adjustment.solver == "gtsam" else adjust_bundle
-        result = solver(bundle.problem, iterations)
+        result = adjust_bundle(bundle.problem, iterations)
         if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
             return None
         for k in range(bundle.problem.variable):
@@ -288,7 +275,7 @@ class LocalMapper:
         older = kept[world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT_SHARE]
         distant = older[~np.isin(older, near)]
         chosen = next((slots for slots in (distant, older, kept) if len(slots)), kept)
-        return np.roll(chosen, -COMPARED * world.next_keyframe)[:COMPARED]
+        return np.asarray(np.roll(chosen, -COMPARED * world.next_keyframe)[:COMPARED])
 
     def cull_keyframe(self, slot: int) -> None:
         """Remove a keyframe; `culled` names its replacement, the most covisible keyframe or the newest of its map."""
@@ -421,6 +408,6 @@ def triangulate(world: Map, slot: int, other: int, min_parallax_sigmas: float) -
         world.kf_words[slot], world.kf_words[other], world.scales,
         camera.fx, camera.fy, camera.cx, camera.cy, float(min_parallax_sigmas),
     )  # fmt: skip
-    pose = world.T_world_cam(slot)
+    pose = se3.inverse(world.kf_pose[slot])
     local = camera.unproject(world.kf_xy[slot, features], depth)
     return features, others, local @ pose[:3, :3].T + pose[:3, 3]

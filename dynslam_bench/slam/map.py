@@ -5,23 +5,51 @@ Keyframes and points live in numbered slots; a freed slot is used again, after t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.core.compiled import kernel
+from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam import map_kernels as kernels
-from dynslam_bench.slam.descriptor_index import DescriptorIndex
-from dynslam_bench.slam.observation import Observations
+
+if TYPE_CHECKING:
+    from dynslam_bench.slam.tracking import Observations
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
+Ints = NDArray[np.int32]
 
+KEYFRAME_TABLES = {
+    "kf_alive": (bool,), "kf_id": (np.int64,), "kf_map": (np.int64,), "kf_frame": (np.int64,), "kf_stamp": (float,),
+    "kf_pose": (float, 4, 4), "kf_centre": (float, 3), "kf_count": (np.int64,),
+}  # fmt: skip
+"""Type and shape of what is stored of each keyframe, see `Map`."""
+FEATURE_TABLES = {
+    "kf_raw": (np.float32, 0, 2), "kf_response": (np.float32, 0), "kf_xy": (float, 0, 2), "kf_right": (float, 0),
+    "kf_z": (np.float32, 0), "kf_octave": (np.int8, 0), "kf_angle": (np.float32, 0), "kf_info": (float, 0),
+    "kf_info_right": (float, 0), "kf_words": (np.uint64, 0, 4), "kf_point": (np.int32, 0),
+}  # fmt: skip
+"""Of each feature of each keyframe."""
+POINT_TABLES = {
+    "alive": (bool,), "id": (np.int64,), "position": (float, 3), "normal": (float, 3), "far": (float,),
+    "words": (np.uint64, 4), "rgb": (np.uint8, 3), "visible": (np.int32,), "found": (np.int32,), "born": (np.int64,),
+    "n_obs": (np.int32,), "obs_at": (np.int64,), "obs_capacity": (np.int32,),
+}  # fmt: skip
+"""Of each point."""
+OBSERVATION_TABLES = {"obs_kf": (np.int32,), "obs_ft": (np.int32,)}
+"""Of each observation."""
 MIN_CAPACITY = 4
 """Observations that a point has room for when it gets its first one."""
+MIN_COSINE = 0.5
+"""Smallest cosine between a point's mean viewing direction and the ray to the camera (ORB-SLAM2's number)."""
+WIDEN_RANGE = 1.25
+"""Factor by which the scale range of a point is widened."""
+REDUNDANT_VIEWS = 3
+"""Other keyframes that see a redundant point (ORB-SLAM2's number)."""
 
 
 class Map:
@@ -40,7 +68,7 @@ class Map:
         many observations it has, where they begin in obs_kf and obs_ft, and how many fit there).
 
     Attributes (others):
-        index: Sorted substrings of the keyframes' descriptors.
+        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors (`place_recognition`).
 
     Attributes (observations ``[O]``, those of each point in a row, oldest first):
         obs_kf, obs_ft (observing keyframe slots and feature numbers).
@@ -55,69 +83,23 @@ class Map:
         self._freed_points: list[int] = []
         self._top = 0
         self._observations = 0
-        self._vacant: dict[int, list[int]] = {}
         self._features = 0
-        self._words = 4
-        self.index = DescriptorIndex()
-        self._allocate()
+        self.substrings: dict[int, tuple[int, NDArray[np.uint16]]] = {}
+        for name, (kind, *shape) in (KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES | OBSERVATION_TABLES).items():
+            setattr(self, name, np.zeros((0, *shape), kind))
 
-    def _grow(self, name: str, length: int, axis: int = 0) -> None:
-        table = getattr(self, name)
-        shape = [*table.shape]
-        shape[axis] = length
-        longer = np.zeros(shape, table.dtype)
-        longer[tuple(slice(size) for size in table.shape)] = table
-        setattr(self, name, longer)
+    if TYPE_CHECKING:
+        obs_kf: Ints
+        obs_ft: Ints
 
-    def _allocate(self) -> None:
-        s, f, w, m = 0, self._features, self._words, 0
-        self.kf_alive = np.zeros(s, bool)
-        self.kf_id = np.zeros(s, np.int64)
-        self.kf_map = np.zeros(s, np.int64)
-        self.kf_frame = np.zeros(s, np.int64)
-        self.kf_stamp = np.zeros(s)
-        self.kf_pose = np.zeros((s, 4, 4))
-        self.kf_centre = np.zeros((s, 3))
-        self.kf_count = np.zeros(s, np.int64)
-        self.kf_raw = np.zeros((s, f, 2), np.float32)
-        self.kf_response = np.zeros((s, f), np.float32)
-        self.kf_xy = np.zeros((s, f, 2))
-        self.kf_right = np.zeros((s, f))
-        self.kf_z = np.zeros((s, f), np.float32)
-        self.kf_octave = np.zeros((s, f), np.int8)
-        self.kf_angle = np.zeros((s, f), np.float32)
-        self.kf_info = np.zeros((s, f))
-        self.kf_info_right = np.zeros((s, f))
-        self.kf_words = np.zeros((s, f, w), np.uint64)
-        self.kf_point = np.zeros((s, f), np.int32)
-        self.alive = np.zeros(m, bool)
-        self.id = np.zeros(m, np.int64)
-        self.position = np.zeros((m, 3))
-        self.normal = np.zeros((m, 3))
-        self.far = np.zeros(m)
-        self.words = np.zeros((m, w), np.uint64)
-        self.rgb = np.zeros((m, 3), np.uint8)
-        self.visible = np.zeros(m, np.int32)
-        self.found = np.zeros(m, np.int32)
-        self.born = np.zeros(m, np.int64)
-        self.n_obs = np.zeros(m, np.int32)
-        self.obs_at = np.zeros(m, np.int64)
-        self.obs_capacity = np.zeros(m, np.int32)
-        self.obs_kf = np.zeros(0, np.int32)
-        self.obs_ft = np.zeros(0, np.int32)
+        def __getattr__(self, name: str) -> NDArray[Any]: ...
 
-    _FEATURE_TABLES = (
-        "kf_raw", "kf_response", "kf_xy", "kf_right", "kf_z", "kf_octave", "kf_angle", "kf_info", "kf_info_right",
-        "kf_words",
-    )  # fmt: skip
-    _KEYFRAME_TABLES = (
-        "kf_alive", "kf_id", "kf_map", "kf_frame", "kf_stamp", "kf_pose", "kf_centre", "kf_count", "kf_point",
-        *_FEATURE_TABLES,
-    )  # fmt: skip
-    _POINT_TABLES = (
-        "alive", "id", "position", "normal", "far", "words", "rgb", "visible", "found", "born", "n_obs", "obs_at",
-        "obs_capacity",
-    )  # fmt: skip
+    def _grow(self, names: Iterable[str], length: int, axis: int = 0) -> None:
+        for name in names:
+            table = getattr(self, name)
+            shape = list(table.shape)
+            shape[axis] = length - shape[axis]
+            setattr(self, name, np.concatenate([table, np.zeros(shape, table.dtype)], axis))
 
     # ------------------------------------------------------------------ keyframes
 
@@ -134,12 +116,9 @@ class Map:
 
     def points_of(self, keyframes: Slots | int) -> Slots:
         """Slots of the points that keyframes observe, ascending."""
-        return kernels.distinct(np.atleast_2d(self.kf_point[keyframes]), self.alive.size)
-
-    @property
-    def descriptor_bytes(self) -> int:
-        """Length of the descriptors in the map."""
-        return 8 * self._words
+        observed, points = np.zeros(self.alive.size, bool), self.kf_point[keyframes]
+        observed[points[points >= 0]] = True
+        return np.flatnonzero(observed)
 
     @property
     def keyframe_count(self) -> int:
@@ -155,23 +134,17 @@ class Map:
         self, observations: Observations, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
     ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
-        if observations.words.shape[1] != self._words:
-            if self.next_keyframe:
-                raise ValueError(f"descriptors changed from {self._words} to {observations.words.shape[1]} words")
-            self._words = observations.words.shape[1]
-            self._allocate()
-        n = len(observations)
+        n, words = observations.words.shape
+        if not self.next_keyframe:
+            self.kf_words, self.words = np.zeros((0, 0, words), np.uint64), np.zeros((0, words), np.uint64)
         if n > self._features:
-            for name in (*self._FEATURE_TABLES, "kf_point"):
-                self._grow(name, n, axis=1)
+            self._grow(FEATURE_TABLES, n, axis=1)
             self.kf_point[:, self._features :] = -1
             self._features = n
         free = np.flatnonzero(~self.kf_alive)
         if not len(free):
-            length = max(16, self.kf_alive.size + self.kf_alive.size // 2)
             free = np.array([self.kf_alive.size])
-            for name in self._KEYFRAME_TABLES:
-                self._grow(name, length)
+            self._grow(KEYFRAME_TABLES | FEATURE_TABLES, max(16, self.kf_alive.size + self.kf_alive.size // 2))
         slot = int(free[0])
         self.kf_alive[slot] = True
         self.kf_id[slot] = self.next_keyframe
@@ -186,7 +159,7 @@ class Map:
             raw.xy, raw.response, observations.xy, observations.right, observations.z, observations.octave,
             observations.angle, observations.info, observations.info_right, observations.words,
         )  # fmt: skip
-        for name, values in zip(self._FEATURE_TABLES, features, strict=True):
+        for name, values in zip(FEATURE_TABLES, features, strict=False):
             getattr(self, name)[slot, :n] = values
         self.kf_point[slot] = -1
         return slot
@@ -196,15 +169,11 @@ class Map:
         self.kf_pose[slot] = T_cam_world
         self.kf_centre[slot] = -T_cam_world[:3, :3].T @ T_cam_world[:3, 3]
 
-    def T_world_cam(self, slot: int) -> Array:
-        """A keyframe's camera-to-world pose."""
-        return se3.inverse(self.kf_pose[slot])
-
     def take_over(self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int) -> None:
         """Become the map of complete tables, in which every slot is in use; see `atlas`."""
-        for name in (*self._KEYFRAME_TABLES, *self._POINT_TABLES, "obs_kf", "obs_ft"):
+        for name in KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES | OBSERVATION_TABLES:
             setattr(self, name, tables[name])
-        self._features, self._words = self.kf_words.shape[1:]
+        self._features = self.kf_words.shape[1]
         self._top, self._observations = self.alive.size, self.obs_kf.size
         self.next_keyframe, self.next_point = next_keyframe, next_point
         for slot, pose in enumerate(self.kf_pose):
@@ -216,9 +185,7 @@ class Map:
 
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
-        counts = kernels.covisibility(
-            self.obs_kf, self.obs_at, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size
-        )
+        counts = _covisibility(self.obs_kf, self.obs_at, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size)
         if exclude >= 0:
             counts[exclude] = 0
         slots = np.flatnonzero(counts)
@@ -245,12 +212,9 @@ class Map:
 
     def remove_keyframe(self, slot: int) -> None:
         """Remove a keyframe, its observations, and the points that no keyframe observes any more."""
-        n = self.kf_count[slot]
-        features = np.flatnonzero(self.kf_point[slot, :n] >= 0)
-        points = self.kf_point[slot, features].astype(np.int64)
-        kernels.unlink_many(*self._observed, self.kf_point, np.full(len(features), slot, np.int64), features)
+        features = np.flatnonzero(self.kf_point[slot] >= 0)
+        self.unobserve(np.full(len(features), slot, np.int64), features)
         self.kf_alive[slot] = False
-        self.remove_points(points[self.n_obs[points] == 0])
 
     # ------------------------------------------------------------------ points
 
@@ -270,9 +234,7 @@ class Map:
         reused = [self._free_points.pop() for _ in range(min(n, len(self._free_points)))]
         fresh = n - len(reused)
         if self._top + fresh > self.alive.size:
-            length = max(2048, self._top + fresh, self.alive.size + self.alive.size // 2)
-            for name in self._POINT_TABLES:
-                self._grow(name, length)
+            self._grow(POINT_TABLES, max(2048, self._top + fresh, self.alive.size + self.alive.size // 2))
         slots = np.concatenate([np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)])
         self._top += fresh
         self.alive[slots] = True
@@ -292,12 +254,12 @@ class Map:
         if not len(points):
             return
         self._reserve(points, 1)
-        kernels.link(*self._observed, self.kf_point, keyframe, features, points)
+        _link(*self._observed, self.kf_point, keyframe, features, points)
 
     def unobserve(self, keyframes: Slots, features: Slots) -> None:
         """Remove observations; points that lose their last one are removed."""
         points = self.kf_point[keyframes, features].astype(np.int64)
-        kernels.unlink_many(*self._observed, self.kf_point, keyframes, features)
+        _unlink(*self._observed, self.kf_point, keyframes, features)
         points = np.unique(points[points >= 0])
         self.remove_points(points[self.n_obs[points] == 0])
 
@@ -305,7 +267,7 @@ class Map:
         """Remove points and their observations."""
         points = np.unique(points)
         points = points[self.alive[points]]
-        kernels.drop_points(*self._observed, self.kf_point, points)
+        _drop_points(*self._observed, self.kf_point, points)
         self.alive[points] = False
         self._freed_points.extend(points.tolist())
 
@@ -314,7 +276,7 @@ class Map:
         if old == new or not self.alive[old] or not self.alive[new]:
             return
         self._reserve(np.array([new]), int(self.n_obs[old]))
-        kernels.merge(*self._observed, self.kf_point, old, new)
+        _merge(*self._observed, self.kf_point, old, new)
         self.visible[new] += self.visible[old]
         self.found[new] += self.found[old]
         self.alive[old] = False
@@ -323,7 +285,7 @@ class Map:
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
         of_points, of_keyframes = (self.position, self.normal, self.far, self.words), (self.kf_words, self.kf_octave)
-        kernels.refresh(points, *of_points, *self._observed, *of_keyframes, self.kf_centre, self.scales)
+        _refresh(points, *of_points, *self._observed, *of_keyframes, self.kf_centre, self.scales)
 
     def release(self) -> None:
         """Allow the slots freed so far to be used again; called once nothing refers to them any more."""
@@ -341,37 +303,37 @@ class Map:
         return np.repeat(begin, count) + np.arange(count.sum())
 
     def _reserve(self, points: Slots, more: int) -> None:
-        """Make room for so many more observations of each of the points; the room that they leave is used again."""
+        """Make room for so many more observations of each of the points."""
         full = self.n_obs[points] + more > self.obs_capacity[points]
         if not full.any():
             return
         short = np.unique(points[full])
-        capacities = np.maximum(2 * self.obs_capacity[short], MIN_CAPACITY)
-        if more > 1:
-            capacities = np.maximum(capacities, self.n_obs[short] + more)
-        for capacity in np.unique(capacities).tolist():
-            moving = short[capacities == capacity]
-            vacant = self._vacant.get(capacity, [])
-            reused = [vacant.pop() for _ in range(min(len(vacant), len(moving)))]
-            fresh = self._observations + capacity * np.arange(len(moving) - len(reused), dtype=np.int64)
-            self._observations += capacity * len(fresh)
-            if self._observations > self.obs_kf.size:
-                length = max(self._observations, self.obs_kf.size + self.obs_kf.size // 2)
-                self._grow("obs_kf", length)
-                self._grow("obs_ft", length)
-            left = zip(self.obs_capacity[moving].tolist(), self.obs_at[moving].tolist(), strict=True)
-            kernels.move(*self._observed, moving, np.concatenate([np.array(reused, np.int64), fresh]))
-            self.obs_capacity[moving] = capacity
-            for size, begin in left:
-                if size:
-                    self._vacant.setdefault(size, []).append(begin)
+        room = np.maximum(2 * self.obs_capacity[short], self.n_obs[short] + more).clip(min=MIN_CAPACITY)
+        if self._observations + room.sum() > self.obs_kf.size:
+            placed = np.flatnonzero(self.obs_capacity)
+            present = self.obs_capacity[placed]
+            self._place(placed, present, int(1.5 * (present.sum() + room.sum())))
+        self._place(short, room)
+
+    def _place(self, points: Slots, room: Ints, length: int = 0) -> None:
+        """Move the observations of points to where each has `room`: behind all others, or into a pool of `length`."""
+        rows = self.observations(points)
+        keyframes, features = self.obs_kf[rows], self.obs_ft[rows]
+        if length:
+            self.obs_kf, self.obs_ft = np.zeros(length, np.int32), np.zeros(length, np.int32)
+            self._observations = 0
+        self.obs_at[points] = self._observations + np.cumsum(room, dtype=np.int64) - room
+        self.obs_capacity[points] = room
+        self._observations += int(room.sum())
+        rows = self.observations(points)
+        self.obs_kf[rows], self.obs_ft[rows] = keyframes, features
 
     # ------------------------------------------------------------------ views
 
     def project(self, T_cam_world: Array, candidates: Slots) -> tuple[Slots, Array, Array, Slots, Array]:
         """The points that a camera should see, with pixels, right coordinates, octaves and viewing cosines."""
         c = self.camera
-        return kernels.project(
+        return _project(
             np.ascontiguousarray(T_cam_world), candidates, self.position, self.normal, self.far,
             c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, float(c.width), float(c.height),
             float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2, len(self.scales),
@@ -384,5 +346,196 @@ class Map:
         """
         depth = self.kf_z[slot, : self.kf_count[slot]]
         close = (depth > 0) & (depth <= close_m) if depth.any() else np.ones(len(depth), bool)
-        total, redundant = kernels.redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed, 3)
+        total, redundant = _redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed)
         return int(total), int(redundant)
+
+
+# ---------------------------------------------------------------------- compiled loops over the tables
+
+
+@kernel
+def _link_one(
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, keyframe: int, feature: int, point: int
+) -> None:
+    begin, end = obs_at[point], obs_at[point] + n_obs[point]
+    for o in range(begin, end):
+        if obs_kf[o] == keyframe:
+            return
+    obs_kf[end] = keyframe
+    obs_ft[end] = feature
+    n_obs[point] += 1
+    kf_point[keyframe, feature] = point
+
+
+@kernel
+def _link(
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, keyframe: int, features: Slots,
+    points: Slots,
+) -> None:  # fmt: skip
+    """Add observations of the points by the keyframe's features; a second one by the same keyframe is skipped."""
+    for i in range(points.shape[0]):
+        if kf_point[keyframe, features[i]] < 0:
+            _link_one(obs_kf, obs_ft, obs_at, n_obs, kf_point, keyframe, features[i], points[i])
+
+
+@kernel
+def _unlink(
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, keyframes: Slots, features: Slots
+) -> None:
+    """Remove observations; the order of the others is kept."""
+    for i in range(keyframes.shape[0]):
+        p = kf_point[keyframes[i], features[i]]
+        if p < 0:
+            continue
+        kf_point[keyframes[i], features[i]] = -1
+        out = obs_at[p]
+        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
+            if obs_kf[o] != keyframes[i] or obs_ft[o] != features[i]:
+                obs_kf[out] = obs_kf[o]
+                obs_ft[out] = obs_ft[o]
+                out += 1
+        n_obs[p] = out - obs_at[p]
+
+
+@kernel
+def _drop_points(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, points: Slots) -> None:
+    """Remove all observations of the points."""
+    for i in range(points.shape[0]):
+        p = points[i]
+        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
+            kf_point[obs_kf[o], obs_ft[o]] = -1
+        n_obs[p] = 0
+
+
+@kernel
+def _merge(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, old: int, new: int) -> None:
+    """Move the observations of `old` to `new`; where one keyframe observes both, that of `new` stays."""
+    for o in range(obs_at[old], obs_at[old] + n_obs[old]):
+        kf_point[obs_kf[o], obs_ft[o]] = -1
+        _link_one(obs_kf, obs_ft, obs_at, n_obs, kf_point, obs_kf[o], obs_ft[o], new)
+    n_obs[old] = 0
+
+
+@kernel
+def _covisibility(obs_kf: Ints, obs_at: Slots, n_obs: Ints, points: Ints, slots: int) -> Slots:
+    """How many of the points each keyframe slot observes."""
+    counts = np.zeros(slots, np.int64)
+    for i in range(points.shape[0]):
+        p = points[i]
+        if p >= 0:
+            for o in range(obs_at[p], obs_at[p] + n_obs[p]):
+                counts[obs_kf[o]] += 1
+    return counts
+
+
+@kernel
+def _refresh(
+    points: Slots, position: Array, normal: Array, far: Array, words: Any, obs_kf: Ints, obs_ft: Ints, obs_at: Slots,
+    n_obs: Ints, kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,
+) -> None:  # fmt: skip
+    """Renew descriptor (the medoid of the observed ones), viewing direction and scale range of the points."""
+    for i in range(points.shape[0]):
+        p = points[i]
+        n = n_obs[p]
+        if n == 0:
+            continue
+        begin, end = obs_at[p], obs_at[p] + n
+        m = min(n, 12)  # only the newest observations count
+        best = end - 1
+        if m > 2:
+            best_score = 1 << 40
+            for a in range(end - m, end):
+                score = 0
+                for b in range(end - m, end):
+                    score += distance(kf_words[obs_kf[a], obs_ft[a]], kf_words[obs_kf[b], obs_ft[b]])
+                if score < best_score:
+                    best, best_score = a, score
+        for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
+            words[p, w] = kf_words[obs_kf[best], obs_ft[best], w]
+        sx, sy, sz = 0.0, 0.0, 0.0
+        reference_distance = 0.0
+        for o in range(begin, end):
+            c = kf_centre[obs_kf[o]]
+            x, y, z = position[p, 0] - c[0], position[p, 1] - c[1], position[p, 2] - c[2]
+            d = np.sqrt(x * x + y * y + z * z) + 1e-12
+            sx += x / d
+            sy += y / d
+            sz += z / d
+            if o == begin:
+                reference_distance = d * scales[kf_octave[obs_kf[o], obs_ft[o]]]
+        length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
+        normal[p, 0], normal[p, 1], normal[p, 2] = sx / length, sy / length, sz / length
+        far[p] = reference_distance
+
+
+@kernel
+def _project(
+    pose: Array, candidates: Slots, position: Array, normal: Array, far: Array,
+    fx: float, fy: float, cx: float, cy: float, bf: float, width: float, height: float, scale_factor: float,
+    levels: int,
+) -> tuple[Slots, Array, Array, Slots, Array]:  # fmt: skip
+    """The candidate points that the camera should see: in the image, at a fit distance, from a fit side.
+
+    Returns:
+        Points, pixels, right coordinates, predicted octaves and cosines of the viewing angle.
+    """
+    n = candidates.shape[0]
+    index = np.empty(n, np.int64)
+    uv = np.empty((n, 2))
+    right = np.empty(n)
+    octave = np.empty(n, np.int64)
+    cosine = np.empty(n)
+    r, t = pose[:3, :3], pose[:3, 3]
+    ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
+    oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
+    oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
+    nearest = scale_factor ** (levels - 1)
+    inverse_log = 1.0 / np.log(scale_factor)
+    count = 0
+    for i in range(n):
+        p = candidates[i]
+        x, y, z = position[p, 0], position[p, 1], position[p, 2]
+        zc = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if zc < 0.05:
+            continue
+        u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / zc + cx
+        v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / zc + cy
+        if u < 0.0 or u >= width or v < 0.0 or v >= height:
+            continue
+        dx, dy, dz = x - ox, y - oy, z - oz
+        d = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if d > WIDEN_RANGE * far[p] or d * WIDEN_RANGE < far[p] / nearest:
+            continue
+        c = (dx * normal[p, 0] + dy * normal[p, 1] + dz * normal[p, 2]) / d
+        if c < MIN_COSINE:
+            continue
+        level = int(np.ceil(np.log(far[p] / d) * inverse_log - 1e-9))
+        index[count] = p
+        uv[count, 0], uv[count, 1] = u, v
+        right[count] = u - bf / zc
+        octave[count] = min(max(level, 0), levels - 1)
+        cosine[count] = c
+        count += 1
+    return index[:count].copy(), uv[:count].copy(), right[:count].copy(), octave[:count].copy(), cosine[:count].copy()
+
+
+@kernel
+def _redundancy(
+    keyframe: int, close: NDArray[np.bool_], kf_point: Ints, kf_octave: Any,
+    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints,
+) -> tuple[int, int]:  # fmt: skip
+    """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser."""
+    total, redundant = 0, 0
+    for f in range(close.shape[0]):
+        p = kf_point[keyframe, f]
+        if p < 0 or not close[f]:
+            continue
+        total += 1
+        if n_obs[p] <= REDUNDANT_VIEWS:
+            continue
+        fine = 0
+        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
+            if obs_kf[o] != keyframe and kf_octave[obs_kf[o], obs_ft[o]] <= kf_octave[keyframe, f] + 1:
+                fine += 1
+        redundant += fine >= REDUNDANT_VIEWS
+    return total, redundant

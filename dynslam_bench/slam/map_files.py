@@ -43,7 +43,7 @@ KEYFRAME_ARRAYS = {
 FEATURE_ARRAYS = {
     "kf_raw": ("f4", "F2"), "kf_response": ("f4", "F"), "kf_xy": ("f8", "F2"), "kf_right": ("f8", "F"),
     "kf_z": ("f4", "F"), "kf_octave": ("i1", "F"), "kf_angle": ("f4", "F"), "kf_info": ("f8", "F"),
-    "kf_info_right": ("f8", "F"), "kf_words": ("u8", "FW"), "kf_point": ("i4", "F"),
+    "kf_info_right": ("f8", "F"), "kf_words": ("u8", "FW"),
 }  # fmt: skip
 """Of each feature of each keyframe, one keyframe after the other; F features, W words of 64 bits a descriptor."""
 POINT_ARRAYS = {
@@ -65,7 +65,7 @@ MAX_WORDS = 64
 _FINITE = ("kf_pose", "kf_raw", "kf_response", "kf_xy", "kf_z", "kf_angle", "kf_info", "kf_info_right", "position",
            "normal", "far", "submap_start", "submap_anchor")  # fmt: skip
 _NOT_BELOW = {"kf_count": 0, "kf_z": 0, "kf_info": 0, "kf_info_right": 0, "visible": 1, "found": 0, "n_obs": 1,
-              "kf_octave": 0, "kf_point": -1, "obs_kf": 0, "obs_ft": 0, "kf_id": 0, "kf_map": 0, "id": 0,
+              "kf_octave": 0, "obs_kf": 0, "obs_ft": 0, "kf_id": 0, "kf_map": 0, "id": 0,
               "born": 0, "submap_bound": 0}  # fmt: skip
 
 
@@ -88,9 +88,6 @@ class MapFeatures(Record):
     def scales(self) -> NDArray[np.float64]:
         """Scale of each level."""
         return np.asarray(self.scale_factor ** np.arange(self.levels, dtype=np.float64))
-
-    def __str__(self) -> str:
-        return f"{self.extractor}, {self.levels} levels of {self.scale_factor:g}"
 
 
 class MapHeader(Record):
@@ -143,10 +140,11 @@ class SavedMap:
         Raises:
             SettingsError: Names what differs.
         """
-        kinds = {"rgbd": "an RGB-D", "rgb": "a monocular"}
         if self.header.sensors != sensors:
-            made, here = kinds[self.header.sensors], kinds[sensors]
-            raise SettingsError(f"{where} is {made} map, and this is {here} system", "their units of length differ")
+            raise SettingsError(
+                f"{where} is a map of sensors '{self.header.sensors}', this system has '{sensors}'",
+                "their units of length differ",
+            )
         if self.header.features != features:
             raise SettingsError(
                 f"{where} is made of other features ({self.header.features}) than this system's ({features})",
@@ -201,7 +199,8 @@ def read_map(path: Path) -> SavedMap:
     except DynslamError as error:
         raise SettingsError(str(error)) from error
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    for fault in _faults(arrays, header):
+    fault = next(_faults(arrays, header), None)
+    if fault is not None:
         raise SettingsError(f"{path} is a damaged map: {fault}", MAKE_ONE)
     return SavedMap(header, arrays)
 
@@ -227,7 +226,7 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
             yield f"'{name}' holds values that are not finite"
     most = {"kf_map": len(arrays["submap_bound"]), "kf_octave": header.features.levels - 1,
             "kf_id": header.next_keyframe - 1, "born": header.next_keyframe - 1, "id": header.next_point - 1,
-            "kf_point": len(arrays["id"]) - 1, "obs_kf": len(arrays["kf_id"]) - 1}  # fmt: skip
+            "obs_kf": len(arrays["kf_id"]) - 1}  # fmt: skip
     for name, least in _NOT_BELOW.items():
         if not (arrays[name] >= least).all():
             yield f"'{name}' holds values below {least}"
@@ -255,33 +254,27 @@ def _contents(arrays: Arrays) -> Iterator[tuple[Any, str]]:
 
 
 def _references(arrays: Arrays) -> Iterator[tuple[Any, str]]:
-    """Features name the point that they observe, and points the features that observe them; both have to agree."""
+    """A feature observes one point at most, and a keyframe observes a point with one feature."""
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
     yield words <= MAX_WORDS, f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
     count = arrays["kf_count"]
     claimed = len(count) * int(count.max(initial=0)) * (64 + 8 * words)  # as tables, as wide as the longest row
     yield claimed <= MAX_TABLE_BYTES, f"'kf_count' claims tables of {claimed} bytes, at most {MAX_TABLE_BYTES} are made"
-    for name, total in (("kf_count", len(arrays["kf_point"])), ("n_obs", len(arrays["obs_kf"]))):
+    for name, total in (("kf_count", len(arrays["kf_xy"])), ("n_obs", len(arrays["obs_kf"]))):
         counts = arrays[name].astype(np.int64)
         yield (counts <= total).all() and int(counts.sum()) == total, f"'{name}' does not add up to {total}"
     keyframe, feature = arrays["obs_kf"], arrays["obs_ft"]
     yield (feature < count[keyframe]).all(), "'obs_ft' names features that the keyframe does not have"
     row = (np.cumsum(count) - count)[keyframe] + feature
     point = np.repeat(np.arange(len(arrays["id"])), arrays["n_obs"])
-    agree = len(np.unique(row)) == len(row) and np.array_equal(arrays["kf_point"][row], point)
-    yield agree, "observations do not agree with 'kf_point'"
+    yield len(np.unique(row)) == len(row), "a feature observes two points"
     once = len(np.unique(point * len(arrays["kf_id"]) + keyframe)) == len(row)
     yield once, "a keyframe observes a point with two features"
-    matched = np.count_nonzero(arrays["kf_point"] >= 0) == len(row)
-    yield matched, "'kf_point' names points that have no such observation"
 
 
 # ---------------------------------------------------------------------- keyframes.csv and map.ply
 
-_COLOURS = ("red", "green", "blue")
-_PLY_LAYOUT = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("n", "<i4")]
-)
+_PLY_LAYOUT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("observations", "<i4")])
 
 
 def write_keyframes_csv(path: Path, outputs: MapOutputs, exact: Mapping[float, int] | None = None) -> None:
@@ -337,15 +330,13 @@ def read_ply(path: Path) -> Cloud:
             f"{path} is no map of this package: expected {_PLY_LAYOUT.itemsize} bytes a point, little-endian"
         )
     points = np.frombuffer(body, _PLY_LAYOUT)
-    positions = np.stack([points[name] for name in "xyz"], axis=1)
-    if not np.isfinite(positions).all():
+    if not np.isfinite(points["position"]).all():
         raise RunError(f"{path} holds points that are not finite")
-    colours = np.stack([points[name] for name in _COLOURS], axis=1)
-    return Cloud(positions, colours, points["n"])
+    return Cloud(points["position"].copy(), points["colour"].copy(), points["observations"].copy())
 
 
 def _ply_header(rows: int) -> bytes:
-    kinds = {"float": ("x", "y", "z"), "uchar": _COLOURS, "int": ("observations",)}
+    kinds = {"float": ("x", "y", "z"), "uchar": ("red", "green", "blue"), "int": ("observations",)}
     properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}", *properties, "end_header"]
     return ("\n".join(lines) + "\n").encode()
@@ -362,9 +353,5 @@ def write_ply(path: Path, outputs: MapOutputs) -> None:
         DynslamError: The folder cannot be written.
     """
     rows = np.zeros(len(outputs.positions), _PLY_LAYOUT)
-    for i, name in enumerate("xyz"):
-        rows[name] = outputs.positions[:, i]
-    for i, name in enumerate(_COLOURS):
-        rows[name] = outputs.colours[:, i]
-    rows["n"] = outputs.observations
+    rows["position"], rows["colour"], rows["observations"] = outputs.positions, outputs.colours, outputs.observations
     write_atomic(path, _ply_header(len(rows)) + rows.tobytes())

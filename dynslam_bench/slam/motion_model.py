@@ -3,23 +3,25 @@
 State of the filter: position p and velocity v in the world, orientation R_cam_world and angular velocity w in the
 camera frame; accelerations are white noise. The measurement is the pose that the image gives, with the Gauss-Newton
 matrix of its optimisation as information. With many well-spread inliers the image decides; with few the motion does.
-The smoother is the fixed-interval one of Rauch, Tung and Striebel (1965).
+The smoother is the fixed-interval one of Rauch, Tung and Striebel (1965); it makes the final trajectory.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.slam.map import Array, Map
 from dynslam_bench.slam.pose_optimisation import apply_twist
 from dynslam_bench.slam.settings import MotionModelSettings
 from dynslam_bench.slam.tracking import TrackedFrame
-
-Array = NDArray[np.float64]
 
 CHI2_POSE = 12.592
 """95 % quantile of chi-square with six degrees of freedom."""
@@ -123,11 +125,6 @@ class MotionState:
             by[:3, :3] @ self.position, self.rotation @ rotation.T, by[6:, 6:] @ self.speed, by @ self.covariance @ by.T
         )
 
-    def relocated(self, T_cam_world: Array) -> MotionState:
-        """The same motion at another pose, e.g. after bundle adjustment."""
-        r = T_cam_world[:3, :3]
-        return MotionState(-r.T @ T_cam_world[:3, 3], r.copy(), self.speed, self.covariance)
-
     def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
         """The state `dt` seconds later."""
         f = _transition(dt)
@@ -216,14 +213,11 @@ class CameraMotion:
         self.state: MotionState | None = None
         self.intervals: deque[float] = deque(maxlen=INTERVALS)
 
-    def forget(self) -> None:
-        """The camera was lost: nothing is known of its motion."""
-        self.state = None
-
     def relocated(self, T_cam_world: Array) -> None:
         """The same motion at another pose, as after bundle adjustment."""
         if self.state is not None:
-            self.state = self.state.relocated(T_cam_world)
+            r = T_cam_world[:3, :3]
+            self.state = replace(self.state, position=-r.T @ T_cam_world[:3, 3], rotation=r.copy())
 
     def transformed(self, T_cam_before: Array, T_cam_now: Array, scale: float) -> None:
         """The same motion after a loop was closed.
@@ -236,24 +230,23 @@ class CameraMotion:
         if self.state is not None:
             self.state = self.state.transformed(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], scale)
 
-    def regular(self, last: TrackedFrame, timestamp: float) -> float:
-        """The stamp, or where it is within `JITTER` of a regular one, the regular one."""
-        is_regular = abs(timestamp - last.timestamp - self._interval) <= JITTER * self._interval
-        return last.timestamp + self._interval if is_regular else timestamp
+    def expected(self, last: TrackedFrame, timestamp: float, *, jitter: float = 0.0) -> tuple[Array, Array | None]:
+        """World-to-camera pose at a time, and the covariance of the motion since the last frame.
 
-    def predicted(self, last: TrackedFrame, timestamp: float) -> Array:
-        """World-to-camera pose at a time; that of the last tracked frame where nothing is known of the gap."""
+        Where nothing is known of the gap it is the pose of the last tracked frame, and no covariance.
+
+        Args:
+            last: The last tracked frame.
+            timestamp: The stamp of the new one, seconds.
+            jitter: Share of the usual interval within which a regular stamp is taken instead.
+        """
+        if abs(timestamp - last.timestamp - self._interval) <= jitter * self._interval:
+            timestamp = last.timestamp + self._interval
         dt = timestamp - last.timestamp
         if self.state is None or not 0 < dt <= MAX_GAP_S:
-            return last.T_cam_world
-        return self.state.predicted(dt, self._settings).T_cam_world
-
-    def covariance(self, last: TrackedFrame, timestamp: float) -> Array | None:
-        """How far the motion since the last frame may be from the predicted one (`MotionState.motion_covariance`)."""
-        dt = timestamp - last.timestamp
-        if self.state is None or not 0 < dt <= MAX_GAP_S:
-            return None
-        return self.state.motion_covariance(dt, self._settings)
+            return last.T_cam_world, None
+        pose = self.state.predicted(dt, self._settings).T_cam_world
+        return pose, self.state.motion_covariance(dt, self._settings)
 
     def filtered(self, last: TrackedFrame, timestamp: float, measured: Array, information: Array) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion.
@@ -276,3 +269,49 @@ class CameraMotion:
         self.intervals.append(dt)
         self.state = self.state.predicted(dt, self._settings).updated(measured, covariance)
         return self.state.T_cam_world
+
+
+# ---------------------------------------------------------------------- the trajectory
+
+
+@dataclass(eq=False, slots=True)
+class FramePose:
+    """A tracked frame's pose relative to a keyframe, so that refinement moves it along.
+
+    Attributes:
+        timestamp: Seconds.
+        reference: Slot of the keyframe.
+        T_cam_ref: Pose ``[4, 4]`` from the keyframe's camera frame to the frame's.
+        information: float32 ``[6, 6]``, Gauss-Newton matrix of the pose.
+    """
+
+    timestamp: float
+    reference: int
+    T_cam_ref: Array
+    information: NDArray[np.float32]
+
+
+def rescale(history: Sequence[FramePose], scales: Mapping[int, float]) -> None:
+    """Lengths around keyframes, by their slots, were multiplied by scales: so are those of their frames."""
+    for frame in history:
+        if frame.reference in scales:
+            scale = scales[frame.reference]
+            frame.T_cam_ref[:3, 3] *= scale
+            frame.information[:3] /= scale
+            frame.information[:, :3] /= scale
+
+
+def trajectory(history: Sequence[FramePose], world: Map, settings: MotionModelSettings) -> Trajectory:
+    """Camera-to-world poses in the order of their stamps, smoothed where the settings say so.
+
+    Frames of unmerged submaps are left out: where they were taken in the root map's world is unknown.
+    """
+    frames = {frame.timestamp: frame for frame in reversed(history) if world.kf_map[frame.reference] == 0}
+    stamps = np.array(sorted(frames), np.float64)
+    ordered = [frames[stamp] for stamp in stamps.tolist()]
+    poses = np.array([frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]).reshape(-1, 4, 4)
+    if settings.smooth and len(poses) > 2:
+        information = [frame.information.astype(np.float64) for frame in ordered]
+        covariances = [pose_covariance(*pair) for pair in zip(poses, information, strict=True)]
+        poses = smooth(stamps, poses, np.array(covariances), settings)
+    return Trajectory(stamps, se3.inverse(poses))

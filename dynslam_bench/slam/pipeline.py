@@ -5,10 +5,12 @@ Every published system runs this file; it differs only in its list of filters, i
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.checks import check_frame
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
-from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
+from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
@@ -25,30 +27,76 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.ego_motion import refine_prediction
-from dynslam_bench.culling.guard import GuardSettings
+from dynslam_bench.culling.guard import GuardSettings, restore_starved
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.backend import BackendResult, RgbdBackend
-from dynslam_bench.slam.stages import CachedStage, CullingResult, StageClock, combine_verdicts, flow_to_previous
 
-FILTER_KEYFRAMES = 20
-"""Latest keyframes that filters may read (DynaSLAM's window)."""
+if TYPE_CHECKING:
+    from dynslam_bench.segmentation.schedule import MaskScheduler
+
+STATS = ("matches", "inliers", "map_points", "keyframes", "keyframe", "maps", "loops", "residual_px")
+"""Fields of the back end's result that are diagnostics of a frame."""
 
 
-class MaskStage(Protocol):
-    """Gives each frame its instances: by a network, from a file, or carried over from an earlier frame.
+class CachedStage(Protocol):
+    """A stage that may have answered its last call from the stage cache.
 
     Attributes:
-        segmented: Whether the latest frame's instances are fresh, not carried over.
+        hit: Whether it did.
+        saved_s: Seconds that this saved.
     """
 
-    segmented: bool
+    hit: bool
+    saved_s: float
 
-    def masks_for(self, frame: Frame, gray: NDArray[np.uint8], *, keyframe: bool) -> Instances:
-        """The objects in the frame; `keyframe` says that the previous frame asked for a fresh segmentation."""
-        ...
+
+class StageClock:
+    """Wall-clock seconds by stage, in the order of first use; what the stage cache saved is added again.
+
+    Args:
+        cached: Stages that answer from the stage cache, by name.
+    """
+
+    def __init__(self, cached: Mapping[str, CachedStage]) -> None:
+        self.seconds: dict[str, float] = {}
+        self._cached = cached
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time the body as part of a stage."""
+        cached = self._cached.get(stage)
+        if cached is not None:
+            cached.hit, cached.saved_s = False, 0.0
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            elapsed = time.perf_counter() - start + (0.0 if cached is None else cached.saved_s)
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
+
+
+@dataclass(frozen=True, eq=False)
+class CullingResult:
+    """Which keypoints are static, by all filters.
+
+    Attributes:
+        keep: bool ``[N]``; False rows enter neither tracking nor map.
+        weight: float32 ``[N]`` in [0, 1], confidence that a keypoint is static.
+        mask: bool ``[H, W]``, dynamic pixels; None where no filter gives a mask.
+        stats: Every filter's stats, each name with the filter's before it, and how many of the last filters the guard
+            set aside because too few keypoints would be left.
+        image: This frame's image as the flow prepared it; None if no flow ran.
+    """
+
+    keep: NDArray[np.bool_]
+    weight: NDArray[np.float32]
+    mask: NDArray[np.bool_] | None
+    stats: Mapping[str, float]
+    image: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +138,7 @@ class SlamPipeline:
         self,
         *,
         extractor: FeatureExtractor,
-        masks: MaskStage | None,
+        masks: MaskScheduler | None,
         filters: Sequence[DynamicFilter],
         flow: FlowEstimator | None,
         backend: RgbdBackend,
@@ -137,106 +185,110 @@ class SlamPipeline:
         if not self._backend.uses_depth:
             frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
         clock = StageClock(self._cached)
-        self._backend.resume()  # filters read the map as it was before a `finalize`
-        gray, depth = _prepare(frame)
-        instances, mask = self._segment(frame, gray, depth, clock)
-        keypoints = self._extract(gray, mask, clock)
+        gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        depth = np.where(np.isfinite(frame.depth), frame.depth, 0).astype(np.float32)
+        instances = mask = None
+        if self._masks is not None:
+            with clock("segmentation"):
+                instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
+                mask = self._dynamic_mask(instances, depth)
+        with clock("features"):
+            keypoints = self._extract(gray, mask)
         xy, z = _undistorted(keypoints, depth, camera)
         bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
         state = self._filter_state(bundle, camera)
-        static = self._cull(bundle, state, clock)
-        result = self._backend.track(bundle, static.keep, static.weight)
+        static = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave
+        result = self._backend.track(bundle, static.keep, static.weight)  # with mapping and loop closing
         self._remember(bundle, static, result)
         timings = clock.seconds | dict(result.timings)
         stats = self._stats(bundle, state, static, result)
-        return TrackResult(
-            result.T_world_cam, result.state, stats, timings, static.mask, bundle.keypoints.xy, static.keep
-        )
+        return TrackResult(result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep)
 
-    def _segment(
-        self, frame: Frame, gray: NDArray[np.uint8], depth: NDArray[np.float32], clock: StageClock
-    ) -> tuple[Instances | None, NDArray[np.bool_] | None]:
-        """The objects in the image, and the mask of those that are dynamic because of their class."""
-        if self._masks is None:
-            return None, None
-        with clock("segmentation"):
-            instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
-            if self._segmentation is None or not len(instances):
-                return instances, None
-            return instances, dynamic_mask(instances, self._segmentation, depth)
+    def _dynamic_mask(self, instances: Instances, depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+        """The mask of the objects that are dynamic because of their class; None where there are no objects."""
+        if self._segmentation is None or not len(instances):
+            return None
+        return dynamic_mask(instances, self._segmentation, depth)
 
-    def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None, clock: StageClock) -> Keypoints:
+    def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> Keypoints:
         """Keypoints, enough of them outside the dynamic mask."""
-        with clock("features"):
-            if mask is None or self._segmentation is None or not isinstance(self._extractor, MaskedExtractor):
-                return self._extractor.extract(gray)
-            return self._extractor.extract_masked(gray, mask, self._segmentation.outside_share)
+        if mask is None or self._segmentation is None or not isinstance(self._extractor, MaskedExtractor):
+            return self._extractor.extract(gray)
+        return self._extractor.extract_masked(gray, mask, self._segmentation.outside_share)
 
-    def _filter_state(self, bundle: FrameBundle, camera: Camera) -> FilterState:
+    def _filter_state(self, frame: FrameBundle, camera: Camera) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
-        previous, backend = self._previous, self._backend
+        previous = self._previous
+        T_world_pred, covariance = self._backend.predict(frame.timestamp)
+        view = self._backend.view()
         return FilterState(
             camera=camera,
-            keep=np.ones(len(bundle), dtype=bool),
+            keep=np.ones(len(frame.xy), dtype=bool),
             previous=None if previous is None else previous.frame,
             previous_keep=None if previous is None else previous.keep,
             T_world_prev=None if previous is None else previous.T_world_cam,
-            T_world_pred=backend.predict(bundle.timestamp),
-            motion_covariance=backend.motion_covariance(bundle.timestamp),
-            keyframes=backend.keyframe_views(FILTER_KEYFRAMES),
-            map_points=backend.map_points(),
-            seed=int(stream(self._seed, "frame", bundle.index).integers(2**63)),
+            T_world_pred=T_world_pred,
+            motion_covariance=covariance,
+            keyframes=view.keyframes,
+            map_points=(view.ids, view.positions),
+            seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
         )
 
-    def _cull(self, bundle: FrameBundle, state: FilterState, clock: StageClock) -> CullingResult:
-        """The filters' verdicts in order; the flow runs on what is left when the first filter needs it."""
-        image: Any = None
-        verdicts = []
+    def _cull(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> CullingResult:
+        """The filters' verdicts in order, as far as the guard lets them; the first that needs the flow starts it."""
+        image, verdicts = None, []
+        stats: dict[str, float] = {}
         for dynamic_filter in self._filters:
             if "flow" in dynamic_filter.needs and image is None:
-                image = self._run_flow(bundle, state, clock)
+                image = self._run_flow(frame, state, clock)
             with clock(f"culling_{dynamic_filter.name}"):
-                verdict = dynamic_filter.apply(bundle, state)
+                verdict = dynamic_filter.apply(frame, state)
             state.keep = state.keep & verdict.keep
-            verdicts.append((dynamic_filter.name, verdict))
-        return combine_verdicts(verdicts, len(bundle), image, self._guard)
+            verdicts.append(verdict)
+            stats |= {f"{dynamic_filter.name}_{key}": value for key, value in verdict.stats.items()}
+        keep, undone, weight = np.ones(len(frame.xy), bool), 0, np.ones(len(frame.xy), np.float32)
+        if verdicts:
+            keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard)
+        used = verdicts[: len(verdicts) - undone]
+        if used:
+            weight = np.prod([verdict.weight for verdict in used], axis=0, dtype=np.float32)
+        masks = [verdict.mask for verdict in used if verdict.mask is not None]
+        mask = np.logical_or.reduce(masks) if masks else None
+        return CullingResult(keep, weight, mask, stats | {"guard_undone": float(undone)}, image)
 
-    def _run_flow(self, bundle: FrameBundle, state: FilterState, clock: StageClock) -> Any:
+    def _run_flow(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> Any:
         """Put the flow to the previous image, and the pose that it predicts, into `state`; the prepared image."""
         assert self._flow is not None  # checked in the constructor
         with clock("flow"):
-            image = self._flow.prepare(bundle.gray)
+            image = self._flow.prepare(frame.gray)
             if (previous := self._previous) is not None:
                 other = self._flow.prepare(previous.frame.gray) if previous.image is None else previous.image
-                state.flow = flow_to_previous(self._flow, image, other, bundle, state)
+                state.flow = flow_to_previous(self._flow, image, other, frame, state)
         with clock("ego_motion"):
-            state.T_world_pred = refine_prediction(bundle, state)
+            state.T_world_pred = refine_prediction(frame, state)
         return image
 
-    def _remember(self, bundle: FrameBundle, static: CullingResult, result: BackendResult) -> None:
+    def _remember(self, frame: FrameBundle, static: CullingResult, result: BackendResult) -> None:
         tracked = result.state == "ok"
         in_root_map = tracked and self._backend.state == "ok"  # predictions of a submap are of another world
         pose = result.T_world_cam if in_root_map else None
-        self._previous = PreviousFrame(bundle, static.keep, static.image, pose)
+        self._previous = PreviousFrame(frame, static.keep, static.image, pose)
         self._keyframe_due = not tracked or result.keyframe
 
     def _stats(
-        self, bundle: FrameBundle, state: FilterState, static: CullingResult, result: BackendResult
+        self, frame: FrameBundle, state: FilterState, static: CullingResult, result: BackendResult
     ) -> dict[str, float]:
         """The frame's diagnostics, the same keys on every frame."""
-        names = ("matches", "inliers", "map_points", "keyframes", "keyframe", "maps", "loops", "residual_px")
         stats = {
-            "keypoints": float(len(bundle)),
+            "keypoints": float(len(frame.xy)),
             "culled": float(np.count_nonzero(~static.keep)),
-            **{name: float(getattr(result, name)) for name in names},
+            **{name: float(getattr(result, name)) for name in STATS},
             "mask_fraction": 0.0 if static.mask is None else float(static.mask.mean()),
             "relocalised": float(result.relocalised),
             **static.stats,
-            "guard_undone": float(static.undone),
         }
-        if self._flow is not None:
-            flow_stats = {} if state.flow is None else state.flow.stats
-            stats |= {f"flow_{name}": flow_stats.get(name, 0.0) for name in stats_names_of(self._flow)}
+        flow_stats = {} if state.flow is None else state.flow.stats
+        stats |= {f"flow_{name}": flow_stats.get(name, 0.0) for name in getattr(self._flow, "stats_names", ())}
         if self._masks is not None:
             stats["segmented"] = float(self._masks.segmented)
         if self._cached:
@@ -287,13 +339,14 @@ class SlamPipeline:
 
     def _configurable_parts(self, settings: Settings) -> Iterator[tuple[str, Callable[[Any], None]]]:
         """Each group of the settings with every part that takes it."""
-        parts: list[tuple[str, Any]] = [(group, part) for part in self._filters for group in groups_of(part)]
-        parts += [
-            ("features", self._extractor),
-            ("segmentation", self._masks),
-            ("flow", self._flow),
-            ("backend", self._backend),
+        parts: list[tuple[str, Any]] = [
+            (group, part) for part in self._filters for group in getattr(part, "groups", (part.name,))
         ]
+        parts += zip(
+            ("features", "segmentation", "flow", "backend"),
+            (self._extractor, self._masks, self._flow, self._backend),
+            strict=True,
+        )
         for group, part in parts:
             if isinstance(part, Reconfigurable) and hasattr(settings, group):
                 yield group, part.configure
@@ -308,20 +361,6 @@ class SlamPipeline:
         return self._camera
 
 
-def groups_of(dynamic_filter: DynamicFilter) -> tuple[str, ...]:
-    """The groups of settings that a filter takes; its name alone where it does not say."""
-    return tuple(getattr(dynamic_filter, "groups", (dynamic_filter.name,)))
-
-
-def _prepare(frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The grey image, and a copy of the depth image in metres, 0 where depth is missing or not finite."""
-    gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-    depth = np.array(frame.depth, dtype=np.float32)
-    if not np.isfinite(depth).all():
-        depth[~np.isfinite(depth)] = 0
-    return gray, depth
-
-
 def _undistorted(
     keypoints: Keypoints, depth: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -329,3 +368,48 @@ def _undistorted(
     column, row = np.rint(keypoints.xy).astype(np.intp).T
     z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
     return camera.undistort_points(keypoints.xy), z
+
+
+def flow_to_previous(
+    flow: FlowEstimator, image: Any, previous: Any, frame: FrameBundle, state: FilterState
+) -> FlowResult:
+    """Flow of the kept keypoints, in rows of all keypoints; the others' rows are not valid.
+
+    Args:
+        flow: The method.
+        image: This frame's image as `flow` prepared it.
+        previous: The previous frame's.
+        frame: This frame.
+        state: With the keypoints that are left and both poses.
+    """
+    kept, count = np.flatnonzero(state.keep), len(frame.xy)
+    guess = predicted_flow(frame, state)[kept]
+    result = flow.track(image, previous, frame.keypoints.xy[kept], guess=guess, seed=state.seed)
+    xy = np.full((count, 2), np.nan, np.float32)
+    valid = np.zeros(count, bool)
+    cost = np.full(count, np.inf, np.float32)
+    xy[kept], valid[kept], cost[kept] = result.xy, result.valid, result.cost
+    return FlowResult(xy, valid, cost, result.stats)
+
+
+def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32]:
+    """Where the motion model expects this frame's keypoints in the previous image.
+
+    Args:
+        frame: The current frame.
+        state: With the previous pose and the predicted one.
+
+    Returns:
+        Raw pixels float32 ``[N, 2]``; NaN where depth or a prediction is missing.
+    """
+    guess = np.full((len(frame.xy), 2), np.nan, np.float32)
+    has_depth = frame.z > 0
+    if state.T_world_prev is None or state.T_world_pred is None or not has_depth.any():
+        return guess
+    camera, T_prev_cur = state.camera, se3.inverse(state.T_world_prev) @ state.T_world_pred
+    points = camera.unproject(frame.xy[has_depth], frame.z[has_depth]) @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
+    ahead = points[:, 2] > 0.05
+    pixels = np.full((len(points), 2), np.nan)
+    pixels[ahead] = camera.distort_points(camera.project(points[ahead]))
+    guess[has_depth] = pixels
+    return guess

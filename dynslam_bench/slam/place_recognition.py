@@ -1,7 +1,8 @@
 """Place recognition: which keyframes show the place of a frame, its pose there, and whether the place is verified.
 
-1. *Rank*: keyframes are scored by descriptor substrings that they share with the frame (`descriptor_index`). Nothing is
-   trained or downloaded.
+1. *Rank*: keyframes are scored by the 16-bit substrings of binary descriptors that they share with the frame. Two
+   descriptors of one point differ in few bits, so that some substrings are equal; those of different points seldom
+   share one (multi-index hashing: Norouzi, Punjani and Fleet, 2012). Nothing is trained or downloaded.
 2. *Pose*: descriptors are matched with a candidate's map points; a pose follows by RANSAC over three-point poses.
 3. *Verify*: all points around the candidate are matched. What was mapped there and should be in view has to be seen,
    unless a mask hides it; a few dozen matches alone fit between places that share a shelf or a poster.
@@ -21,19 +22,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.features.matching import match_brute_force
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.motion_model import pose_covariance
-from dynslam_bench.slam.observation import Observations
-from dynslam_bench.slam.pose_optimisation import PoseEstimate
 from dynslam_bench.slam.settings import TrackingSettings
-from dynslam_bench.slam.tracking import Matches, match_map, solve
+from dynslam_bench.slam.tracking import Matches, Observations, PoseCandidate, match_map, solve
 
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
+VALUES = 1 << 16
+"""Values of a substring."""
+STRIDE = 4
+"""Every fourth substring is used: the others change the ranking little and cost as much again."""
+CHANGED = 0.25
+"""A keyframe is indexed again when it has gained or lost this share of its points."""
 
 MAX_DISTANCE = 60
 RATIO = 0.85
@@ -97,11 +101,52 @@ def top_candidates(world: Map, keyframes: Slots, observations: Observations, cou
 def recognition_scores(world: Map, keyframes: Slots, observations: Observations) -> Array:
     """Place-recognition scores ``[S]`` of keyframes; comparable within one call alone.
 
-    The weights of the shared substrings over the root of the number of points: many points share more by chance.
+    The sum of the weights of the substrings that a keyframe shares with the frame, over the root of its number of
+    points: many points share more by chance. The weight is the logarithm of how much rarer a substring is than all of
+    the frame's together.
     """
-    world.index.update(world.kf_alive, world.kf_id, world.kf_point, world.kf_words)
-    score, points = world.index.score(keyframes, observations.words)
-    return np.asarray(score / np.sqrt(np.maximum(points, 1)))
+    _index_substrings(world)
+    query = np.ascontiguousarray(observations.words).view(np.uint16)[:, ::STRIDE].T
+    counts = np.full((len(query), VALUES), -1, np.int64)
+    for position, values in enumerate(query):
+        counts[position, values] = 0
+    indexed = [world.substrings[slot][1] for slot in keyframes.tolist()]
+    for substrings in indexed:
+        _count_shared(substrings, counts)
+    total = np.maximum(counts, 0).sum()
+    weight = np.where(counts > 0, np.log(max(total, 1) / np.maximum(counts, 1)), 0.0)
+    scores = np.array([_sum_weights(substrings, counts, weight) for substrings in indexed])
+    return np.asarray(scores / np.sqrt([max(substrings.shape[1], 1) for substrings in indexed]))
+
+
+def _index_substrings(world: Map) -> None:
+    """Sort the substrings of new keyframes, and of those that have gained or lost many points."""
+    observed = np.count_nonzero(world.kf_point >= 0, axis=1)
+    for slot in np.flatnonzero(world.kf_alive).tolist():
+        keyframe, substrings = world.substrings.get(slot, (-1, np.zeros((0, 0), np.uint16)))
+        new, count = keyframe != world.kf_id[slot], substrings.shape[1]
+        if new or abs(observed[slot] - count) > CHANGED * count:
+            columns = world.kf_words[slot, world.kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE].T
+            world.substrings[slot] = int(world.kf_id[slot]), np.sort(np.ascontiguousarray(columns))
+
+
+@kernel
+def _count_shared(substrings: NDArray[np.uint16], counts: NDArray[np.int64]) -> None:
+    """Count the substrings ``[P, F]`` of a keyframe that are in the frame; those that are not have -1."""
+    for position in range(substrings.shape[0]):
+        for value in substrings[position]:
+            if counts[position, value] >= 0:
+                counts[position, value] += 1
+
+
+@kernel
+def _sum_weights(substrings: NDArray[np.uint16], counts: NDArray[np.int64], weight: NDArray[np.float64]) -> float:
+    score = 0.0
+    for position in range(substrings.shape[0]):
+        for value in substrings[position]:
+            if counts[position, value] > 0:
+                score += weight[position, value]
+    return score
 
 
 # ---------------------------------------------------------------------- pose
@@ -193,18 +238,9 @@ def ransac_matches(
     return ransac[0], matches.select(ransac[1])
 
 
-@dataclass(frozen=True, eq=False)
-class PnpPose:
-    """A pose found without prediction, the keyframe and matches it rests on and its inliers among them."""
-
-    keyframe: int
-    matches: Matches
-    estimate: PoseEstimate
-
-
 def pnp_poses(
     world: Map, keyframes: list[int], observations: Observations, rng: np.random.Generator, min_inliers: int
-) -> Iterator[PnpPose]:
+) -> Iterator[PoseCandidate]:
     """Poses by descriptor matches: a good one at once, the others after all candidates, the best first.
 
     Args:
@@ -218,7 +254,7 @@ def pnp_poses(
         return
     matched = [(match_keyframe(world, keyframe, observations), keyframe) for keyframe in keyframes]
     matched.sort(key=lambda pair: (-len(pair[0]), -int(world.kf_id[pair[1]])))
-    others: list[PnpPose] = []
+    others: list[PoseCandidate] = []
     for matches, keyframe in matched[:PNP_CANDIDATES]:
         if len(matches) < max(MIN_PNP_INLIERS, min_inliers // 3):
             break
@@ -226,7 +262,7 @@ def pnp_poses(
         if ransac is None:
             continue
         pose, inliers = ransac
-        candidate = PnpPose(keyframe, inliers, solve(world.camera, observations, inliers, pose))
+        candidate = PoseCandidate(keyframe, inliers, solve(world.camera, observations, inliers, pose))
         if candidate.estimate.count >= 2 * min_inliers:
             yield candidate
         else:

@@ -177,29 +177,34 @@ def _linearise(
 
 
 @kernel
+def observation_chi2(
+    pose: Array, point: Array, uv: Array, right: float, info: float, info_right: float,
+    fx: float, fy: float, cx: float, cy: float, bf: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
+    x = pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2] * point[2] + pose[0, 3]
+    y = pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2] * point[2] + pose[1, 3]
+    z = pose[2, 0] * point[0] + pose[2, 1] * point[1] + pose[2, 2] * point[2] + pose[2, 3]
+    if z < NEAR_M:
+        return np.inf, np.inf
+    u = fx * x / z + cx
+    du, dv = uv[0] - u, uv[1] - (fy * y / z + cy)
+    pixel = info * (du * du + dv * dv)
+    if info_right <= 0.0:
+        return pixel, pixel
+    dr = right - (u - bf / z)
+    return pixel, pixel + info_right * dr * dr
+
+
+@kernel
 def _classify(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
     fx: float, fy: float, cx: float, cy: float, bf: float, inlier: NDArray[np.bool_], error: Array,
 ) -> None:  # fmt: skip
     for i in range(points.shape[0]):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
-        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
-        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-        inlier[i] = False
-        error[i] = np.inf
-        if z < NEAR_M:
-            continue
-        du = uv[i, 0] - (fx * x / z + cx)
-        dv = uv[i, 1] - (fy * y / z + cy)
-        chi2 = info[i] * (du * du + dv * dv)
-        error[i] = np.sqrt(chi2)
-        limit = CHI2_MONO
-        if info_right[i] > 0.0:
-            dr = right[i] - (fx * x / z + cx - bf / z)
-            chi2 += info_right[i] * dr * dr
-            limit = CHI2_DEPTH
-        inlier[i] = chi2 <= limit
+        pixel, whole = observation_chi2(pose, points[i], uv[i], right[i], info[i], info_right[i], fx, fy, cx, cy, bf)
+        error[i] = np.sqrt(pixel)
+        inlier[i] = whole <= (CHI2_DEPTH if info_right[i] > 0.0 else CHI2_MONO)
 
 
 @kernel

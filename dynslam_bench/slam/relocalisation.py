@@ -1,4 +1,4 @@
-"""The initial pose of a frame: from the last frame, else from keyframes, within what the camera can have moved.
+"""Relocalisation: the initial pose of a frame from keyframes, within what the camera can have moved.
 
 Buildings repeat themselves: the next door looks like the last one, and the local map there agrees. The relocalisation
 gate tells such places apart: a camera covers a limited distance in the time, and the images since the last tracked
@@ -7,12 +7,10 @@ frame tell how far it has rotated.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core.seeding import stream
@@ -20,35 +18,19 @@ from dynslam_bench.features.matching import match_brute_force
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.atlas import Atlas
-from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.place_recognition import (
     MAX_DISTANCE,
     RATIO,
-    PnpPose,
     is_aliased,
     pnp_poses,
     pose_uncertainty,
     top_candidates,
     verify_place,
 )
-from dynslam_bench.slam.pose_optimisation import PoseEstimate
 from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import CLOSE_BASELINES, Matches, TrackedFrame, match_last_frame, solve
+from dynslam_bench.slam.tracking import MIN_MATCHES, InitialPose, Observations, PoseCandidate, TrackedFrame
 
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
-
-ENOUGH_MAPPED = 100
-"""So many matches with map points of the last frame make points from its depth alone unnecessary."""
-ENOUGH_MATCHES = 20
-"""Matches with the last frame that make a second, wider search unnecessary (ORB-SLAM2's number)."""
-MIN_MATCHES = 10
-"""Inliers that a pose needs at least to be a candidate."""
-WIDEN = 2.5
-"""Factor on the search window where the narrow one gave no trusted pose."""
-TRUSTED_INLIERS = 50
-TRUSTED_SHARE = 0.5
-"""Inliers, and their share of the matches, that make a pose from the last frame trusted by itself."""
 CANDIDATES = 10
 """Best-ranked keyframes that are matched feature by feature; bounds the time of a frame."""
 MANY_POINTS = 60
@@ -240,128 +222,64 @@ class RelocalisationGate:
 
 
 @dataclass(frozen=True, eq=False)
-class InitialPose:
-    """A pose that enough matches agree on.
-
-    Attributes:
-        T_cam_world: World-to-camera pose.
-        matches: The matches that agree.
-        keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's reference.
-        relocalised: Whether it comes from a keyframe, or the camera was lost before.
-        share: Which share of the keyframe's points in view is seen; NaN if not verified.
-        uncertainty: `place_recognition.pose_uncertainty`; NaN if not verified.
-    """
-
-    T_cam_world: Array
-    matches: Matches
-    keyframe: int
-    relocalised: bool
-    share: float = np.nan
-    uncertainty: float = np.nan
-
-    @classmethod
-    def of(cls, matches: Matches, estimate: PoseEstimate, keyframe: int, *, relocalised: bool) -> InitialPose:
-        """The pose of an estimate, with the matches that are inliers."""
-        return cls(estimate.T_cam_world, matches.select(estimate.inliers), keyframe, relocalised)
-
-
-@dataclass(eq=False)
 class PoseSearch:
-    """The search for the initial pose of one frame; it reads the map and never changes it.
+    """The search of keyframes for the initial pose of one frame; it reads the map and never changes it.
 
     Attributes:
-        atlas: The maps.
+        world: The maps.
         observations: The frame's features.
-        last: The last tracked frame.
-        prediction: World-to-camera pose by the motion model.
         reference: Slot of the keyframe that shares most points with the last tracked frame.
         keyframes: Slots of the candidate keyframes.
         lost: Whether the camera was lost since then; else it was tracked in the frame before.
-        bound: Gives the motion bound.
+        bound: Where the camera can be.
         settings: Of the back end.
         seed: Of the sequence's random draws.
         frame: Index of the frame.
     """
 
-    atlas: Atlas
+    world: Map
     observations: Observations
-    last: TrackedFrame
-    prediction: Array
     reference: int
     keyframes: Slots
     lost: bool
-    bound: Callable[[], MotionBound]
+    bound: MotionBound
     settings: BackendSettings
     seed: int
     frame: int
-    _weak: tuple[Matches, PoseEstimate] | None = None
 
-    def from_last_frame(self) -> InitialPose | None:
-        """The pose from the last frame, if enough of its points agree and the camera was not lost."""
-        if self.lost:
-            self.bound()  # advances the rotation from image to image, whatever is recognised
-        self._weak, trusted = self._match_last_frame()
-        if self._weak is None or not trusted or self.lost:
-            return None
-        return InitialPose.of(*self._weak, self.reference, relocalised=False)
-
-    def relocalised(self) -> InitialPose | None:
-        """The pose from keyframes; called after `from_last_frame`.
+    def relocalised(self, weak: PoseCandidate | None) -> InitialPose | None:
+        """The pose from keyframes.
 
         A pose from the last frame that few matches agree on, as by chance after a gap or a sudden rotation, competes
         with those of keyframes, and has to be within the motion bound. After a loss it counts only if the place is
         verified.
+
+        Args:
+            weak: The pose from the last frame, if there is one.
         """
-        weak = self._weak
-        if weak is not None and self.lost:
-            verified = self._verified(PnpPose(self.reference, *weak))
-            if verified is not None:
-                return verified
-        pose = self._relocalise(MIN_MATCHES if weak is None or self.lost else weak[1].count + 1)
-        if pose is None and weak is not None and not self.lost and self._within_bound(weak[1]):
-            return InitialPose.of(*weak, self.reference, relocalised=False)
+        if weak is None:
+            return self._relocalise(MIN_MATCHES)
+        if self.lost:
+            return self._verified(weak) or self._relocalise(MIN_MATCHES)
+        pose = self._relocalise(weak.estimate.count + 1)
+        if pose is None and self._within_bound(weak):
+            return weak.initial_pose(relocalised=False)
         return pose
 
     def in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
-        world = self.atlas.world
-        if self.lost or not world.kf_map[self.reference]:
-            return None
-        pose = replace(self, keyframes=world.submap(0), lost=True)._relocalise(MIN_MATCHES)
+        pose = replace(self, keyframes=self.world.submap(0), lost=True)._relocalise(MIN_MATCHES)
         enough = self.settings.relocalisation.min_inliers
         return pose if pose is not None and len(pose.matches) >= enough else None
 
-    def _match_last_frame(self) -> tuple[tuple[Matches, PoseEstimate] | None, bool]:
-        """The best pose from the last frame, and whether it is trusted; each search is wider than the one before."""
-        world, s = self.atlas.world, self.settings.tracking
-        close_m = CLOSE_BASELINES * world.camera.baseline_m
-        best: tuple[Matches, PoseEstimate] | None = None
-        for widen, depth_m, enough in (
-            (1.0, 0.0, ENOUGH_MAPPED),
-            (1.0, close_m, ENOUGH_MATCHES),
-            (WIDEN, close_m, ENOUGH_MATCHES),
-        ):
-            radius = widen * s.radius_px
-            matches = match_last_frame(
-                world, self.last, self.observations, self.prediction, radius, depth_m, s.max_distance
-            )
-            if len(matches) < enough:
-                continue
-            estimate = solve(world.camera, self.observations, matches, self.prediction, rounds=3)
-            if estimate.count >= MIN_MATCHES and (best is None or estimate.count > best[1].count):
-                best = matches, estimate
-            if best is not None and estimate.count >= max(TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)):
-                return best, True
-        return best, False
-
     def _relocalise(self, min_inliers: int) -> InitialPose | None:
         """A pose by descriptors: from the reference keyframe, else from the best-ranked candidates."""
-        world, rng = self.atlas.world, stream(self.seed, "relocalisation", self.frame)
+        world, rng = self.world, stream(self.seed, "relocalisation", self.frame)
         least = self.settings.tracking.min_inliers
         if not self.lost:
             for candidate in pnp_poses(world, [self.reference], self.observations, rng, least):
-                if candidate.estimate.count >= min_inliers and self._within_bound(candidate.estimate):
-                    return InitialPose.of(candidate.matches, candidate.estimate, candidate.keyframe, relocalised=True)
+                if candidate.estimate.count >= min_inliers and self._within_bound(candidate):
+                    return candidate.initial_pose(relocalised=True)
         keyframes = top_candidates(world, self.keyframes, self.observations, CANDIDATES)
         for candidate in pnp_poses(world, keyframes, self.observations, rng, least):
             if candidate.estimate.count >= min_inliers:
@@ -370,10 +288,10 @@ class PoseSearch:
                     return verified
         return None
 
-    def _verified(self, candidate: PnpPose) -> InitialPose | None:
+    def _verified(self, candidate: PoseCandidate) -> InitialPose | None:
         """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
-        world, observations, s = self.atlas.world, self.observations, self.settings
-        submap, admits = int(world.kf_map[candidate.keyframe]), self.bound().admits
+        world, observations, s = self.world, self.observations, self.settings
+        submap, admits = int(world.kf_map[candidate.keyframe]), self.bound.admits
         if not admits(submap, candidate.estimate.T_cam_world):
             return None
         inliers = candidate.matches.select(candidate.estimate.inliers)
@@ -393,6 +311,6 @@ class PoseSearch:
                 return None
         return InitialPose(place.T_cam_world, place.matches, candidate.keyframe, True, place.share, uncertainty)
 
-    def _within_bound(self, estimate: PoseEstimate) -> bool:
+    def _within_bound(self, candidate: PoseCandidate) -> bool:
         """Whether the camera can be at a pose in the map where it was tracked last."""
-        return self.bound().admits(self.atlas.active, estimate.T_cam_world)
+        return self.bound.admits(self.bound.atlas.active, candidate.estimate.T_cam_world)

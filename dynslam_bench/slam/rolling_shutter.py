@@ -18,8 +18,7 @@ from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.motion_model import MAX_GAP_S
-from dynslam_bench.slam.observation import Observations, right_coordinates
-from dynslam_bench.slam.tracking import MapFit, TrackedFrame
+from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, right_coordinates, solve
 
 Array = NDArray[np.float64]
 
@@ -98,7 +97,7 @@ class RollingShutter:
 
     def predicted(self, raw: Observations, last: TrackedFrame, timestamp: float) -> Observations:
         """The features compensated by the velocity in the last frame."""
-        if self.velocity is None or not self._follows(last, timestamp):
+        if self.velocity is None or not 0 < timestamp - last.timestamp <= MAX_GAP_S:
             return raw
         return compensate_rolling_shutter(raw, self._camera, self.velocity)
 
@@ -124,21 +123,16 @@ class RollingShutter:
             timestamp: The frame's stamp, seconds.
             force: Whether fewer points may agree, as before the first frame is compensated.
         """
-        pose = fit.estimate.T_cam_world
-        if not self._follows(last, timestamp) or not np.isfinite(pose).all():
+        pose, dt = fit.estimate.T_cam_world, timestamp - last.timestamp
+        if not 0 < dt <= MAX_GAP_S or not np.isfinite(pose).all():
             return observations, fit, None
-        velocity = CameraVelocity.between(last.T_cam_world, pose, self._exposure_interval(timestamp - last.timestamp))
+        # a camera exposes at a regular rate, however its frames were stamped
+        usual = float(np.median(self._intervals)) if self._intervals else dt
+        regular = round(dt / usual) * usual
+        exposed = regular if abs(dt - regular) <= STAMP_NOISE * usual else dt
+        velocity = CameraVelocity.between(last.T_cam_world, pose, max(exposed, self._camera.readout_s))
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
-        refit = fit.refit(compensated, self._camera)
+        refit = replace(fit, estimate=solve(self._camera, compensated, fit.matches, pose))
         if refit.count < MIN_AGREEING * fit.count and not force:
             return observations, fit, None
         return compensated, refit, velocity
-
-    def _follows(self, last: TrackedFrame, timestamp: float) -> bool:
-        return 0 < timestamp - last.timestamp <= MAX_GAP_S
-
-    def _exposure_interval(self, dt: float) -> float:
-        """Seconds between two exposures: a camera exposes at a regular rate, however its frames were stamped."""
-        usual = float(np.median(self._intervals)) if self._intervals else dt
-        regular = round(dt / usual) * usual
-        return max(regular if abs(dt - regular) <= STAMP_NOISE * usual else dt, self._camera.readout_s)

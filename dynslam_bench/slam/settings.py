@@ -6,7 +6,6 @@ Thresholds that few users need to change are constants beside the rule that uses
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from pydantic import Field
 
@@ -121,9 +120,6 @@ class BundleAdjustmentSettings(Settings):
         8, low=2, high=20, limits=(1, 100), meaning="keyframes that are refined: the newest and its covisible ones"
     )
     iterations: int = tunable(3, low=1, high=10, limits=(1, 100), meaning="Levenberg-Marquardt iterations")
-    solver: Literal["schur", "gtsam"] = Field(
-        "schur", description="the project's Schur complement; gtsam is the reference that it is compared with"
-    )
     full: bool = Field(
         False,
         description="whether to refine all keyframes and points together after the last frame; changes the final "

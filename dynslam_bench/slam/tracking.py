@@ -1,26 +1,30 @@
-"""Matching a frame against the last frame and the local map, and the pose that follows.
+"""Tracking: a frame's features, their matches with the last frame and the local map, and the pose that follows.
 
 All functions are pure: they read the map and never change it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.features.matching import rotation_consistent, search_in_radius
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.features.matching import CellGrid, Words, as_words, rotation_consistent, search_in_radius
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.observation import Observations
+from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import PoseEstimate, optimise_pose
 from dynslam_bench.slam.settings import TrackingSettings
 
-Array = NDArray[np.float64]
-Slots = NDArray[np.int64]
-
+MAX_DEPTH_M = 40.0
+"""Depth beyond this is treated as missing."""
+RIGHT_SIGMA_PX = 1.5
+"""Standard deviation of the right coordinate at octave 0, beside the depth sensor's noise."""
+DEPTH_NOISE = 0.0025
+"""Standard deviation of the depth over its square, 1/m (structured-light sensors)."""
 CLOSE_BASELINES = 40.0
 """Points nearer than this many stereo baselines are close: their depth is trusted at once (ORB-SLAM2's number)."""
 MARGIN_PX = 8.0
@@ -32,6 +36,105 @@ MIN_KEYFRAME_GAP = 20
 """Keyframes at least between one and another that a loop is closed to."""
 STRONG_COVISIBILITY = 15
 """Two keyframes that share so many points constrain each other (the least that ORB-SLAM2 calls covisible)."""
+ENOUGH_MAPPED = 100
+"""So many matches with map points of the last frame make points from its depth alone unnecessary."""
+ENOUGH_MATCHES = 20
+"""Matches with the last frame that make a second, wider search unnecessary (ORB-SLAM2's number)."""
+MIN_MATCHES = 10
+"""Inliers that a pose needs at least to be a candidate."""
+WIDEN = 2.5
+"""Factor on the search window where the narrow one gave no trusted pose."""
+TRUSTED_INLIERS = 50
+TRUSTED_SHARE = 0.5
+"""Inliers, and their share of the matches, that make a pose from the last frame trusted by itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Features of one frame that no filter removed, one row each, ready for matching.
+
+    Attributes:
+        keypoints: Raw keypoints (distorted pixels).
+        xy: float64 ``[N, 2]`` undistorted pixels.
+        z: float64 ``[N]`` depth in metres, 0 missing.
+        right: float64 ``[N]`` right coordinate ``u - fx * baseline / z``, NaN without depth.
+        octave: int64 ``[N]``.
+        angle: float64 ``[N]`` degrees.
+        words: uint64 ``[N, W]`` descriptors.
+        info: float64 ``[N]`` inverse variance of the pixel coordinates, 1/px^2, times the filters' weight.
+        info_right: float64 ``[N]`` inverse variance of the right coordinate, times the weight; 0 without depth.
+        grid: Cells of the features.
+        rgb: uint8 ``[N, 3]`` colour at the feature.
+        mask: bool ``[H, W]``, dynamic pixels, behind which no map point is visible; None without masks.
+    """
+
+    keypoints: Keypoints
+    xy: Array
+    z: Array
+    right: Array
+    octave: Slots
+    angle: Array
+    words: Words
+    info: Array
+    info_right: Array
+    grid: CellGrid
+    rgb: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+def observe(
+    frame: FrameBundle,
+    keep: NDArray[np.bool_],
+    weight: NDArray[np.float32],
+    camera: Camera,
+    scales: Array,
+) -> Observations:
+    """Select and prepare the features of a frame.
+
+    The right coordinate ``u - b f / z`` carries the depth (ORB-SLAM2, Eq. for RGB-D); its variance is the pixel's plus
+    that of the depth sensor, ``(b f / z^2 * c z^2)^2 = (b f c)^2``, constant in disparity.
+
+    Args:
+        frame: The frame with its keypoints.
+        keep: bool ``[N]``, False rows are left out entirely.
+        weight: float32 ``[N]`` in [0, 1], scales the information of a feature.
+        camera: Intrinsics.
+        scales: Scale of each octave.
+    """
+    weight = np.clip(np.nan_to_num(np.asarray(weight, np.float64), nan=0.0), 0.0, 1.0)
+    index = np.flatnonzero(np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0))
+    keypoints = frame.keypoints.select(index)
+    xy = np.ascontiguousarray(frame.xy[index], dtype=np.float64)
+    z = np.nan_to_num(frame.z[index].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
+    octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
+    variance = scales[octave] ** 2
+    noise = RIGHT_SIGMA_PX**2 * variance + (camera.fx * camera.baseline_m * DEPTH_NOISE) ** 2
+    column = np.clip(np.rint(keypoints.xy[:, 0]).astype(np.int64), 0, frame.rgb.shape[1] - 1)
+    row = np.clip(np.rint(keypoints.xy[:, 1]).astype(np.int64), 0, frame.rgb.shape[0] - 1)
+    return Observations(
+        keypoints,
+        xy,
+        z,
+        right_coordinates(xy, z, camera),
+        octave,
+        keypoints.angle.astype(np.float64),
+        as_words(keypoints.descriptors),
+        weight[index] / variance,
+        np.where(z > 0, weight[index] / noise, 0.0),
+        CellGrid.of(xy, camera.width, camera.height),
+        frame.rgb[row, column],
+        frame.mask,
+    )
+
+
+def right_coordinates(xy: Array, z: Array, camera: Camera) -> Array:
+    """Right coordinates ``[N]`` of pixels ``[N, 2]`` with depths ``[N]`` in metres; NaN where the depth is 0."""
+    has_depth = z > 0
+    return np.where(has_depth, xy[:, 0] - camera.fx * camera.baseline_m / np.where(has_depth, z, 1.0), np.nan)
 
 
 @dataclass(eq=False)
@@ -79,6 +182,84 @@ class Matches:
         return Matches(feature, point, np.concatenate((self.position, other.position)))
 
 
+@dataclass(frozen=True, eq=False)
+class PoseCandidate:
+    """A pose, the matches that it was fitted to, and a keyframe nearby.
+
+    Attributes:
+        keyframe: Slot of the keyframe that is matched, or else of the last frame's reference.
+        matches: The matches.
+        estimate: The pose and its inliers among the matches.
+    """
+
+    keyframe: int
+    matches: Matches
+    estimate: PoseEstimate
+
+    def initial_pose(self, *, relocalised: bool) -> InitialPose:
+        """The pose with the matches that are inliers."""
+        inliers = self.matches.select(self.estimate.inliers)
+        return InitialPose(self.estimate.T_cam_world, inliers, self.keyframe, relocalised)
+
+
+@dataclass(frozen=True, eq=False)
+class InitialPose:
+    """A pose that enough matches agree on.
+
+    Attributes:
+        T_cam_world: World-to-camera pose.
+        matches: The matches that agree.
+        keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's reference.
+        relocalised: Whether it comes from a keyframe, or the camera was lost before.
+        share: Which share of the keyframe's points in view is seen; NaN if not verified.
+        uncertainty: `place_recognition.pose_uncertainty`; NaN if not verified.
+    """
+
+    T_cam_world: Array
+    matches: Matches
+    keyframe: int
+    relocalised: bool
+    share: float = np.nan
+    uncertainty: float = np.nan
+
+
+def pose_from_last_frame(
+    world: Map,
+    last: TrackedFrame,
+    observations: Observations,
+    prediction: Array,
+    reference: int,
+    settings: TrackingSettings,
+) -> tuple[PoseCandidate | None, bool]:
+    """The best pose from the last frame, and whether it is trusted; each search is wider than the one before.
+
+    Args:
+        world: The map.
+        last: The last tracked frame.
+        observations: The new frame's features.
+        prediction: Its world-to-camera pose by the motion model.
+        reference: Slot of the keyframe that shares most points with the last frame.
+        settings: Radius and descriptor distance.
+    """
+    close_m = CLOSE_BASELINES * world.camera.baseline_m
+    best: PoseCandidate | None = None
+    for widen, depth_m, enough in (
+        (1.0, 0.0, ENOUGH_MAPPED),
+        (1.0, close_m, ENOUGH_MATCHES),
+        (WIDEN, close_m, ENOUGH_MATCHES),
+    ):
+        radius = widen * settings.radius_px
+        matches = match_last_frame(world, last, observations, prediction, radius, depth_m, settings.max_distance)
+        if len(matches.feature) < enough:
+            continue
+        estimate = solve(world.camera, observations, matches, prediction, rounds=3)
+        if estimate.count >= MIN_MATCHES and (best is None or estimate.count > best.estimate.count):
+            best = PoseCandidate(reference, matches, estimate)
+        if best is not None and estimate.count >= max(TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)):
+            return best, True
+    return best, False
+
+
 def match_last_frame(
     world: Map,
     last: TrackedFrame,
@@ -109,10 +290,10 @@ def match_last_frame(
     mapped = from_map[rows]
     position[mapped] = world.position[last.point[rows[mapped]]]
     unmapped = rows[~mapped]
-    position[~mapped] = se3.transform(
-        se3.inverse(last.T_cam_world), camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
-    )
-    local = se3.transform(T_cam_world, position)
+    if len(unmapped):
+        local = camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
+        position[~mapped] = se3.transform(se3.inverse(last.T_cam_world), local)
+    local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     ahead = local[:, 2] > 0.05
     uv = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
     inside = (
@@ -122,12 +303,12 @@ def match_last_frame(
     )
     rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
     octave = last.observations.octave[rows]
-    free, words = np.ones(len(observations), bool), last.observations.words[rows]
+    free, words = np.ones(len(observations.xy), bool), last.observations.words[rows]
     right = uv[:, 0] - camera.fx * camera.baseline_m / depth
     windows, octaves = (uv, right, radius_px * world.scales[octave]), (octave - 1, octave + 1)
     feature, _ = search_in_radius(
         observations.grid,
-        observations.arrays,
+        (observations.xy, observations.right, observations.octave, observations.words),
         free,
         windows,
         octaves,
@@ -167,7 +348,7 @@ def match_map(
     points, uv, right, octave, cosine = world.project(T_cam_world, candidates)
     matched = np.zeros(world.alive.size, bool)
     matched[matches.point[matches.point >= 0]] = True
-    free = np.ones(len(observations), bool)
+    free = np.ones(len(observations.xy), bool)
     free[matches.feature] = False
     rest = ~matched[points]
     radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
@@ -175,7 +356,14 @@ def match_map(
     windows, octaves = (uv[rest], right[rest], radius[rest]), (octave[rest] - 1, octave[rest] + 1)
     words, bits = world.words[wanted], settings.max_distance
     feature, _ = search_in_radius(
-        observations.grid, observations.arrays, free, windows, octaves, words, max_distance=bits, ratio=MAP_RATIO
+        observations.grid,
+        (observations.xy, observations.right, observations.octave, observations.words),
+        free,
+        windows,
+        octaves,
+        words,
+        max_distance=bits,
+        ratio=MAP_RATIO,
     )
     hit = feature >= 0
     return Matches(feature[hit], wanted[hit], world.position[wanted[hit]]), points
@@ -213,10 +401,6 @@ class MapFit:
     def count(self) -> int:
         """Number of inliers."""
         return int(np.count_nonzero(self.inliers))
-
-    def refit(self, observations: Observations, camera: Camera) -> MapFit:
-        """The pose fitted again to the same matches, the features of which have moved a little."""
-        return replace(self, estimate=solve(camera, observations, self.matches, self.estimate.T_cam_world))
 
 
 def track_local_map(

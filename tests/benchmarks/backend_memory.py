@@ -1,7 +1,7 @@
 """Resident memory and frame time of systems over 10,000 frames of a rendered room, walked to and fro.
 
     python tests/benchmarks/backend_memory.py [--tracker orb-slam2 ... | all] [--frames 10000] [--loop 300]
-        [--size 640 480] [--sequence synthetic/sitting_xyz] [--record FILE]
+        [--size 640 480] [--sequence synthetic/sitting_xyz]
 
 Each tracker runs whole (features, masks, culling, tracking, mapping) in a process of its own. The sequence's first
 `loop` frames are held in memory and played forwards and backwards in turn, so that nothing but the tracker grows.
@@ -110,7 +110,6 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=10000)
     parser.add_argument("--loop", type=int, default=300)
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
-    parser.add_argument("--record", type=Path)
     options = parser.parse_args()
     smaller = PreprocessingSettings(width=options.size[0], height=options.size[1])
     sequence = open_sequence(options.sequence, frames=(0, options.loop), preprocessing=smaller)
@@ -125,8 +124,6 @@ def main() -> int:
         rows.append(ours.recv())
         process.join()
         sys.stdout.write(f"{json.dumps(rows[-1])}\n")
-        if options.record:
-            options.record.write_text(json.dumps(rows, indent=1) + "\n")
     return int(any(row["growth_mb_per_1000"] > BAR_MB or row["slower"] > BAR_SLOWER for row in rows))
 
 

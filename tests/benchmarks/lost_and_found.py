@@ -29,6 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
 
 from dynslam_bench.contracts.features import Keypoints  # noqa: E402
 from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
@@ -50,54 +51,33 @@ SCENES = [
 BEFORE = {"black": 100, "kidnapped": 200, "carried": 200}
 BACK, AFTER, SOON = 150, 30, 10
 NEAR_M, NEAR_DEG, WRONG_M = 0.3, 20.0, 0.1
-HEAD = (
-    "| scene, loss | cases | known and found within 10 | frames, median / most | known, never found "
-    "| other views, found | wrong frames | worst mm | `ok` frames |\n|" + " --- |" * 9 + "\n"
-)
 DILATION = 15
 """Pixels around people that count as theirs."""
 
 
 @dataclass(frozen=True, eq=False)
-class SceneFrame:
-    """A frame: static features, their depth, and the mask of people (packed bits)."""
-
-    keypoints: Keypoints
-    z: np.ndarray
-    mask: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Scene:
-    """The camera's view: the camera, the frames, true poses ``[N, 4, 4]``, frames a second."""
+    """A rendered scene.
+
+    Attributes:
+        camera: The camera.
+        frames: Of each frame its static keypoints, their depth, and the mask of people as packed bits.
+        poses: True camera-to-world poses ``[N, 4, 4]``.
+        fps: Frames a second.
+    """
 
     camera: Camera
-    seen: list[SceneFrame]
+    frames: list[tuple[Keypoints, np.ndarray, np.ndarray]]
     poses: np.ndarray
     fps: float
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of a case: whether the view was known, frames until `ok` (None: never), wrong ones, frames `ok`."""
-
-    known: bool
-    frames_lost: int | None
-    wrong: int
-    worst_m: float
-    tracked: int
-    frames: int
 
 
 def rendered(source: str, count: int) -> Scene:
     """Features of the first `count` frames of a sequence; of every second one where the camera walks."""
     stride = 2 if "loop" in source else 1
-    sequence, extractor = (
-        open_sequence(source, frames=(0, count * stride), stride=stride),
-        build_extractor(FeatureSettings()),
-    )
-    assert sequence.ground_truth is not None and sequence.masks is not None
-    kernel, seen = np.ones((2 * DILATION + 1, 2 * DILATION + 1), np.uint8), []
+    sequence = open_sequence(source, frames=(0, count * stride), stride=stride)
+    extractor = build_extractor(FeatureSettings())
+    kernel, frames = np.ones((2 * DILATION + 1, 2 * DILATION + 1), np.uint8), []
     for index in range(len(sequence)):
         frame, masks = sequence[index], sequence.masks[index]
         people = np.isin(masks.instances, [n for n, name in masks.class_names.items() if name == "person"])
@@ -106,18 +86,18 @@ def rendered(source: str, count: int) -> Scene:
         keypoints = extractor.extract_masked(gray, mask, SegmentationSettings().outside_share)
         column, row = np.rint(keypoints.xy).astype(int).T
         at = row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)
-        mine = np.flatnonzero(~mask[at])
-        seen.append(SceneFrame(keypoints.select(mine), frame.depth[at][mine].clip(min=0), np.packbits(mask)))
+        static = np.flatnonzero(~mask[at])
+        frames.append((keypoints.select(static), frame.depth[at][static].clip(min=0), np.packbits(mask)))
     stamps, truth = sequence.timestamps, sequence.ground_truth
     nearest = np.abs(truth.timestamps[:, None] - stamps[None]).argmin(axis=0)
-    return Scene(sequence.camera, seen, truth.T_world_cam[nearest], sequence.fps / stride)
+    return Scene(sequence.camera, frames, truth.T_world_cam[nearest], sequence.fps / stride)
 
 
 def frame_of(scene: Scene, index: int | None, number: int) -> FrameBundle:
     """A frame of the case; None is a black one."""
-    seen, size = scene.seen[0 if index is None else index], (scene.camera.height, scene.camera.width)
-    mask = np.unpackbits(seen.mask).reshape(size).astype(bool)
-    keypoints, z = seen.keypoints, seen.z
+    size = scene.camera.height, scene.camera.width
+    keypoints, z, packed = scene.frames[index or 0]
+    mask = np.unpackbits(packed).reshape(size).astype(bool)
     if index is None:
         keypoints, z, mask = keypoints.select(np.zeros(0, np.int64)), z[:0], np.zeros(size, bool)
     blank = np.zeros((*size, 3), np.uint8)
@@ -141,8 +121,8 @@ def is_known(scene: Scene, view: int, mapped: list[int]) -> bool:
     return bool((near & (rotated <= NEAR_DEG)).any())
 
 
-def case(scene: Scene, kind: str, start: int, black: int, settings: BackendSettings) -> Outcome:
-    """Drive one case."""
+def case(scene: Scene, kind: str, start: int, black: int, settings: BackendSettings) -> dict[str, object]:
+    """Drive one case; a row of the table of cases."""
     path, before = path_of(kind, start, black), BEFORE[kind]
     backend = RgbdBackend(settings)
     backend.reset(scene.camera, 0)
@@ -155,32 +135,28 @@ def case(scene: Scene, kind: str, start: int, black: int, settings: BackendSetti
             true = (se3.inverse(scene.poses[start]) @ scene.poses[index])[:3, 3]
             error[number] = np.linalg.norm(result.T_world_cam[:3, 3] - true)
     dark = np.array([index is None for index in path])
-    drift = error[:before].max()
-    wrong = int(np.count_nonzero(ok & (dark | (error > drift + WRONG_M))))
     again = np.flatnonzero(ok[-AFTER:])
     mapped = [path[number] for number in np.flatnonzero(ok[:before])]
-    frames_lost = int(again[0]) + 1 if len(again) else None
-    known = bool(mapped) and is_known(scene, path[-AFTER], mapped)
-    return Outcome(known, frames_lost, wrong, float(error[ok].max(initial=0)), int(ok.sum()), len(path))
+    return {
+        "known": bool(mapped) and is_known(scene, path[-AFTER], mapped),
+        "frames_lost": int(again[0]) + 1 if len(again) else np.inf,
+        "wrong": np.count_nonzero(ok & (dark | (error > error[:before].max() + WRONG_M))),
+        "worst_mm": 1e3 * error[ok].max(initial=0),
+        "tracked": np.count_nonzero(ok),
+        "frames": len(path),
+    }
 
 
-def row(words: str, outcomes: list[Outcome]) -> str:
-    """One row of the table."""
-    known = [outcome.frames_lost for outcome in outcomes if outcome.known]
-    others = [outcome.frames_lost for outcome in outcomes if not outcome.known]
-    needed = [frames for frames in known if frames is not None]
-    cells = (
-        words,
-        len(outcomes),
-        f"{sum(frames <= SOON for frames in needed)} of {len(known)}",
-        f"{np.median(needed):.0f} / {max(needed)}" if needed else "-",
-        known.count(None),
-        f"{len(others) - others.count(None)} of {len(others)}",
-        sum(outcome.wrong for outcome in outcomes),
-        f"{1e3 * max(outcome.worst_m for outcome in outcomes):.0f}",
-        f"{sum(outcome.tracked for outcome in outcomes)} of {sum(outcome.frames for outcome in outcomes)}",
-    )
-    return "| " + " | ".join(map(str, cells)) + " |\n"
+def summary(cases: pd.DataFrame) -> pd.Series:
+    """One row of the printed table."""
+    known, others = cases[cases.known].frames_lost, cases[~cases.known].frames_lost
+    return pd.Series({
+        "cases": len(cases), "known": len(known), "found within 10": (known <= SOON).sum(),
+        "median": known[np.isfinite(known)].median(), "most": known[np.isfinite(known)].max(),
+        "never found": np.isinf(known).sum(), "other views": len(others), "others found": np.isfinite(others).sum(),
+        "wrong frames": cases.wrong.sum(), "worst mm": cases.worst_mm.max(), "ok": cases.tracked.sum(),
+        "frames": cases.frames.sum(),
+    })  # fmt: skip
 
 
 def main() -> int:
@@ -194,23 +170,17 @@ def main() -> int:
     options = parser.parse_args()
     cv2.setNumThreads(1)
     settings = apply_overrides(BackendSettings(), parse_assignments(options.set))
-    sys.stdout.write(HEAD)
-    every: list[Outcome] = []
+    rows = []
     for source in options.sequences:
         scene = rendered(source, options.frames)
         for kind in BEFORE:
             length = max(index for index in path_of(kind, 0, options.black) if index is not None) + 1
-            starts = np.linspace(0, options.frames - length, options.cases).astype(int)
-            outcomes = [case(scene, kind, int(start), options.black, settings) for start in starts]
-            every += outcomes
-            sys.stdout.write(row(f"{source.removeprefix('synthetic/')}, {kind}", outcomes))
-            sys.stdout.flush()
-    sys.stdout.write(row("all", every))
-    known = [outcome for outcome in every if outcome.known]
-    return int(
-        any(outcome.wrong for outcome in every)
-        or any(outcome.frames_lost is None or outcome.frames_lost > SOON for outcome in known)
-    )
+            for start in np.linspace(0, options.frames - length, options.cases).astype(int):
+                rows.append({"scene": source, "loss": kind} | case(scene, kind, int(start), options.black, settings))
+    cases = pd.DataFrame(rows)
+    for keys in (["scene", "loss"], lambda _: "all"):
+        print(cases.groupby(keys, sort=False).apply(summary).to_string(float_format="{:.0f}".format))
+    return int(cases.wrong.any() or (cases[cases.known].frames_lost > SOON).any())
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 from dynslam_bench.runs import RunStore  # noqa: E402
 
-FIXTURE = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
+FIXTURE = ROOT / "tests" / "fixtures" / "results"
 TRACKERS, SEQUENCES = 20, 50
 SETTINGS = 120
 """As many as trackers have: a record of 12 KB."""

@@ -23,10 +23,10 @@ def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pyte
 
 
 def test_kernels_are_cached_and_release_the_lock() -> None:
-    from dynslam_bench.slam import map_kernels
+    from dynslam_bench.slam.pose_optimisation import apply_twist
 
-    options = map_kernels.project.targetoptions
-    assert options["nogil"] and map_kernels.project.stats.cache_path
+    options = apply_twist.targetoptions
+    assert options["nogil"] and apply_twist.stats.cache_path
 
 
 def test_a_division_by_zero_is_an_error_unless_asked_for() -> None:

@@ -31,7 +31,7 @@ def _sound() -> dict[str, Any]:
         "kf_xy": np.full((5, 2), 4.0), "kf_right": np.array([1.0, np.nan, 1.0, 1.0, 1.0]),
         "kf_z": np.array([1, 0, 1, 1, 1], np.float32), "kf_octave": np.array([0, 1, 2, 7, 0], np.int8),
         "kf_angle": np.zeros(5, np.float32), "kf_info": np.ones(5), "kf_info_right": np.ones(5),
-        "kf_words": np.zeros((5, 4), np.uint64), "kf_point": np.array([1, -1, 0, 0, 1], np.int32),
+        "kf_words": np.zeros((5, 4), np.uint64),
         "id": np.array([3, 8]), "position": np.array([[0.0, 0, 1], [0.1, 0, 1]]), "normal": np.eye(3)[[2, 2]],
         "far": np.ones(2), "words": np.zeros((2, 4), np.uint64), "rgb": np.zeros((2, 3), np.uint8),
         "visible": np.ones(2, np.int32), "found": np.ones(2, np.int32), "born": np.array([0, 1]),
@@ -48,7 +48,7 @@ def _seeds() -> list[bytes]:
     odd: list[dict[str, Any]] = [{}, *({name: value} for name, value in far.items())]
     odd += [{"far": np.zeros(2)}, {"id": np.array([3, 3])}, {"kf_id": np.array([0, 9])}, {"rgb": np.zeros((2, 4))}]
     odd += [{"obs_ft": np.array([2, 2, 0, 1], np.int32)}, {"obs_ft": np.array([2, 1, 0, 0], np.int32)}]
-    odd += [{"n_obs": np.array([1, 1], np.int32)}, {"kf_point": np.array([1, 1, 0, 0, 1], np.int32)}]
+    odd += [{"n_obs": np.array([1, 1], np.int32)}]
     odd += [{"visible": np.zeros(2, np.int32)}, {"position": np.full((2, 3), np.nan)}, {"more": np.zeros(1)}]
     odd += [{HEADER: np.array([255], np.uint8)}, {HEADER: np.frombuffer(b"{}", np.uint8)}]
     nothing = {name: value[:0] for name, value in sound.items() if name != HEADER}

@@ -31,7 +31,7 @@ from dynslam_bench.tuning import Study, StudySummary, samplers
 from .mutate import mutate_json, mutate_lines, mutate_zip
 from .target import Target, at
 
-FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
+FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "results"
 RUN = "a7abe04996a79cc4"
 
 

@@ -16,7 +16,7 @@ from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
 from dynslam_bench.runs.store import list_runs
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULTS = ROOT / "tests" / "fixtures" / "before_rebuild" / "results"
+RESULTS = ROOT / "tests" / "fixtures" / "results"
 ROWS = [
     FrameRow(0, 1.5, "ok", None, None, 0.0, 0.0, -0.0, 0.25, {"total": 0.1}, {"culled": 3.0}, [0.0] * 6 + [1.0]),
     FrameRow(1, 1.625, "dropped"),

@@ -10,8 +10,8 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
-from dynslam_bench.slam.observation import observe
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
+from dynslam_bench.slam.tracking import observe
 
 
 class PointWorld:

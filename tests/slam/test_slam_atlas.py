@@ -93,11 +93,10 @@ def test_maps_that_never_meet_stay_apart_and_filters_see_the_active_one():
     outputs, world = backend.outputs(), backend.world
     assert {record.map for record in outputs.keyframes} == {0, 1}
     assert 0 < len(outputs.positions) < world.point_count, "where those of the submap lie is unknown"
-    ids, _ = backend.map_points()
-    views = backend.keyframe_views(100)
+    views, ids, _ = backend.view()
     assert views and all(view.timestamp > 2.4 for view in views), "keyframes of the root map are older"
     assert set(ids.tolist()) == set(world.id[world.points_of(world.submap(1))].tolist())
-    assert 0 < len(ids) < world.point_count and backend.predict(8.0) is not None
+    assert 0 < len(ids) < world.point_count and backend.predict(8.0)[0] is not None
     without, results, _ = drive(RingWorld(), APART, STEP)
     assert set(states(results)[25:]) == {"lost"} and {record.map for record in without.outputs().keyframes} == {0}
 

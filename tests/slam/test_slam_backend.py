@@ -1,22 +1,16 @@
 """The back end on a simulated world: accuracy, repeatability, tracking state, bad input."""
 
-import sys
 import warnings
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from point_world import PointWorld, errors, make_backend, states, track_all
+from point_world import errors, make_backend, states, track_all
 
-from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.core.settings import parameters
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.bundle_adjustment import adjust_bundle_gtsam
+from dynslam_bench.slam import keyframes
 from dynslam_bench.slam.motion_model import MAX_GAP_S
-from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 
-NEEDS_GTSAM = pytest.mark.skipif(find_spec("gtsam") is None, reason="the extra [gtsam] is not installed")
 COUNTS = ("matches", "inliers", "residual_px", "relocalised", "keyframe", "map_points", "keyframes")
 
 
@@ -60,10 +54,9 @@ def test_full_bundle_adjustment_is_undone_when_the_run_goes_on(room):
     """`finalize` gives the same when asked twice, and a run that goes on is what it would have been."""
     asked, quiet = (make_backend(room, bundle_adjustment__full=True) for _ in range(2))
     for index, pose in enumerate(room.path(60)):
-        for backend in (asked, quiet):
-            backend.resume()
-        assert np.array_equal(asked.map_points()[1], quiet.map_points()[1])
-        for one, other in zip(asked.keyframe_views(3), quiet.keyframe_views(3), strict=True):
+        (views, _, points), (others, _, same) = asked.view(), quiet.view()
+        assert np.array_equal(points, same)
+        for one, other in zip(views, others, strict=True):
             assert np.array_equal(one.T_world_cam, other.T_world_cam)
         frame = room.see(pose, index)
         (one,), (other,) = track_all(asked, [frame]), track_all(quiet, [frame])
@@ -73,7 +66,6 @@ def test_full_bundle_adjustment_is_undone_when_the_run_goes_on(room):
             first, second = asked.finalize(), asked.finalize()
             assert np.array_equal(first.T_world_cam, second.T_world_cam)
             assert not np.array_equal(before, asked.outputs().positions)
-            assert np.array_equal(asked.map_points()[1], asked.outputs().positions)
     assert np.array_equal(asked.finalize().T_world_cam, quiet.finalize().T_world_cam)
 
 
@@ -89,7 +81,7 @@ def test_dynamic_features_enter_neither_tracking_nor_map(room):
         keeps.append(~moving)
     backend = make_backend(room)
     assert errors(track_all(backend, frames, keeps), truth).max() < 0.025
-    for record, view in zip(backend.outputs().keyframes[::-1], backend.keyframe_views(100), strict=True):
+    for record, view in zip(backend.outputs().keyframes[::-1], backend.view().keyframes, strict=True):
         assert len(view.keypoints) == np.count_nonzero(keeps[record.frame])
 
 
@@ -119,45 +111,22 @@ def test_a_covered_lens_is_lost_exactly_as_long_as_it_is_covered(room):
     assert np.allclose(backend.finalize().timestamps, [i / 30 for i in range(80) if not 40 <= i < 60])
 
 
-def test_relocalises_at_another_place_after_a_gap_of_a_second(room):
-    order = [*range(60), *range(90, 120)]
-    truth = room.path(120)[order]
-    results = track_all(make_backend(room), [room.see(pose, i) for i, pose in zip(order, truth, strict=True)])
-    assert states(results[:60]) == ["ok"] * 60 and states(results[60:]).count("ok") >= 25
-    assert errors(results, truth).max() < 0.03
-
-
-def test_an_unknown_place_is_not_recognised(room):
-    truth, backend = room.path(30), make_backend(room)
-    track_all(backend, [room.see(pose, i) for i, pose in enumerate(truth)])
-    other = PointWorld(seed=9)
-    assert states(track_all(backend, [other.see(truth[i], 30 + i) for i in range(5)])) == ["lost"] * 5
-
-
 def rotation_alone(room):
     t = np.arange(60) / 30.0
     return se3.exp(np.stack([0 * t, 0 * t, 0 * t, 0.2 * np.sin(2 * t), 0.9 * np.sin(1.5 * t), 0 * t], axis=1))
 
 
 @pytest.mark.parametrize(
-    ("path", "settings", "noise", "limit"),
+    ("path", "noise", "limit"),
     [
-        (rotation_alone, {}, {}, 0.02),
-        (lambda room: room.path(40), {}, {"wrong": 500}, 0.03),  # 500 of 700 fit nothing
-        (lambda room: room.path(40), {"bundle_adjustment__solver": "schur"}, {}, 0.015),
-        pytest.param(lambda room: room.path(40), {"bundle_adjustment__solver": "gtsam"}, {}, 0.015, marks=NEEDS_GTSAM),
+        (rotation_alone, {}, 0.02),
+        (lambda room: room.path(40), {"wrong": 500}, 0.03),  # 500 of 700 fit nothing
     ],
 )
-def test_other_paths_noise_and_solvers(room, path, settings, noise, limit):
+def test_rotation_alone_and_wrong_matches(room, path, noise, limit):
     truth = path(room)
-    results = track_all(make_backend(room, **settings), [room.see(p, i, **noise) for i, p in enumerate(truth)])
+    results = track_all(make_backend(room), [room.see(p, i, **noise) for i, p in enumerate(truth)])
     assert errors(results, truth).max() < limit and (noise or states(results) == ["ok"] * len(truth))
-
-
-def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gtsam", None)  # as if it were not installed
-    with pytest.raises(TrackerError, match=r"pip install '\.\[gtsam\]'"):
-        adjust_bundle_gtsam(None, 1)
 
 
 def test_features_without_depth_become_points_by_triangulation(room):
@@ -167,8 +136,8 @@ def test_features_without_depth_become_points_by_triangulation(room):
     results = track_all(with_it, frames)
     track_all(without, frames)
     assert errors(results, truth).max() < 0.02
-    local = with_it.map_points()[1]
-    assert len(local) > len(without.map_points()[0])
+    local = with_it.view().positions
+    assert len(local) > len(without.view().ids)
     # every point lies on a wall of the room: z = 2.5, |x| = 3 or |y| = 2 in the world of the first camera
     wall = np.minimum.reduce([abs(local[:, 2] - 2.5), abs(abs(local[:, 0]) - 3), abs(abs(local[:, 1]) - 2)])
     assert np.median(wall) < 0.02 and np.quantile(wall, 0.9) < 0.08
@@ -202,36 +171,25 @@ def test_the_prediction_is_the_motion_models_at_the_time_of_the_frame(room):
     steps = np.cumsum([0, *([1, 2, 4] * 10)])
     path = room.path(int(steps[-1]) + 1)
     backend, ahead, stay = make_backend(room), [], []
-    assert backend.predict(0.0) is None
+    assert backend.predict(0.0) == (None, None)
     start = np.eye(4)
     for number, step in enumerate(steps):
         stamp, before = step / 30.0, steps[number - 1] / 30.0
         if number > 6:
             truth = start @ path[step]
             previous = before - steps[number - 2] / 30.0
-            ahead.append(np.linalg.norm((se3.inverse(truth) @ backend.predict(stamp))[:3, 3]))
-            stay.append(np.linalg.norm((se3.inverse(truth) @ backend.predict(before + previous))[:3, 3]))
-            shorter, longer = backend.motion_covariance(stamp), backend.motion_covariance(stamp + 1 / 30)
+            ahead.append(np.linalg.norm((se3.inverse(truth) @ backend.predict(stamp)[0])[:3, 3]))
+            stay.append(np.linalg.norm((se3.inverse(truth) @ backend.predict(before + previous)[0])[:3, 3]))
+            shorter, longer = backend.predict(stamp)[1], backend.predict(stamp + 1 / 30)[1]
             assert np.trace(shorter) < np.trace(longer)
         (result,) = track_all(backend, [room.see(path[step], number, stamp=stamp)])
         if number == 0:
             start = result.T_world_cam @ se3.inverse(path[0])
     assert np.mean(ahead) < 0.5 * np.mean(stay)
     beyond = steps[-1] / 30.0 + MAX_GAP_S + 1e-6
-    assert backend.motion_covariance(beyond) is None
-    np.testing.assert_allclose(backend.predict(beyond), result.T_world_cam, atol=1e-12)
-
-
-def test_views_and_points_fit_each_other(room):
-    backend = make_backend(room)
-    track_all(backend, [room.see(pose, i) for i, pose in enumerate(room.path(60))])
-    ids, positions = backend.map_points()
-    assert len(ids) == len(set(ids.tolist())) == len(positions) and ids.dtype == np.int64
-    views, outputs = backend.keyframe_views(3), backend.outputs()
-    assert len(views) == 3 and backend.keyframe_views(0) == ()
-    assert views[0].depth is not None and views[0].xy.shape == (len(views[0].keypoints), 2)
-    assert np.array_equal(views[0].T_world_cam, outputs.keyframes[-1].T_world_cam)
-    assert (outputs.observations >= 1).all() and np.array_equal(outputs.ids, ids)
+    pose, covariance = backend.predict(beyond)
+    assert covariance is None
+    np.testing.assert_allclose(pose, result.T_world_cam, atol=1e-12)
 
 
 def test_the_number_of_keyframes_is_bounded_and_those_around_the_camera_stay(room):
@@ -251,12 +209,6 @@ def test_a_repeated_stamp_is_no_error(room):
     frames = [room.see(pose, i, stamp=min(i, 5) / 30.0) for i, pose in enumerate(room.path(10))]
     backend = make_backend(room)
     assert states(track_all(backend, frames)) == ["ok"] * 10 and len(backend.finalize()) == 6
-
-
-def test_few_settings_are_tunable_and_each_is_described():
-    tunable = parameters(BackendSettings)
-    assert 8 < len(tunable) <= 14 and all(parameter.meaning for parameter in tunable)
-    assert {p.name for p in parameters(MonocularBackendSettings)} == {p.name for p in tunable} - {"keyframes.max_gap"}
 
 
 def resting(room):
@@ -283,10 +235,15 @@ def test_both_ends_of_a_range_give_other_results(room, name, ends, frames, other
     assert one != other
 
 
-def test_the_number_of_depth_images_is_bounded(room):
-    """Only the newest keyframes keep their depth image."""
+def test_filters_see_the_newest_keyframes_and_all_points(room, monkeypatch):
+    monkeypatch.setattr(keyframes, "VIEWS", 10)
     backend = make_backend(room, keyframes__tracked_share=1.0, keyframes__redundant_share=1.0)
     track_all(backend, [replace(room.see(p, i), depth=np.ones((480, 640), np.float32))
                         for i, p in enumerate(room.path(40))])  # fmt: skip
-    views = backend.keyframe_views(100)
-    assert len(views) > 8 and [view.depth is not None for view in views] == [True] * 8 + [False] * (len(views) - 8)
+    (views, ids, positions), outputs = backend.view(), backend.outputs()
+    assert len(set(ids.tolist())) == len(positions) > 0 and np.array_equal(outputs.ids, ids)
+    assert len(outputs.keyframes) > 10, "more than are shown"
+    assert [view.depth is not None for view in views] == [True] * 8 + [False] * 2
+    for record, view in zip(outputs.keyframes[::-1], views, strict=False):
+        assert np.array_equal(view.T_world_cam, record.T_world_cam)
+        assert view.xy.shape == (len(view.keypoints), 2) and len(view.keypoints) == record.features

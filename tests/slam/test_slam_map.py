@@ -9,7 +9,6 @@ from point_world import make_backend, observed, track_all, without_depth
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.local_mapping import triangulate
 from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.map_kernels import distinct
 
 
 def keyframe_of(room, world, pose, index, octave=0):
@@ -39,14 +38,6 @@ def test_points_and_keyframes_agree_on_their_observations(room):
     begin, end = world.obs_at[points], world.obs_at[points] + world.obs_capacity[points]
     order = np.argsort(begin)
     assert (end[order][:-1] <= begin[order][1:]).all() and (world.n_obs[points] <= world.obs_capacity[points]).all()
-
-
-@pytest.mark.parametrize("largest", [0, 1, 50, 400])
-def test_distinct_points_of_a_table(largest):
-    rng = np.random.default_rng(largest)
-    table = np.where(rng.random((7, 90)) < 0.5, rng.integers(0, max(largest, 1), (7, 90)), -1).astype(np.int32)
-    table[:, : 90 if largest == 0 else 0] = -1
-    np.testing.assert_array_equal(distinct(table, 500), np.unique(table[table >= 0]))
 
 
 def test_one_point_with_many_observations_costs_the_others_no_room(room):

@@ -17,7 +17,6 @@ from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.initialisation import (
     MIN_VIEWS,
     VIEWS,
-    LaterView,
     TwoViewInitialiser,
     View,
     accepted_motion,
@@ -42,7 +41,7 @@ def initialise(frames, camera, settings=None):
     """The initial map of frames, or None."""
     initialiser = TwoViewInitialiser()
     for frame in frames:
-        initial = initialiser.add(View(frame, observed(frame, camera)), camera, settings or TwoViewSettings())
+        initial = initialiser.add(frame, observed(frame, camera), camera, settings or TwoViewSettings())
         if initial is not None:
             break
     return initial
@@ -64,12 +63,12 @@ def flattened(room):
 def test_two_views_give_the_motion_up_to_scale(room, flat):
     world = flattened(room) if flat else room
     first, second = (observed(frame, world.camera) for frame in see(world, [np.eye(4), SIDEWAYS], wrong=60))
-    later = [LaterView(second, match_views(first, second, first.xy, 200.0))]
+    later = [View(None, second, match_views(first, second, first.xy, 200.0))]
     motion = accepted_motion(possible_motions(first, later, world.camera, TwoViewSettings()), TwoViewSettings())
     true = se3.inverse(SIDEWAYS)
     assert np.degrees(se3.rotation_angle(motion.T_second_first @ se3.inverse(true))) < 0.5
     assert angle_deg(motion.T_second_first[:3, 3], true[:3, 3]) < 4.0
-    assert len(motion.pair) > 120 and (motion.points[:, 2] > 0).all() and motion.parallax_deg > 1.0
+    assert len(motion.matches) > 120 and (motion.points[:, 2] > 0).all() and motion.parallax_deg > 1.0
 
 
 def before_a_wall(room, seed, noise_px):
@@ -105,7 +104,7 @@ def test_a_motion_is_carried_on_where_the_newest_view_alone_does_not_give_it(roo
     settings, initialiser = TwoViewSettings(radius_px=300.0), TwoViewInitialiser()
     upwards = np.array([[0.0], [1.0], [0.0]])
     for frame in frames:
-        initial = initialiser.add(View(frame, observed(frame, room.camera)), room.camera, settings)
+        initial = initialiser.add(frame, observed(frame, room.camera), room.camera, settings)
         assert frame is frames[-1] or initial is None
         if frame is frames[-2]:
             monkeypatch.setattr(cv2, "decomposeEssentialMat", lambda model: (np.eye(3), np.eye(3), upwards))
@@ -116,7 +115,7 @@ def test_a_motion_is_carried_on_where_the_newest_view_alone_does_not_give_it(roo
 def test_a_camera_that_waits_for_parallax_keeps_few_views(room):
     initialiser, kept = TwoViewInitialiser(), []
     for frame in see(room, [np.eye(4)] * 40):
-        assert initialiser.add(View(frame, observed(frame, room.camera)), room.camera, TwoViewSettings()) is None
+        assert initialiser.add(frame, observed(frame, room.camera), room.camera, TwoViewSettings()) is None
         kept.append(len(initialiser.later))
     assert VIEWS < max(kept) <= 2 * VIEWS
 

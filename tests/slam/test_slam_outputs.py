@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
-from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.slam.map_files import write_keyframes_csv, write_ply
-from dynslam_bench.slam.sheet import draw_sheet, write_sheet
+from dynslam_bench.slam.run_figure import write_run_figure
 
 
 def outputs(points=50, keyframes=4):
@@ -55,28 +54,16 @@ def test_binary_ply_byte_by_byte(tmp_path, points):
         assert (r, g, b) == tuple(map_outputs.colours[i]) and n == map_outputs.observations[i]
 
 
-def test_an_unwritable_folder_is_an_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DynslamError):
-        write_ply(tmp_path / "file" / "map.ply", outputs())
-
-
-def test_sheet_has_five_filled_panels(tmp_path):
+def test_the_figure_of_a_run_has_five_filled_panels(tmp_path):
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
     poses = se3.exp(np.cumsum(rng.normal(0, 0.05, (30, 6)), axis=0))
-    track = Trajectory(np.arange(30) / 30.0, poses)
-    sheet = draw_sheet("tum/fr1/xyz", image, [image] * 12, [image] * 5, outputs(400), track, track)
-    write_sheet(tmp_path / "sheet.png", sheet)
-    back = cv2.imread(str(tmp_path / "sheet.png"))[..., ::-1]
-    assert np.array_equal(back, sheet)
+    track, file = Trajectory(np.arange(30) / 30.0, poses), tmp_path / "figure.png"
+    write_run_figure(file, "tum/fr1/xyz", image, [image] * 9, [image] * 5, outputs(400), track, track)
+    figure = cv2.imread(str(file))
     for x, y in ((12, 72), (504, 72), (996, 72), (258, 472), (750, 472)):  # corners of the panels
-        panel = sheet[y : y + 360, x : x + 480]
+        panel = figure[y : y + 360, x : x + 480]
         assert np.count_nonzero((panel != 255).any(axis=2)) > 500
-
-
-def test_sheet_of_an_empty_map():
     empty = MapOutputs((), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
-    image = np.zeros((480, 640, 3), np.uint8)
-    sheet = draw_sheet("x", image, [], [], empty, Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
-    assert sheet.dtype == np.uint8 and sheet.ndim == 3
+    write_run_figure(file, "x", image, [], [], empty, Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
+    assert cv2.imread(str(file)).shape == figure.shape

@@ -5,9 +5,8 @@ import pytest
 from point_world import PointWorld, observed
 
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.descriptor_index import CHANGED, STRIDE, DescriptorIndex
 from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.place_recognition import recognition_scores, top_candidates
+from dynslam_bench.slam.place_recognition import CHANGED, STRIDE, recognition_scores, top_candidates
 
 ANGLES = np.deg2rad(np.arange(0, 360, 30))
 
@@ -95,11 +94,10 @@ def test_the_index_follows_keyframes_that_come_and_go(room, seed):
     assert compared > 8
 
 
-def test_a_keyframe_is_indexed_again_when_many_of_its_points_changed():
-    words, ids, alive = np.arange(100, dtype=np.uint64).reshape(1, 100, 1), np.zeros(1, np.int64), np.ones(1, bool)
-    index, kf_point = DescriptorIndex(), np.full((1, 100), 3, np.int32)
-    most = round(100 * CHANGED)
-    for removed, counted in ((0, 100), (most, 100), (most + 1, 99 - most), (60, 40)):
-        kf_point[0, :removed] = -1
-        index.update(alive, ids, kf_point, words)
-        assert index.score(ids, words[0])[1] == counted
+def test_a_keyframe_is_indexed_again_when_many_of_its_points_changed(room, world):
+    (slot,) = world.keyframes[:1]
+    count = int(np.count_nonzero(world.kf_point[slot] >= 0))
+    for removed, indexed in ((0, count), (int(count * CHANGED), count), (int(count * CHANGED) + 1, None)):
+        world.kf_point[slot, :removed] = -1
+        recognition_scores(world, world.keyframes, observations(room, 0.0, 100))
+        assert world.substrings[slot][1].shape[1] == (count - removed if indexed is None else indexed)

@@ -83,7 +83,7 @@ def test_a_lost_camera_predicts_nothing_and_its_rotation_is_followed_in_every_fr
     )
     backend, recognised, _ = run(RingWorld(), [*range(15), *range(60, 70)])
     assert (recognised[15:] == "lost").all() and len(calls) == 9, "the first of the ten is compared by tracking"
-    assert backend.predict(2.6) is None and backend.motion_covariance(2.6) is None
+    assert backend.predict(2.6) == (None, None)
 
 
 # ---------------------------------------------------------------------- the gate

@@ -82,15 +82,6 @@ def test_a_constant_motion_is_undone_to_a_tenth_of_a_pixel(room, has_depth):
         assert not observations.z.any() and np.isnan(observations.right).all()
 
 
-def test_the_velocity_is_that_of_the_points():
-    before, now = (se3.inverse(steady(t)) for t in (0.2, 0.2 + 1e-4))
-    velocity = CameraVelocity.between(before, now, 1e-4)
-    point = np.array([0.3, -0.2, 2.0])
-    change = (se3.transform(now, point) - se3.transform(before, point)) / 1e-4
-    local = se3.transform(now, point)
-    np.testing.assert_allclose(change, np.cross(velocity.angular, local) + velocity.linear, atol=1e-2)
-
-
 def test_a_feature_that_a_motion_would_put_behind_the_camera_stays(room):
     frame, camera = room.see(np.eye(4), 0), replace(room.camera, readout_s=READOUT_S)
     observations = observed(frame, camera)
@@ -145,14 +136,6 @@ def test_odd_stamps_and_gaps(shaken_frames, sequence, readout_s, lost):
     assert {i for i, r in enumerate(results) if r.state != "ok"} == lost
     assert backend.world.kf_frame[0] == frames[0].index and len(backend.finalize()) == len(frames) - len(lost)
     assert readout_s or backend.shutter.velocity is None
-
-
-def test_switched_off_it_is_a_global_shutter_to_the_last_bit(shaken_frames):
-    room, frames = shaken_frames
-    _, one = rolling_backend(room, frames[:8], 0.0)
-    _, other = rolling_backend(room, frames[:8], READOUT_S, tracking__rolling_shutter=False)
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a.T_world_cam, b.T_world_cam)
 
 
 @pytest.mark.parametrize(

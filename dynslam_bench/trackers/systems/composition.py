@@ -156,8 +156,7 @@ def compose(
     from dynslam_bench.flow.registry import build_flow
     from dynslam_bench.segmentation.cached import cache_segmenter
     from dynslam_bench.slam.backend import build_backend
-    from dynslam_bench.slam.pipeline import SlamPipeline
-    from dynslam_bench.slam.stages import CachedStage
+    from dynslam_bench.slam.pipeline import CachedStage, SlamPipeline
 
     cache = None if context.cache is None else StageCache(Path(context.cache))
     cached: dict[str, CachedStage] = {}
