@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.layout import map_geometry
-from dynslam_bench.flow.orientation_maps import OrientationMaps
+from dynslam_bench.flow.orientation_maps import Side
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.flow.simd import Bytes, Floats, Ints, Longs, descriptor_sum
 
@@ -65,13 +65,6 @@ class CostTables(NamedTuple):
     ceiling: int
 
 
-class Side(NamedTuple):
-    """One image as the kernels see it: flat histogram bytes and grey levels."""
-
-    histograms: NDArray[np.uint8]
-    gray: NDArray[np.uint8]
-
-
 class Reference(NamedTuple):
     """The points as the kernels see them.
 
@@ -84,19 +77,6 @@ class Reference(NamedTuple):
     points: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
     appearance: NDArray[np.int32]
-
-
-class MatchingCosts(NamedTuple):
-    """Arguments of the cost: points, target image, tables."""
-
-    reference: Reference
-    target: Side
-    tables: CostTables
-
-
-def side(maps: OrientationMaps) -> Side:
-    """The kernels' view of a prepared image."""
-    return Side(maps.histograms.reshape(-1), maps.gray)
 
 
 def tables_for(shape: tuple[int, ...], settings: FlowSettings) -> CostTables:
@@ -327,9 +307,9 @@ def parabola(
         stop: One past the last.
         labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
         step: Pixels.
-        reference: `matching_cost.Reference`.
-        target: `matching_cost.Side`.
-        tables: `matching_cost.CostTables`.
+        reference: `Reference`.
+        target: `orientation_maps.Side`.
+        tables: `CostTables`.
         used: int64 ``[N]``, cost evaluations, counted on.
     """
     far = np.int64(1 << 40)

@@ -14,6 +14,7 @@ they share twice.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import inlined, kernel
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.layout import MapGeometry, level_shape, map_geometry
-from dynslam_bench.flow.refinement import BORDER, pad_image
+from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.simd import (
     Bytes,
     Halves,
@@ -45,6 +46,13 @@ SPILL = 64
 """Numbers that vector code may access beyond a line's end."""
 
 
+class Side(NamedTuple):
+    """One image as the kernels see it: flat histogram bytes and grey levels."""
+
+    histograms: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
+
+
 @dataclass(frozen=True, eq=False)
 class OrientationMaps:
     """One prepared image.
@@ -53,15 +61,16 @@ class OrientationMaps:
         gray: uint8 ``[H, W]``, the image.
         framed: uint8 ``[H + 96, W + 96]``, the image with its edges repeated (`refinement.BORDER`).
         framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, likewise.
-        histograms: uint8 ``[total, 8]``, all levels; a unit-norm histogram has Euclidean length 255.
-        geometry: How to index them.
+        histograms: uint8 ``[total, 8]``, all levels as `layout.map_geometry` arranges them; a unit-norm histogram has
+            Euclidean length 255.
+        side: Histograms and image for the kernels.
     """
 
     gray: NDArray[np.uint8]
     framed: NDArray[np.uint8]
     framed_half: NDArray[np.uint8]
     histograms: NDArray[np.uint8]
-    geometry: MapGeometry
+    side: Side
 
 
 def orientation_maps(
@@ -74,7 +83,7 @@ def orientation_maps(
         workers: Threads over which rows are divided; None for the calling thread alone.
         buffers: Reuses the memory of maps that are no longer referenced; None allocates.
     """
-    workers, buffers = workers or Workers(), buffers or BufferPool()
+    run, buffers = (workers or Workers()).run, buffers or BufferPool()
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
@@ -89,11 +98,19 @@ def orientation_maps(
     blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)
     fine = layout.LEVEL_STEPS.count(2)
     cells = histograms.reshape(-1)
-    workers.run(fine_levels, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
-    workers.run(coarse_levels, quarter_rows, coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells)
-    pad_image(half[BORDER : BORDER + rows, BORDER : BORDER + columns], BORDER, half)
-    pad_image(gray, BORDER, whole)
-    return OrientationMaps(gray, whole, half, histograms, geometry)
+    run(fine_levels, 0, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
+    run(coarse_levels, 0, quarter_rows, coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells)
+    whole[BORDER:-BORDER, BORDER:-BORDER] = gray
+    for framed in (half, whole):
+        repeat_edges(framed)
+    return OrientationMaps(gray, whole, half, histograms, Side(cells, gray))
+
+
+def repeat_edges(framed: NDArray[np.uint8]) -> None:
+    """Fill the border of an image, `BORDER` wide, with its outermost pixels."""
+    rows = framed[BORDER:-BORDER]
+    rows[:, :BORDER], rows[:, -BORDER:] = rows[:, BORDER : BORDER + 1], rows[:, -BORDER - 1 : -BORDER]
+    framed[:BORDER], framed[-BORDER:] = rows[0], rows[-1]
 
 
 @inlined

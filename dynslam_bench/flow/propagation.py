@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.flow.search_kernels import advance, scrambled
+from dynslam_bench.flow.label_search import advance, scrambled
 from dynslam_bench.flow.simd import Flags, Floats, Longs
 
+NO_MOTION = np.empty((0, 4), dtype=np.float32)
 VOTERS = 256
 """Approximate number of points that vote on a hypothesis."""
 
@@ -78,6 +79,15 @@ def label_turns(labels: Floats) -> Floats:
         turns[i, 0] = np.float32(np.cos(labels[i, 3])) * scale
         turns[i, 1] = np.float32(np.sin(labels[i, 3])) * scale
     return turns
+
+
+def labels_as_seen(points: Floats, labels: Floats, neighbours: Longs, motions: Floats = NO_MOTION) -> Floats:
+    """`transported_labels` without bounds that matter, float32 ``[N, K + M, 4]``."""
+    count = len(points)
+    extent = np.full((count, 4), 8.0, dtype=np.float32)
+    out = np.empty((count, neighbours.shape[1] + len(motions), 4), dtype=np.float32)
+    transported_labels(0, count, points, labels, label_turns(labels), neighbours, motions, -extent, extent, out)
+    return out
 
 
 def common_motions(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,8 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Shape = tuple[int, ...]
 Arrays = tuple[NDArray[np.uint8], ...]
+
+
+def _call(kernel: Callable[..., Any], *arguments: Any) -> None:
+    kernel(*arguments)
 
 
 class Workers:
@@ -19,23 +23,26 @@ class Workers:
 
     Args:
         threads: Their number, the calling thread included.
+
+    Attributes:
+        run: ``run(kernel, start, stop, *arguments)`` calls ``kernel(start, stop, *arguments)`` on equal parts of the
+            range and waits for all; with one thread it calls the kernel itself.
     """
 
     def __init__(self, threads: int = 1) -> None:
         self.threads = max(1, threads)
-        self._pool = ThreadPoolExecutor(self.threads - 1, "flow") if self.threads > 1 else None
+        self.run: Callable[..., Any] = getattr(operator, "call", _call)  # without an `operator.call` in Python 3.10
+        if self.threads > 1:
+            self.run = self._divide
+            self._pool = ThreadPoolExecutor(self.threads - 1, "flow")
 
-    def run(self, kernel: Callable[..., Any], count: int, *arguments: Any) -> None:
-        """Call ``kernel(start, stop, *arguments)`` on equal parts of ``range(count)`` and wait for all.
+    def _divide(self, kernel: Callable[..., Any], start: int, stop: int, *arguments: Any) -> None:
+        """Run the last part in the calling thread, the others in the pool.
 
-        The last part runs in the calling thread. The kernels release the GIL and write disjoint rows, so that the
-        result is the same for every number of threads.
+        The kernels release the GIL and write disjoint rows, so that the result is the same for every number of threads.
         """
-        if self._pool is None:
-            kernel(0, count, *arguments)
-            return
-        parts = max(1, min(self.threads, count))
-        bounds = [count * part // parts for part in range(parts + 1)]
+        parts = max(1, min(self.threads, stop - start))
+        bounds = [start + (stop - start) * part // parts for part in range(parts + 1)]
         futures = [self._pool.submit(kernel, bounds[i], bounds[i + 1], *arguments) for i in range(parts - 1)]
         kernel(bounds[-2], bounds[-1], *arguments)
         for future in futures:
@@ -65,7 +72,7 @@ class BufferPool:
         self._most = most
         self._sets: list[Arrays] = []
 
-    def take(self, *shapes: Shape) -> Arrays:
+    def take(self, *shapes: tuple[int, ...]) -> Arrays:
         """Arrays of these shapes: a used set where one is free, else new ones, zeroed."""
         for number, arrays in enumerate(self._sets):
             if tuple(array.shape for array in arrays) == shapes and _references(arrays) <= _UNREFERENCED:

@@ -11,12 +11,11 @@ from pictures import grid, moved, moved_points, picture
 
 from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
 from dynslam_bench.core.errors import PluginError
-from dynslam_bench.flow.label_search import STRATEGIES, make_plan
+from dynslam_bench.flow.label_search import STRATEGIES, make_plan, new_state
 from dynslam_bench.flow.matching_cost import tables_for
 from dynslam_bench.flow.opencv import LucasKanadeFlow
 from dynslam_bench.flow.propagation import better_half, common_motions
 from dynslam_bench.flow.registry import FLOWS, build_flow
-from dynslam_bench.flow.search_kernels import new_state
 from dynslam_bench.flow.settings import FlowMethodSettings, FlowSettings
 from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
 
@@ -159,10 +158,11 @@ def test_searches_are_anytime_and_monotone(search):
     plan = make_plan(settings)
     extent = np.tile(np.array([40, 40, 1, 0.7], np.float32), (len(points), 1))
     state = new_state(len(points), plan.population, -extent, extent.copy(), pair.tables.ceiling)
-    run = flow._runner(plan, flow.describe(pair.reference, points, pair.tables), pair, state, 0)
+    costs = flow.describe(pair.reference, points, pair.tables), pair.target.side, pair.tables
+    zero = np.zeros((len(points), 1, 4), np.float32)
     for number, end in enumerate(plan.ends):
         last = state.costs[:, 0].copy()
-        run(number, np.zeros((len(points), 1, 4), np.float32))
+        plan.kernel(0, len(points), *costs, state, zero, end, number, np.uint64(0), *plan.options)
         assert (state.used == (end if search in DRAWING else number + 1)).all()
         assert (state.costs[:, 0] <= last).all() and (np.diff(state.costs, axis=1) >= 0).all()
     assert plan.ends[-1] == settings.budget
