@@ -250,9 +250,7 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         """Where the moth of that index lands in a trial of the budget; `flames` best first."""
         left = flames_left(self._population, trial, self._n_trials)
         around, now = flames[min(index, left - 1)], flight(trial / self._n_trials, EMFOA)
-        return np.asarray(
-            moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
-        )
+        return np.asarray(moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random))
 
     def _land(self, value: float, distribution: BaseDistribution, flame: Any) -> Any:
         if isinstance(distribution, CategoricalDistribution):

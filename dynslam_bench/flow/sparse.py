@@ -244,9 +244,7 @@ class SparseDaisyFlow:
         window: Window,
     ) -> NDArray[np.float32]:
         correlation = np.empty(len(points), dtype=np.float32)
-        self.workers.run(
-            similarity_lucas_kanade, 0, len(points), points, labels, template, target, window, correlation
-        )
+        self.workers.run(similarity_lucas_kanade, 0, len(points), points, labels, template, target, window, correlation)
         return correlation
 
     def _forward_backward_error(
