@@ -19,7 +19,7 @@ MIN_POINTS = 3
 
 
 class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
-    """B6, YOLO-SLAM: drops, in each dynamic box, the largest set of features of similar depth; keeps the rest of the box.
+    """B6, YOLO-SLAM: in each dynamic box the largest set of features of similar depth is dropped, the rest is kept.
 
     Stats: ``dropped``, ``objects``, ``in_boxes``.
     """
@@ -125,7 +125,7 @@ def _window(box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple
 
 
 class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
-    """B9, Blitz-SLAM: drops the features on the masks of people, completed by depth, and on movable objects that they touch.
+    """B9, Blitz-SLAM: drops the features on people, whose masks depth completes, and on movable objects that they touch.
 
     The depth image is divided into blocks along its edges. A block of which enough lies on the mask is added to the
     mask as a whole. A person in front of a wall is a block; a person on a floor forms one block with the floor.

@@ -34,7 +34,7 @@ class ReseedingFilter(Rule[ReseedingSettings]):
     name = "reseeding"
     needs: frozenset[Need] = frozenset()
     provenance: Provenance = "inspired"
-    stats_names = ("dropped", "static", "reseeded", "missing")
+    stats_names = ("static", "reseeded", "missing", "dropped")
 
     def __init__(self, settings: ReseedingSettings, features: FeatureSettings) -> None:
         super().__init__(settings)

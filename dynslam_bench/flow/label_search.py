@@ -7,7 +7,6 @@ and `move_moths` is `moth_flame.moth_positions` for one point, with spirals and 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,13 +59,11 @@ class Plan(NamedTuple):
     Attributes:
         population: Labels kept a point.
         ends: Evaluations a point at which each phase ends; between phases labels are exchanged.
-        kernel: Runs a phase; see `moth_flame_phase` and `shrinking_window_phase`.
-        options: Its last arguments.
+        options: Last arguments of `run_phase`.
     """
 
     population: int
     ends: tuple[int, ...]
-    kernel: Callable[..., Any]
     options: tuple[Any, ...]
 
 
@@ -77,16 +74,14 @@ def make_plan(settings: DaisySettings) -> Plan:
     sweeps = min(settings.sweeps, max(1, budget // 16)) if propagates else 0
     # initialising the population takes a double share
     ends = tuple(budget * (k + 2) // (sweeps + 2) for k in range(sweeps + 1))
-    if rules is None:
-        return Plan(1, ends, shrinking_window_phase, (np.float32(shrink),))
-    population = max(2, min(settings.population, budget // 8))
-    founding = population * (2 if rules.opposition else 1)
+    population = max(2, min(settings.population, budget // 8)) if rules else 1
+    founding = population * (2 if rules and rules.opposition else 1)
     iterations = max(1, -(-(budget - founding) // population))
-    table = moth_flame.flight_table(population, iterations, rules)
+    table = moth_flame.flight_table(population, iterations, rules or moth_flame.MFO)
     step = settings.cauchy_step_px  # of Eq. 13, per dimension of a label: px, px, octaves, radians
     steps = np.array([step, step, 0.1, np.deg2rad(5.0)], dtype=np.float32)
-    options = (table, moth_flame.spiral_table(), moth_flame.cauchy_table(), steps)
-    return Plan(population, ends, moth_flame_phase, options)
+    tables = (table, moth_flame.spiral_table(), moth_flame.cauchy_table(), steps)
+    return Plan(population, ends, (*tables, rules is not None, np.float32(shrink)))
 
 
 class SearchState(NamedTuple):
@@ -176,20 +171,20 @@ def insert(flames: Floats, costs: Longs, label: Floats, cost: Scalar) -> None:
 @inlined
 def widen(lower: Floats, upper: Floats, flames: Floats) -> None:
     """Extend a point's bounds to 8 px around its best displacement, which may come from a neighbour."""
-    room = np.float32(8)
     for j in range(2):
-        lower[j], upper[j] = min(lower[j], flames[0, j] - room), max(upper[j], flames[0, j] + room)
+        lower[j] = min(lower[j], flames[0, j] - np.float32(8))
+        upper[j] = max(upper[j], flames[0, j] + np.float32(8))
 
 
-CANDIDATES, INITIAL, OPPOSITES, FLIGHT = 0, 1, 2, 3
-"""Stages of a phase; all but the first and the last belong to phase 0."""
+CANDIDATES, INITIAL, OPPOSITES, SEARCH = 0, 1, 2, 3
+"""Stages of a phase; the second and the third belong to phase 0 of a moth-flame search."""
 
 
 @kernel
-def moth_flame_phase(
+def run_phase(
     start: int, stop: int, reference: Reference, target: Side, tables: CostTables, state: SearchState,
     candidates: Floats, end: int, phase: int, seed: Scalar, table: FlightTable, spiral: Floats, cauchy: Floats,
-    steps: Floats,
+    steps: Floats, moth_flame: bool, shrink: Scalar,
 ) -> None:  # fmt: skip
     """Spend evaluations on points start..stop until each has used `end`.
 
@@ -199,7 +194,7 @@ def moth_flame_phase(
         reference: `matching_cost.Reference`.
         target: `orientation_maps.Side`.
         tables: `matching_cost.CostTables`.
-        state: `SearchState`, changed in place.
+        state: `SearchState`, changed in place; a search that is no moth-flame search has a population of one.
         candidates: float32 ``[N, C, 4]``, labels to try first (neighbours', the guess, ...); not finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase; 0 initialises the population.
@@ -208,6 +203,8 @@ def moth_flame_phase(
         spiral: `moth_flame.spiral_table`.
         cauchy: `moth_flame.cauchy_table`.
         steps: float32 ``[4]``, scale of the Cauchy steps.
+        moth_flame: Whether moths fly; else labels are drawn from a window that shrinks.
+        shrink: Factor of that window an evaluation, see `Strategy.shrink`; with 0 the rest of the budget is left.
     """
     population, iterations = state.costs.shape[1], len(table.counts)
     initial = population * (2 if table.opposition else 1)
@@ -218,13 +215,12 @@ def moth_flame_phase(
         lower, upper, moths = state.lower[i], state.upper[i], state.moths[i]
         flames, costs = state.flames[i], state.costs[i]
         random = first_state(seed, i, phase)
-        used, placed = state.used[i], 0
-        stage = CANDIDATES
+        used, placed, stage, window = state.used[i], 0, CANDIDATES, np.float32(0.5)
         while True:  # costs are computed in one place; the stages differ in the labels that are tried
-            count = 0
+            count = population
             if stage == CANDIDATES:
                 count = finite_labels(candidates[i], trials)
-                if phase == 0:
+                if phase == 0 and moth_flame:
                     placed = min(count, population, end - used)
                     moths[:placed] = trials[:placed]
             elif stage == INITIAL:
@@ -232,16 +228,22 @@ def moth_flame_phase(
                 count = population - placed
             elif stage == OPPOSITES:
                 random = oppose(moths, lower, upper, low, high, trials, random)
-                count = population
-            else:
-                if used >= end:
-                    break
+            elif used >= end:
+                break
+            elif moth_flame:
                 iteration = min(max((used - initial) // population, 0), iterations - 1)
                 random = move_moths(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, random)
-                count = population
                 for m in range(population):
                     for j in range(4):
                         trials[m, j] = moths[m, j]
+            elif shrink == 0:
+                break
+            else:
+                random = advance(random)
+                draw(trials[0], scrambled(random), lower, upper, flames, window, shrink)
+                window *= shrink
+                if window * (upper[0] - lower[0]) < np.float32(1):
+                    window = np.float32(0.5)
             for k in range(min(count, end - used)):
                 for j in range(4):
                     label[j] = trials[k, j]
@@ -252,15 +254,15 @@ def moth_flame_phase(
                 used += 1
             if stage == CANDIDATES:
                 widen(lower, upper, flames)
-                stage = INITIAL if phase == 0 else FLIGHT
+                stage = INITIAL if phase == 0 and moth_flame else SEARCH
             elif stage == INITIAL:
-                stage = OPPOSITES if table.opposition else FLIGHT
+                stage = OPPOSITES if table.opposition else SEARCH
             elif stage == OPPOSITES:
                 for m in range(population):  # the best N of X and its opposites
                     if costs[m] < tables.ceiling:
                         for j in range(4):
                             moths[m, j] = flames[m, j]
-                stage = FLIGHT
+                stage = SEARCH
         state.used[i] = used
 
 
@@ -343,65 +345,9 @@ def move_moths(
     return random
 
 
-@kernel
-def shrinking_window_phase(
-    start: int, stop: int, reference: Reference, target: Side, tables: CostTables, state: SearchState,
-    candidates: Floats, end: int, phase: int, seed: Scalar, shrink: float,
-) -> None:  # fmt: skip
-    """Spend evaluations on points start..stop until each has used `end`.
-
-    Args:
-        start: First point.
-        stop: One past the last.
-        reference: `matching_cost.Reference`.
-        target: `orientation_maps.Side`.
-        tables: `matching_cost.CostTables`.
-        state: `SearchState`, changed in place; only the best label is used.
-        candidates: float32 ``[N, C, 4]``, labels to try first; not finite means none.
-        end: Evaluations a point, counted from the very start, at which the phase ends.
-        phase: Number of the phase.
-        seed: Of the frame.
-        shrink: Factor of the window per evaluation (PatchMatch: 0.5); 1 is a uniform random search of the whole box,
-            0 draws nothing: the candidates are all that is tried, and the rest of the budget is left.
-    """
-    label = np.empty(4, dtype=np.float32)
-    for i in range(start, stop):
-        random = first_state(seed, i, phase)
-        lower, upper, flames, costs = state.lower[i], state.upper[i], state.flames[i], state.costs[i]
-        used, given, widened = state.used[i], 0, False
-        window = np.float32(0.5)
-        while used < end:
-            if given < candidates.shape[1]:
-                total = np.float32(0)
-                for j in range(4):
-                    label[j] = candidates[i, given, j]
-                    total += label[j]
-                given += 1
-                if not np.isfinite(total):
-                    continue
-            elif shrink == 0:
-                break
-            else:
-                if not widened:
-                    widen(lower, upper, flames)
-                    widened = True
-                random = advance(random)
-                bits = scrambled(random)
-                draw(label, bits, lower, upper, flames, window, shrink)
-                window *= np.float32(shrink)
-                if window * (upper[0] - lower[0]) < np.float32(1):
-                    window = np.float32(0.5)
-            cost = label_cost(i, label[0], label[1], label[2], label[3], reference, target, tables, costs[0])
-            insert(flames, costs, label, cost)
-            used += 1
-        if not widened:
-            widen(lower, upper, flames)
-        state.used[i] = used
-
-
 @inlined
 def draw(
-    label: Floats, bits: Scalar, lower: Floats, upper: Floats, flames: Floats, window: Scalar, shrink: float
+    label: Floats, bits: Scalar, lower: Floats, upper: Floats, flames: Floats, window: Scalar, shrink: Scalar
 ) -> None:
     """Fill a label: anywhere in the box (`shrink` 1), or in a window of it around the best label."""
     for j in range(4):

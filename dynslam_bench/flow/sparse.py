@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result, usable_points
-from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, new_state
+from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, new_state, run_phase
 from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
@@ -180,7 +180,7 @@ class SparseDaisyFlow:
                 sources = (points, best, label_turns(best), neighbours, motions)
                 run(transported_labels, 0, n, *sources, lower, upper, candidates)
             costs = (described, pair.target.side, pair.tables)
-            run(plan.kernel, 0, n, *costs, state, candidates, end, phase, np.uint64(seed), *plan.options)
+            run(run_phase, 0, n, *costs, state, candidates, end, phase, np.uint64(seed), *plan.options)
         return state
 
     def refine_together(
@@ -195,8 +195,7 @@ class SparseDaisyFlow:
         if not STRATEGIES[self.settings.search].propagates or len(points) < 3:
             return correlation
         predictions = labels_as_seen(points, labels, neighbours)
-        alternative, dissents = np.empty_like(labels), np.empty(len(points), dtype=np.bool_)
-        dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX), alternative, dissents)
+        alternative, dissents = dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX))
         self._take_better(points, labels, correlation, alternative, dissents, pair)
         if self.settings.similarity_seeds:
             motions = np.empty((2, 4), dtype=np.float32)

@@ -107,7 +107,7 @@ def rotated_descriptors(histograms: Array, points: Array, shape: tuple[int, int]
 def label_costs(
     points: Array, labels: Array, descriptors: Array, histograms: Array, shape: tuple[int, int], tables: CostTables
 ) -> Array:
-    """First term of Eq. 1 of labels ``[N, 4]``, one a point, int64 ``[N]``; OUTSIDE where the label leaves the image."""
+    """First term of Eq. 1 of one label a point, ``[N, 4]``; `OUTSIDE` where it leaves the image. Int64 ``[N]``."""
     centre = points + labels[:, :2]
     inside = (centre == within(centre, shape)).all(axis=1)
     labels = np.where(inside[:, None], labels, 0)

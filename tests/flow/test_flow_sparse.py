@@ -11,7 +11,7 @@ from pictures import grid, moved, moved_points, picture
 
 from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
 from dynslam_bench.core.errors import PluginError
-from dynslam_bench.flow.label_search import STRATEGIES, make_plan, new_state
+from dynslam_bench.flow.label_search import STRATEGIES, make_plan, new_state, run_phase
 from dynslam_bench.flow.matching_cost import tables_for
 from dynslam_bench.flow.opencv import LucasKanadeFlow
 from dynslam_bench.flow.propagation import better_half, common_motions
@@ -162,7 +162,7 @@ def test_searches_are_anytime_and_monotone(search):
     zero = np.zeros((len(points), 1, 4), np.float32)
     for number, end in enumerate(plan.ends):
         last = state.costs[:, 0].copy()
-        plan.kernel(0, len(points), *costs, state, zero, end, number, np.uint64(0), *plan.options)
+        run_phase(0, len(points), *costs, state, zero, end, number, np.uint64(0), *plan.options)
         assert (state.used == (end if search in DRAWING else number + 1)).all()
         assert (state.costs[:, 0] <= last).all() and (np.diff(state.costs, axis=1) >= 0).all()
     assert plan.ends[-1] == settings.budget
