@@ -20,12 +20,12 @@ from scipy.spatial import cKDTree
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, is_degenerate, usable_points
 from dynslam_bench.flow.dense_kernels import Superpixels, aggregate_and_choose, spread_labels, superpixels
-from dynslam_bench.flow.matching_cost import MAX_COST, tables_for
+from dynslam_bench.flow.matching_cost import MAX_COST, cost_tables
 from dynslam_bench.flow.orientation_maps import OrientationMaps
 from dynslam_bench.flow.propagation import labels_as_seen
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
-from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 
 NEIGHBOURS = 9
 """Reliable regions that a regional motion is fitted to."""
@@ -157,12 +157,11 @@ class _RegionLabels:
         seed: int,
     ) -> None:
         self.settings, self._sparse = settings, sparse
-        shape = reference.gray.shape
-        self._pair = Pair(reference, target, tables_for(shape, sparse.settings))
+        self._pair = sparse.pair(reference, target)
         self.half = np.ascontiguousarray(reference.framed_half[BORDER:-BORDER, BORDER:-BORDER])
         self.regions = superpixels(self.half, max(2, settings.superpixel_px // 2))
         self.centres = self.regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
-        self._tables = tables_for(shape, sparse.settings.model_copy(update={"support": 1}))
+        self._tables = cost_tables(reference.gray.shape, settings.terms)
         self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
         pair, centres = self._pair, self.centres

@@ -19,10 +19,10 @@ from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
     Reference,
+    cost_tables,
     describe,
     parabola,
     reference_appearance,
-    tables_for,
 )
 from dynslam_bench.flow.orientation_maps import OrientationMaps, orientation_maps
 from dynslam_bench.flow.propagation import (
@@ -99,7 +99,7 @@ class SparseDaisyFlow:
         if not usable.any():
             return invalid_result(xy, degenerate=False)
         settings, points = self.settings, xy[usable]
-        pair = Pair(reference, target, tables_for(reference.gray.shape, settings))
+        pair = self.pair(reference, target)
         if guess is not None:
             guess = np.asarray(guess, dtype=np.float32).reshape(-1, 2)[usable]
         described, neighbours = self.describe(reference, points, pair.tables), self.nearest(points)
@@ -120,6 +120,13 @@ class SparseDaisyFlow:
         valid, share = np.zeros(len(xy), np.bool_), np.ones(len(xy), np.float32)
         xy[usable], valid[usable], share[usable] = ends, good, cost / pair.tables.ceiling
         return FlowResult(xy, valid, share, flow_stats(len(xy), int(good.sum()), int(evaluations.sum())))
+
+    def pair(self, reference: OrientationMaps, target: OrientationMaps) -> Pair:
+        """Two images with the tables of the settings' terms and support of Eq. 1."""
+        settings, shape = self.settings, reference.gray.shape
+        return Pair(
+            reference, target, cost_tables(shape, settings.terms, settings.support, settings.support_spacing_px)
+        )
 
     def describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
         """What the search needs of the reference points: their rotated descriptors and appearance."""

@@ -9,9 +9,8 @@ import pytest
 
 from dynslam_bench.flow import moth_flame as rules
 from dynslam_bench.flow.label_search import advance, move_moths, scrambled
-from dynslam_bench.flow.matching_cost import tables_for
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 
 FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}
 POPULATION, ITERATIONS = 6, 10
@@ -102,10 +101,8 @@ def searched(search):
     guess = points + np.float32(3)
     guess[::2] = np.nan
     flow = SparseDaisyFlow(FlowSettings(search=search))
-    tables = tables_for(image.shape, flow.settings)
-    first, second = flow.prepare(image), flow.prepare(target)
-    described = flow.describe(first, points, tables)
-    return flow.search(described, Pair(first, second, tables), flow.nearest(points), guess, 9)
+    pair = flow.pair(flow.prepare(image), flow.prepare(target))
+    return flow.search(flow.describe(pair.reference, points, pair.tables), pair, flow.nearest(points), guess, 9)
 
 
 STORED = {

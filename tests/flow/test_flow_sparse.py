@@ -12,12 +12,11 @@ from pictures import grid, moved, moved_points, picture
 from dynslam_bench.contracts.flow import FlowEstimator, stats_names_of
 from dynslam_bench.core.errors import PluginError
 from dynslam_bench.flow.label_search import STRATEGIES, make_plan, new_state, run_phase
-from dynslam_bench.flow.matching_cost import tables_for
 from dynslam_bench.flow.opencv import LucasKanadeFlow
 from dynslam_bench.flow.propagation import better_half, common_motions
 from dynslam_bench.flow.registry import FLOWS, build_flow
 from dynslam_bench.flow.settings import FlowMethodSettings, FlowSettings
-from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 SEARCHES = list(STRATEGIES)
@@ -26,7 +25,7 @@ METHODS = ["daisy", "lucas-kanade", "dis"]
 
 
 def pair_of(flow, image, target):
-    return Pair(flow.prepare(image), flow.prepare(target), tables_for(image.shape, flow.settings))
+    return flow.pair(flow.prepare(image), flow.prepare(target))
 
 
 def share_found(result, points, matrix):
