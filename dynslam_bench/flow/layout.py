@@ -89,19 +89,12 @@ class MapGeometry(NamedTuple):
     total: int
 
 
-def level_shape(height: int, width: int, step: int) -> tuple[int, int]:
-    """Rows and columns of a level with `step` full-image pixels a map pixel; an odd last row or column is dropped."""
-    for _ in range(int(np.log2(step))):
-        height, width = max(1, height // 2), max(1, width // 2)
-    return height, width
-
-
 @lru_cache(maxsize=16)
 def map_geometry(height: int, width: int) -> MapGeometry:
     """The arrangement of the seven levels for an image size in pixels."""
     levels, total = [], 0
     for step in LEVEL_STEPS:
-        rows, columns = level_shape(height, width, step)
+        rows, columns = max(1, height // step), max(1, width // step)  # an odd last row or column is dropped
         margin = MARGIN // step
         # full-image x (pixel centres at integers) lies in map pixel floor((x + 0.5) / step)
         shift, bias = int(np.log2(step * SUBPIXEL)), SUBPIXEL // 2 + margin * step * SUBPIXEL

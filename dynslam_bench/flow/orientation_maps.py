@@ -13,6 +13,7 @@ they share twice.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import inlined, kernel
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.layout import MapGeometry, level_shape, map_geometry
+from dynslam_bench.flow.layout import MapGeometry, map_geometry
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.simd import (
     Bytes,
@@ -34,16 +35,51 @@ from dynslam_bench.flow.simd import (
     store_normalised,
     store_uint16,
 )
-from dynslam_bench.flow.workers import BufferPool, Workers
+from dynslam_bench.flow.workers import Workers
 
 NORM_FLOOR = 0.01 * 255.0
 """Added to a histogram's norm before dividing, so that flat regions stay near zero (0.01 for images in [0, 1])."""
 FIXED_POINT = 256
 """Units a grey level in the blurred derivatives."""
+Arrays = tuple[NDArray[np.uint8], ...]
 RING = 16
 """Lines stored of each level; a power of two above twice the farthest tap."""
 SPILL = 64
 """Numbers that vector code may access beyond a line's end."""
+
+
+def _references(arrays: Arrays) -> int:
+    """The largest number of references to one of a set's arrays, this function's own included."""
+    return max(sys.getrefcount(array) for array in arrays)
+
+
+_UNREFERENCED = _references((np.zeros(1, dtype=np.uint8),))
+"""Of a set that only its tuple refers to."""
+
+
+class BufferPool:
+    """Sets of zeroed uint8 arrays, reused once nothing else refers to any of them or to a view.
+
+    The first access to a page of fresh memory costs more than computing its content (`docs/flow.md`, Speed). A reused
+    set keeps its old content: callers must not write where they rely on zeros.
+
+    Args:
+        most: Sets kept at most; older ones are left to the garbage collector.
+    """
+
+    def __init__(self, most: int = 4) -> None:
+        self._most = most
+        self._sets: list[Arrays] = []
+
+    def take(self, *shapes: tuple[int, ...]) -> Arrays:
+        """Arrays of these shapes: a used set where one is free, else new ones, zeroed."""
+        for number, arrays in enumerate(self._sets):
+            if tuple(array.shape for array in arrays) == shapes and _references(arrays) <= _UNREFERENCED:
+                self._sets.append(self._sets.pop(number))  # the longest unused first
+                return tuple([*arrays])  # a tuple of its own, so that its holder counts as a reference
+        fresh = tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
+        self._sets = [*self._sets, fresh][-self._most :]
+        return tuple([*fresh])
 
 
 class Side(NamedTuple):
@@ -87,7 +123,7 @@ def orientation_maps(
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
-    (rows, columns), (quarter_rows, quarter_columns) = level_shape(height, width, 2), level_shape(height, width, 4)
+    (rows, quarter_rows), (columns, quarter_columns) = ((max(1, n // 2), max(1, n // 4)) for n in gray.shape)
     histograms, whole, half = buffers.take(
         (geometry.total, layout.BINS),
         (height + 2 * BORDER, width + 2 * BORDER),

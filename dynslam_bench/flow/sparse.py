@@ -24,7 +24,7 @@ from dynslam_bench.flow.matching_cost import (
     parabola,
     reference_appearance,
 )
-from dynslam_bench.flow.orientation_maps import OrientationMaps, orientation_maps
+from dynslam_bench.flow.orientation_maps import BufferPool, OrientationMaps, orientation_maps
 from dynslam_bench.flow.propagation import (
     common_motions,
     dissenting_labels,
@@ -35,7 +35,7 @@ from dynslam_bench.flow.propagation import (
 )
 from dynslam_bench.flow.refinement import Window, similarity_lucas_kanade
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.workers import BufferPool, Workers
+from dynslam_bench.flow.workers import Workers
 
 VOTE = (192, np.float32(5.0))
 """Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
@@ -234,30 +234,20 @@ class SparseDaisyFlow:
     def refine(self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
         """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
         reference, target = pair.reference, pair.target
-        self._align(points, labels, reference.framed_half, target.framed_half, COARSE)
-        return self._align(points, labels, reference.framed, target.framed, self._window(margin=2, warps=2))
-
-    def _window(self, margin: int, warps: int) -> Window:
-        """The window at full resolution."""
-        return Window(1, self.settings.refinement_window_px // 2, margin, warps)
-
-    def _align(
-        self,
-        points: NDArray[np.float32],
-        labels: NDArray[np.float32],
-        template: NDArray[np.uint8],
-        target: NDArray[np.uint8],
-        window: Window,
-    ) -> NDArray[np.float32]:
         correlation = np.empty(len(points), dtype=np.float32)
-        self.workers.run(similarity_lucas_kanade, 0, len(points), points, labels, template, target, window, correlation)
+        arguments = (similarity_lucas_kanade, 0, len(points), points, labels)
+        self.workers.run(*arguments, reference.framed_half, target.framed_half, COARSE, correlation)
+        window = Window(1, self.settings.refinement_window_px // 2, margin=2, warps=2)
+        self.workers.run(*arguments, reference.framed, target.framed, window, correlation)
         return correlation
 
     def _forward_backward_error(
         self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
     ) -> NDArray[np.float32]:
         """Distance in pixels between each point and the end of its inverse label, refined in the other direction."""
-        inverse = -labels
-        self._align(xy, inverse, pair.target.framed, pair.reference.framed, self._window(margin=3, warps=1))
+        inverse, correlation = -labels, np.empty(len(points), dtype=np.float32)
+        window = Window(1, self.settings.refinement_window_px // 2, margin=3, warps=1)
+        images = pair.target.framed, pair.reference.framed
+        self.workers.run(similarity_lucas_kanade, 0, len(xy), xy, inverse, *images, window, correlation)
         distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
         return distance

@@ -8,9 +8,9 @@ from exact_reference import binomial, quantised_maps
 from pictures import picture
 
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.orientation_maps import orientation_maps
+from dynslam_bench.flow.orientation_maps import BufferPool, orientation_maps
 from dynslam_bench.flow.registry import build_flow
-from dynslam_bench.flow.workers import BufferPool, Workers
+from dynslam_bench.flow.workers import Workers
 
 
 def noise(shape, seed=0):
