@@ -6,7 +6,7 @@ the starvation guard (`guard`).
 
 from __future__ import annotations
 
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 S = TypeVar("S", bound=Settings)
+Number: TypeAlias = "float | np.number[Any] | np.bool_"
 
 
 class Rule(DynamicFilter, Generic[S]):
@@ -32,7 +33,9 @@ class Rule(DynamicFilter, Generic[S]):
     def reset(self, camera: Camera) -> None:
         """A rule without memory has nothing to reset."""
 
-    def verdict(self, keep: NDArray[np.bool_], mask: NDArray[np.bool_] | None = None, **stats: float) -> FilterResult:
+    def verdict(
+        self, keep: NDArray[np.bool_], mask: NDArray[np.bool_] | None = None, /, **stats: Number
+    ) -> FilterResult:
         """A verdict of weights 1 and 0 with every stat of `stats_names`: 0 where it is not given."""
         stats["dropped"] = np.count_nonzero(~keep)
         counts = {name: float(stats.get(name, 0.0)) for name in self.stats_names}

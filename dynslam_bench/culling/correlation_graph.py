@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import Number, Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
@@ -86,7 +86,13 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
         keep[rows[~static]] = False
-        counts = {"tracked": len(rows), "settled": len(old), "edges": total, "cut": cut, "components": components}
+        counts: dict[str, Number] = {
+            "tracked": len(rows),
+            "settled": len(old),
+            "edges": total,
+            "cut": cut,
+            "components": components,
+        }
         return self.verdict(keep, **counts)
 
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:

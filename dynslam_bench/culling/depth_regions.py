@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxDepthSettings, DepthBlockSettings, DepthRansacSettings
 from dynslam_bench.geometry.camera import inside
@@ -94,7 +94,11 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         boxes = dynamic_boxes(frame, self.segmentation)
         people = [mask for mask in (self._segment(box, depth) for box in boxes) if mask is not None]
         mask = dilate(np.logical_or.reduce([np.zeros(depth.shape, bool), *people]), self.settings.dilation_px)
-        stats = {"objects": len(boxes), "ignored": len(boxes) - len(people), "mask_fraction": float(mask.mean())}
+        stats: dict[str, Number] = {
+            "objects": len(boxes),
+            "ignored": len(boxes) - len(people),
+            "mask_fraction": float(mask.mean()),
+        }
         return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
 
     def _segment(self, box: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
@@ -125,7 +129,7 @@ def _window(box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple
 
 
 class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
-    """B9, Blitz-SLAM: drops the features on people, whose masks depth completes, and on movable objects that they touch.
+    """B9, Blitz-SLAM: drops the features on people, whose masks depth completes, and on movable objects they touch.
 
     The depth image is divided into blocks along its edges. A block of which enough lies on the mask is added to the
     mask as a whole. A person in front of a wall is a block; a person on a floor forms one block with the floor.
@@ -151,7 +155,12 @@ class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
         if mask.any():
             whole, blocks = covered_blocks(mask, frame.depth, self.settings)
             mask = dilate(mask | whole, self.segmentation.dilation_px)
-        stats = {"objects": len(people), "touched": len(touched), "blocks": blocks, "mask_fraction": float(mask.mean())}
+        stats: dict[str, Number] = {
+            "objects": len(people),
+            "touched": len(touched),
+            "blocks": blocks,
+            "mask_fraction": float(mask.mean()),
+        }
         return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
 
 
@@ -178,4 +187,4 @@ def covered_blocks(
     covered = np.bincount(label[mask], minlength=count)
     whole = covered >= np.maximum(settings.min_share * size, 1)
     whole[0] = False  # label 0: edges and pixels without depth
-    return np.asarray(whole[label]), np.count_nonzero(whole)
+    return np.asarray(whole[label]), int(np.count_nonzero(whole))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import ObjectRule, Rule
+from dynslam_bench.culling import Number, ObjectRule, Rule
 from dynslam_bench.culling.ego_motion import coherent, rigid_flow
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxEpipolarSettings, ClassRuleSettings, EpipolarSettings, Unmatched
@@ -67,9 +67,8 @@ def fundamental_matrix(
             matrix, _ = cv2.findFundamentalMat(first[agree], second[agree], cv2.FM_8POINT)
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
             return None
-        matrix = np.asarray(matrix, dtype=np.float64)
-        agree = epipolar_distance(matrix, first, second) < inlier_px
-    return matrix
+        agree = epipolar_distance(np.asarray(matrix, dtype=np.float64), first, second) < inlier_px
+    return np.asarray(matrix, dtype=np.float64)
 
 
 def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points) -> Points:
@@ -149,7 +148,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         if matches is None:
             return self.verdict(keep)
         fit = matches.valid & state.keep
-        stats: dict[str, float] = {"matches": np.count_nonzero(fit), "degenerate": 1, "f_asked": 1}
+        stats: dict[str, Number] = {"matches": np.count_nonzero(fit), "degenerate": 1, "f_asked": 1}
         if self._is_degenerate(matches.before[fit], matches.now[fit], state.camera, stats):
             return self.verdict(keep, **stats)
         distance = matches.distances(fit)
@@ -158,8 +157,8 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         failing = distance > self.settings.threshold_px
         stats["inliers"] = np.count_nonzero(fit & ~failing)
         if self.settings.max_contradiction < 1:
-            stats["contradiction"] = contradiction(frame, state, failing, matches)
-            if stats["contradiction"] > self.settings.max_contradiction:
+            share = stats["contradiction"] = contradiction(frame, state, failing, matches)
+            if share > self.settings.max_contradiction:
                 return self.verdict(keep, **stats)
         stats |= {"degenerate": 0, "f_judged": 1}
         if self.settings.mode == "object":
@@ -168,16 +167,16 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         xy, shape = frame.keypoints.xy, frame.gray.shape
         return self.verdict(~coherent(failing, matches.valid, xy, self.settings.min_share, shape), **stats)
 
-    def _is_degenerate(self, before: Points, now: Points, camera: Camera, stats: dict[str, float]) -> bool:
+    def _is_degenerate(self, before: Points, now: Points, camera: Camera, stats: dict[str, Number]) -> bool:
         """Whether matches or parallax are too small or one homography explains the view; fills in both stats."""
         if len(before) < MIN_MATCHES:
             return True
-        stats["parallax_px"] = rotation_residual(before, now, camera)
+        parallax_px = stats["parallax_px"] = rotation_residual(before, now, camera)
         flow_px = float(np.median(np.linalg.norm(before - now, axis=1)))
-        if stats["parallax_px"] < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
+        if parallax_px < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
             return True
-        stats["homography_share"] = homography_share(before, now)
-        return stats["homography_share"] > self.settings.homography_share
+        share = stats["homography_share"] = homography_share(before, now)
+        return share > self.settings.homography_share
 
 
 def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
@@ -276,7 +275,12 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
             fit = tested & ~in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), previous).any(axis=0)
         if np.count_nonzero(fit) < MIN_OUTSIDE:
             fit = tested
-        stats = {"matches": np.count_nonzero(fit), "lost": np.count_nonzero(lost), "boxes": len(boxes), "f_asked": 1}
+        stats: dict[str, Number] = {
+            "matches": np.count_nonzero(fit),
+            "lost": np.count_nonzero(lost),
+            "boxes": len(boxes),
+            "f_asked": 1,
+        }
         distance = matches.distances(fit, settings.inlier_px)
         if distance is None:
             return self.verdict(keep, failed=1, **stats)
@@ -302,7 +306,7 @@ class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
         settings, xy = self.settings, frame.keypoints.xy
         keep, none = np.ones(len(xy), dtype=bool), np.zeros(len(xy), dtype=bool)
         matches = matches_by_flow(frame, state, settings.unmatched)
-        stats: dict[str, float] = {"f_asked": matches is not None, "on_movable": 0, "moving_objects": 0}
+        stats: dict[str, Number] = {"f_asked": matches is not None, "on_movable": 0, "moving_objects": 0}
         if frame.instances is None or not len(frame.instances):
             return self.verdict(keep, **stats)
         people = dynamic_mask(frame.instances, self.segmentation, frame.depth)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.epipolar import epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.settings import MovingVoteSettings
 from dynslam_bench.geometry.camera import Camera, inside
@@ -44,7 +44,13 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
         near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
         votes = np.count_nonzero(inside(near_people, moving))
-        stats = {"corners": corners, "moving": len(moving), "votes": votes, "f_asked": asked, "f_judged": judged}
+        stats: dict[str, Number] = {
+            "corners": corners,
+            "moving": len(moving),
+            "votes": votes,
+            "f_asked": asked,
+            "f_judged": judged,
+        }
         if votes < self.settings.min_votes:
             return self.verdict(keep, **stats)
         return self.verdict(~inside(people, frame.keypoints.xy), people, **stats)

@@ -49,7 +49,7 @@ class ReseedingFilter(Rule[ReseedingSettings]):
             used | ~static,  # features that earlier filters dropped are not judged again
             static=np.count_nonzero(static),
             reseeded=np.count_nonzero(used & ~usual),
-            missing=max(self.settings.budget - np.count_nonzero(used), 0),
+            missing=max(self.settings.budget - int(np.count_nonzero(used)), 0),
         )
 
     def _choose(self, frame: FrameBundle, allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:

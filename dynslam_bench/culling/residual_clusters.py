@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import inside
@@ -56,7 +56,11 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         sampled[valid] = moving[label]
         size = frame.depth.shape[::-1]
         mask = cv2.resize(sampled.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-        stats = {"clusters": len(moving), "moving": np.count_nonzero(moving), "mask_fraction": float(mask.mean())}
+        stats: dict[str, Number] = {
+            "clusters": len(moving),
+            "moving": np.count_nonzero(moving),
+            "mask_fraction": float(mask.mean()),
+        }
         return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
 
     def _residual(

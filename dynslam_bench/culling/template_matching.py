@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
 from dynslam_bench.geometry import se3
@@ -40,8 +40,8 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
         self._window = self._window[: self.settings.window]
         xy = frame.keypoints.xy
         boxed = in_boxes(xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
-        keep, rows = ~boxed, np.flatnonzero(boxed & (frame.z > 0))
-        stats = {"in_boxes": float(np.count_nonzero(boxed))}
+        keep, rows = np.asarray(~boxed), np.flatnonzero(boxed & (frame.z > 0))
+        stats: dict[str, Number] = {"in_boxes": float(np.count_nonzero(boxed))}
         if state.T_world_pred is None or not self._window or not len(rows):
             return self.verdict(keep, **stats)
         world = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))

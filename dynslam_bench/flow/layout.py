@@ -100,4 +100,5 @@ def map_geometry(height: int, width: int) -> MapGeometry:
         shift, bias = int(np.log2(step * SUBPIXEL)), SUBPIXEL // 2 + margin * step * SUBPIXEL
         levels.append((total, columns + 2 * margin, shift, bias))
         total += (rows + 2 * margin) * (columns + 2 * margin)
-    return MapGeometry(*np.array(levels, dtype=np.int64).T.copy(), total)
+    base, stride, shift, bias = np.array(levels, dtype=np.int64).T.copy()
+    return MapGeometry(base, stride, shift, bias, total)

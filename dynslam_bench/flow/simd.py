@@ -83,9 +83,10 @@ class _Arithmetic(AbstractTemplate):
 for _symbol, _operation in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
     infer_global(_symbol)(type(f"_Lanes_{_operation}", (_Arithmetic,), {}))
 
-    @lower_builtin(_symbol, SimdType, SimdType)
     def _lower(context: Code, builder: Code, kind: Code, arguments: Code, operation: str = _operation) -> Code:
         return getattr(builder, operation)(*arguments)
+
+    lower_builtin(_symbol, SimdType, SimdType)(_lower)
 
 
 def pointer_to(context: Code, builder: Code, kind: Code, array: Code, index: Code, vector: ir.VectorType) -> Code:
@@ -127,7 +128,8 @@ def _loading(result: SimdType, vector: ir.VectorType, align: int, convert: Calla
 
     def load(typing_context: Code, array: Code, index: Code) -> Definition:
         def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-            return convert(builder, load_vector(context, builder, kind.args[0], *arguments, vector, align))
+            array, index = arguments
+            return convert(builder, load_vector(context, builder, kind.args[0], array, index, vector, align))
 
         return result(array, types.int64), generate
 
@@ -139,8 +141,8 @@ def _storing(value: SimdType, align: int) -> Code:
 
     def store(typing_context: Code, array: Code, index: Code, vector: Code) -> Definition:
         def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-            pointer = pointer_to(context, builder, kind.args[0], *arguments[:2], value.vector)
-            builder.store(arguments[2], pointer, align=align)
+            array, index, vector = arguments
+            builder.store(vector, pointer_to(context, builder, kind.args[0], array, index, value.vector), align=align)
             return context.get_dummy_value()
 
         return types.void(array, types.int64, value), generate
