@@ -243,16 +243,14 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         if len(finished) >= self._population // 2:
             members = np.array([[to_unit(trial.params[name], space[name]) for name in names] for trial in finished])
             low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
-            unit = opposites(np, members[len(finished) % len(members)], low, high, low, high, self._rng.random)
+            unit = opposites(members[len(finished) % len(members)], low, high, low, high, self._rng.random)
         return {name: from_unit(value, space[name]) for name, value in zip(names, unit, strict=True)}
 
     def _fly(self, moth: Array, flames: Array, index: int, trial: int) -> Array:
         """Where the moth of that index lands in a trial of the budget; `flames` best first."""
         left = flames_left(self._population, trial, self._n_trials)
         around, now = flames[min(index, left - 1)], flight(trial / self._n_trials, EMFOA)
-        return np.asarray(
-            moth_positions(np, moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
-        )
+        return np.asarray(moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random))
 
     def _land(self, value: float, distribution: BaseDistribution, flame: Any) -> Any:
         if isinstance(distribution, CategoricalDistribution):

@@ -1,4 +1,4 @@
-"""Dynamic feature filters: one published rejection rule a module.
+"""Dynamic feature filters: published rejection rules.
 
 The building blocks are numbered as in `docs/baselines.md` (B1 to B15). All filters receive the same keypoints and share
 the starvation guard (`guard`).
@@ -6,14 +6,18 @@ the starvation guard (`guard`).
 
 from __future__ import annotations
 
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
-from dynslam_bench.contracts.filter import DynamicFilter
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 S = TypeVar("S", bound=Settings)
+Number: TypeAlias = "float | np.number[Any] | np.bool_"
 
 
 class Rule(DynamicFilter, Generic[S]):
@@ -28,6 +32,14 @@ class Rule(DynamicFilter, Generic[S]):
 
     def reset(self, camera: Camera) -> None:
         """A rule without memory has nothing to reset."""
+
+    def verdict(
+        self, keep: NDArray[np.bool_], mask: NDArray[np.bool_] | None = None, /, **stats: Number
+    ) -> FilterResult:
+        """A verdict of weights 1 and 0 with every stat of `stats_names`: 0 where it is not given."""
+        stats["dropped"] = np.count_nonzero(~keep)
+        counts = {name: float(stats.get(name, 0.0)) for name in self.stats_names}
+        return FilterResult(keep, keep.astype(np.float32), counts, mask)
 
 
 class ObjectRule(Rule[S]):

@@ -10,9 +10,9 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import Number, Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
-from dynslam_bench.culling.matches import link_to_previous
+from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
@@ -55,60 +55,68 @@ class CorrelationFilter(Rule[CorrelationSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Build the graph over the points that have been observed before."""
-        keep = np.ones(len(frame), dtype=bool)
-        stats = dict.fromkeys(("tracked", "settled", "edges", "cut", "components"), 0.0)
+        keep = np.ones(len(frame.xy), dtype=bool)
         local = self._observe(frame.xy, frame.keypoints.xy, frame.z, frame.depth, state.camera)
         past = self._past_observations(frame, state)
         self._past, self._last = past, local
         if state.T_world_pred is None or not len(past):
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep)
         now = _in_world(local, state.T_world_pred)
         observed = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1))
         rows = np.flatnonzero(observed.any(axis=0))
         if len(rows) < MIN_POINTS:
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep)
         age = len(past) - observed[::-1, rows].argmax(axis=0)
         settled = age >= min(self.settings.settled, len(past))
         now, past, observed, xy = now[rows], past[:, rows], observed[:, rows], frame.xy[rows]
-        static, cut, total = np.ones(len(rows), dtype=bool), 0, 0
         old = np.flatnonzero(settled)
-        stats |= {"tracked": float(len(rows)), "settled": float(len(old))}
         if len(old) < MIN_POINTS:
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep, tracked=len(rows), settled=len(old))
+        static = np.ones(len(rows), dtype=bool)
         edges = _delaunay_edges(xy[old])
         uncut = self._agree(now[old], past[:, old], observed[:, old], edges)
-        static[old], stats["components"] = self._static_component(edges[uncut], now[old, :3])
-        total, cut = len(edges), int(np.count_nonzero(~uncut))
+        static[old], components = self._static_component(edges[uncut], now[old, :3])
+        total, cut = len(edges), np.count_nonzero(~uncut)
         if len(old) < len(rows):
             edges = _delaunay_edges(xy)
             edges = edges[settled[edges].sum(axis=1) == 1]
             edges = np.where(settled[edges[:, :1]], edges[:, ::-1], edges)  # the younger point first
             uncut = self._agree(now, past, observed, edges)
-            total, cut = total + len(edges), cut + int(np.count_nonzero(~uncut))
+            total, cut = total + len(edges), cut + np.count_nonzero(~uncut)
             vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
-        stats |= {"edges": float(total), "cut": float(cut)}
         keep[rows[~static]] = False
-        return FilterResult.of(keep, stats)
+        counts: dict[str, Number] = {
+            "tracked": len(rows),
+            "settled": len(old),
+            "edges": total,
+            "cut": cut,
+            "components": components,
+        }
+        return self.verdict(keep, **counts)
 
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
         """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
         previous, pose, flow = state.previous, state.T_world_prev, state.flow
-        if previous is None or pose is None or flow is None or self._last is None or len(self._last) != len(previous):
-            return np.zeros((0, len(frame), 12))
+        if (
+            previous is None
+            or pose is None
+            or flow is None
+            or self._last is None
+            or len(self._last) != len(previous.xy)
+        ):
+            return np.zeros((0, len(frame.xy), 12))
         link = link_to_previous(frame, state)
         before = np.concatenate([_in_world(self._last, pose)[None], self._past])[: self.settings.window]
-        past = np.full((len(before), len(frame), 12), np.nan)
+        past = np.full((len(before), len(frame.xy), 12), np.nan)
         past[:, link >= 0] = before[:, link[link >= 0]]
         loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
-        if len(loose):
-            raw = flow.xy[loose]
-            height, width = previous.depth.shape
-            column, row = np.rint(raw).astype(np.intp).T
-            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            z = np.where(inside, previous.depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
-            observations = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
-            past[0, loose] = _in_world(observations, pose)
+        raw, (height, width) = flow.xy[loose], previous.depth.shape
+        column, row = np.rint(raw).astype(np.intp).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        z = np.where(inside, previous.depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
+        observations = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
+        past[0, loose] = _in_world(observations, pose)
         return past
 
     def _observe(
@@ -117,13 +125,11 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
         points = np.full((len(xy), 12), np.nan)
         valid = np.isfinite(z) & (z > 0)
-        if valid.any():
-            points[valid, :3] = camera.unproject(xy[valid], z[valid])
-            variance = depth_variance(depth, raw[valid])
-            covariance = point_covariance(
-                np.asarray(xy[valid], np.float64), z[valid], variance, camera, self.settings.pixel_sigma
-            )
-            points[valid, 3:] = covariance.reshape(-1, 9)
+        points[valid, :3] = camera.unproject(xy[valid], z[valid])
+        variance = depth_variance(depth, raw[valid])
+        pixels = np.asarray(xy[valid], np.float64)
+        covariance = point_covariance(pixels, z[valid], variance, camera, self.settings.pixel_sigma)
+        points[valid, 3:] = covariance.reshape(-1, 9)
         return points
 
     def _agree(
@@ -142,9 +148,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         distance[comparable] = (change[comparable] * solved).sum(axis=1)
         return np.asarray(distance <= chi2.ppf(self.settings.quantile, 3))
 
-    def _static_component(
-        self, edges: NDArray[np.intp], points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], float]:
+    def _static_component(self, edges: NDArray[np.intp], points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], int]:
         count = len(points)
         graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
         _, label = connected_components(graph, directed=False)
@@ -154,7 +158,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         else:
             measure = np.array([_volume(points[label == body]) for body in range(len(size))])
         static = int(np.lexsort((size, measure))[-1])  # with equal volumes the one with more points
-        return np.asarray(label == static), float(len(size))
+        return np.asarray(label == static), len(size)
 
 
 def _in_world(local: NDArray[np.float64], T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,7 @@
-"""The camera's motion since the previous frame from optical flow and depth, and what motion tests share."""
+"""The camera's motion since the previous frame from optical flow and depth, and the rigid-motion test that uses it.
+
+The test finds motion along epipolar lines, and any motion while the camera only rotates or stands still.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterState, FrameBundle
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.culling import Rule
+from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 
@@ -28,6 +33,11 @@ CORRELATION = 100.0
 """Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
 (the back end inflates the covariance of its poses for the same reason)."""
 
+THRESHOLD_SHARE = 0.05
+"""Added to the pixel threshold, as a share of the flow that the camera's motion explains (rolling shutter)."""
+MEMORY = 0.6
+"""Share of a point's evidence that is carried over from the previous frame."""
+
 
 def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
     """Standard deviation of a structured-light depth camera at depth z, metres (Nguyen et al. 2012, axial noise)."""
@@ -45,15 +55,14 @@ def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floa
     Returns:
         Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there were none.
     """
-    ones = np.ones(len(before))
-    if state.previous is None or state.previous_keep is None or not len(state.previous):
-        return ones
+    share = np.ones(len(before))
+    if state.previous is None or state.previous_keep is None:
+        return share
     previous_cell, grid = cell_index(state.previous.keypoints.xy, CELL, frame.gray.shape)
-    count = np.bincount(previous_cell, minlength=grid[0] * grid[1])
-    kept = np.bincount(previous_cell, weights=state.previous_keep, minlength=grid[0] * grid[1])
-    share = np.where(count > 0, kept / np.maximum(count, 1), 1.0)
-    cell, _ = cell_index(np.nan_to_num(before), CELL, frame.gray.shape)
-    return np.where(np.isfinite(before).all(axis=1), share[cell], ones)
+    kept = cell_mean(state.previous_keep, previous_cell, grid, empty=1.0)
+    finite = np.isfinite(before).all(axis=1)
+    share[finite] = kept[cell_index(before[finite], CELL, frame.gray.shape)[0]]
+    return share
 
 
 def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
@@ -61,6 +70,15 @@ def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> t
     rows, columns = -(-shape[0] // size), -(-shape[1] // size)
     cell = np.floor(xy / size).astype(np.intp)
     return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
+
+
+def cell_mean(
+    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int], *, empty: float = 0.0
+) -> NDArray[np.float64]:
+    """Mean of values ``[N]`` in each cell of a grid, `empty` where there are none; cells as in `cell_index`."""
+    count = np.bincount(cell, minlength=grid[0] * grid[1])
+    total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1])
+    return np.where(count > 0, total / np.maximum(count, 1), empty)
 
 
 def rigid_flow(
@@ -104,10 +122,12 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     use = flow.valid & state.keep & (frame.z > 0)
     if np.count_nonzero(use) < MIN_POINTS:
         return state.T_world_pred
-    start = np.eye(4) if state.T_world_pred is None else se3.inverse(state.T_world_prev) @ state.T_world_pred
+    start, prior = np.eye(4), None
+    if state.T_world_pred is not None:
+        start = se3.inverse(state.T_world_prev) @ state.T_world_pred
+        prior = prior_information(state, start)
     points = state.camera.unproject(frame.xy[use], frame.z[use])
     before = state.camera.undistort_points(flow.xy[use])
-    prior = None if state.T_world_pred is None else prior_information(state, start)
     T_prev_cur = _align(points, before, state.camera, start, static_share(frame, state, flow.xy[use]), prior)
     return state.T_world_pred if T_prev_cur is None else state.T_world_prev @ T_prev_cur
 
@@ -151,8 +171,10 @@ def _align(
     for number, scale in enumerate(TURN_PX + KERNEL_PX):
         moved = se3.transform(pose, points)
         z = np.maximum(moved[:, 2], 0.05)
-        error = camera.project(moved) - pixels
-        error = np.where(moved[:, 2:3] > 0.05, np.nan_to_num(error, posinf=1e4, neginf=-1e4), 1e4)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            projected = moved[:, :2] / moved[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        error = np.nan_to_num(projected - pixels, posinf=1e4, neginf=-1e4)
+        error = np.where(moved[:, 2:] > 0.05, error, 1e4)
         weight = prior_weight / np.square(1 + (error**2).sum(axis=1) / (scale**2 + rolling_shutter))
         x, y = moved[:, 0] / z, moved[:, 1] / z
         zero = np.zeros_like(x)
@@ -208,3 +230,81 @@ def coherent(
 
     failures, tests = around(failing & tested), around(tested)
     return np.asarray(failing & (failures[index] >= MIN_FAILING) & (failures[index] >= share * tests[index]))
+
+
+class RigidMotionFilter(Rule[RigidMotionSettings]):
+    """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
+
+    A point's evidence is 1 where it fails in the image or in depth. The evidence follows the flow and decays over the
+    next frames (`MEMORY`), so that people who pause for a moment stay culled.
+    Stats: ``dropped``, ``tested``, ``failed`` (in this frame alone).
+    """
+
+    name = "motion"
+    needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
+    provenance: Provenance = "assumed"
+    stats_names = ("dropped", "tested", "failed")
+
+    def __init__(self, settings: RigidMotionSettings) -> None:
+        super().__init__(settings)
+        self._evidence: NDArray[np.float64] | None = None
+
+    def reset(self, camera: Camera) -> None:
+        """Forget the evidence of the previous sequence."""
+        self._evidence = None
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Test the points that have flow and depth."""
+        flow, xy, shape = state.flow, frame.keypoints.xy, frame.gray.shape
+        if flow is None or state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
+            self._evidence = None
+            return self.verdict(np.ones(len(xy), dtype=bool))
+        tested = flow.valid & (frame.z > 0)
+        failed = np.zeros(len(xy), dtype=bool)
+        failed[tested] = self._fails(frame, state, tested)
+        failed = coherent(failed, tested, xy, self.settings.min_share, shape)
+        evidence = failed.astype(np.float64)
+        if self._evidence is not None:
+            origin, _ = cell_index(flow.xy[flow.valid], CELL // 2, shape)
+            evidence[flow.valid] += MEMORY * self._evidence[origin]
+        evidence = evidence.clip(0, 1)
+        self._evidence = cell_mean(evidence, *cell_index(xy, CELL // 2, shape))
+        return self.verdict(evidence < 0.5, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
+
+    def _fails(self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        assert state.flow is not None and state.previous is not None
+        moved, expected = rigid_flow(frame, state, tested)
+        before = state.camera.undistort_points(state.flow.xy[tested])
+        distance = np.linalg.norm(expected - before, axis=1)
+        explained = np.linalg.norm(expected - frame.xy[tested], axis=1)
+        limit_px = self.settings.threshold_px + THRESHOLD_SHARE * explained
+        measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
+        limit = self.settings.threshold_sigma * np.sqrt(2) * depth_sigma(moved[:, 2])
+        off_depth = (measured > 0) & (np.abs(measured - moved[:, 2]) > limit)
+        return np.asarray(~(distance <= limit_px) | off_depth)
+
+
+def nearest_depth(
+    depth: NDArray[np.float32], xy: NDArray[np.floating], expected: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """The depth in the 3x3 patch around each raw pixel that is nearest to the expected depth.
+
+    Thus depth edges and sub-pixel flow errors do not count as motion.
+
+    Args:
+        depth: float32 ``[H, W]`` metres, 0 or not finite where missing.
+        xy: Raw pixels ``[N, 2]``.
+        expected: Depths ``[N]``, metres.
+
+    Returns:
+        Depths ``[N]``, metres; 0 where the patch has none or lies outside the image.
+    """
+    height, width = depth.shape
+    offsets = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+    pixels = np.rint(xy)[:, None, :].astype(np.intp) + offsets
+    column, row = pixels[..., 0], pixels[..., 1]
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    patch = depth[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
+    patch[~inside | ~np.isfinite(patch)] = 0
+    gap = np.where(patch > 0, np.abs(patch - np.asarray(expected)[:, None]), np.inf)
+    return np.asarray(np.take_along_axis(patch, gap.argmin(axis=1)[:, None], axis=1)[:, 0])

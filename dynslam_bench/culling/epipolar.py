@@ -1,40 +1,127 @@
-"""B3: the epipolar test on optical flow (paper, Eq. 23-25), with a degeneracy guard."""
+"""B3, the epipolar test on optical flow (paper, Eq. 23-25): as this project runs it, with boxes, and by class (B15).
+
+F is the fundamental matrix of the matches between the previous and the current image.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import Number, ObjectRule, Rule
 from dynslam_bench.culling.ego_motion import coherent, rigid_flow
-from dynslam_bench.culling.matches import (
-    MIN_MATCHES,
-    Estimator,
-    Matches,
-    Points,
-    f_stats,
-    homography_share,
-    rotation_residual,
-)
-from dynslam_bench.culling.settings import EpipolarSettings
+from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
+from dynslam_bench.culling.settings import BoxEpipolarSettings, ClassRuleSettings, EpipolarSettings, Unmatched
 from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.segmentation.postprocess import dynamic_mask, select
 
+Points = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+MIN_MATCHES = 16
+"""Twice the minimum of the eight-point algorithm."""
+CONFIDENCE = 0.99
+"""Of RANSAC."""
 RIGID_PX = 2.0
 """A point within this distance of its prediction by the camera's motion counts as static in `contradiction`."""
 VOTE_SHARE = 0.3
 """Share of an object's tested points that must fail for the object to count as moving (not stated in the paper)."""
-STATS = (
-    "matches",
-    "inliers",
-    "parallax_px",
-    "homography_share",
-    "contradiction",
-    "degenerate",
-    "moving_objects",
-    "f_asked",
-    "f_judged",
-)
+MIN_OUTSIDE = 20
+"""SG-SLAM takes all matches where fewer than this lie outside the boxes."""
+
+
+def fundamental_matrix(
+    first: Points,
+    second: Points,
+    *,
+    inlier_px: float = 1.0,
+    max_draws: int = 2000,
+    min_matches: int = MIN_MATCHES,
+    refits: int = 2,
+) -> NDArray[np.float64] | None:
+    """The matrix F with ``x2^T F x1 = 0`` (Eq. 24) for matched pixels, by RANSAC.
+
+    Args:
+        first: Undistorted pixels x1, float64 ``[N, 2]``.
+        second: Undistorted pixels x2, float64 ``[N, 2]``.
+        inlier_px: Distance in pixels up to which a match agrees with F.
+        max_draws: Most samples that RANSAC draws.
+        min_matches: Fewer matches give no F.
+        refits: How often F is fitted again to all matches that agree: the F of the minimal sample is noisy at the
+            image's border.
+
+    Returns:
+        F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate).
+    """
+    agree = np.ones(len(first), dtype=bool)
+    for fit in range(refits + 1):
+        if np.count_nonzero(agree) < min_matches:
+            return None
+        if fit == 0:
+            matrix, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, inlier_px, CONFIDENCE, max_draws)
+        else:
+            matrix, _ = cv2.findFundamentalMat(first[agree], second[agree], cv2.FM_8POINT)
+        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            return None
+        agree = epipolar_distance(np.asarray(matrix, dtype=np.float64), first, second) < inlier_px
+    return np.asarray(matrix, dtype=np.float64)
+
+
+def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points) -> Points:
+    """Distances ``[N]`` in pixels of x2 to the epipolar line of x1 (Eq. 25, with the root that the text lost)."""
+    lines = np.column_stack([first, np.ones(len(first))]) @ matrix.T
+    signed = (lines[:, :2] * second).sum(axis=1) + lines[:, 2]
+    return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
+
+
+class Matches(NamedTuple):
+    """Keypoints and where their flow ends, undistorted pixels.
+
+    Attributes:
+        before: float64 ``[N, 2]``, x1 in the previous image.
+        now: float64 ``[N, 2]``, x2 in the current one.
+        valid: bool ``[N]``, keypoints whose flow succeeded.
+        tested: bool ``[N]``, keypoints that are tested.
+    """
+
+    before: Points
+    now: Points
+    valid: Flags
+    tested: Flags
+
+    def distances(self, fit: Flags, inlier_px: float = 1.0) -> Points | None:
+        """Epipolar distances ``[N]`` of the tested matches, 0 for others, by the F of the matches `fit` (bool ``[N]``).
+
+        None where F cannot be estimated.
+        """
+        matrix = fundamental_matrix(self.before[fit], self.now[fit], inlier_px=inlier_px)
+        if matrix is None:
+            return None
+        distance = np.zeros(len(fit))
+        distance[self.tested] = epipolar_distance(matrix, self.before[self.tested], self.now[self.tested])
+        return distance
+
+
+def matches_by_flow(frame: FrameBundle, state: FilterState, unmatched: Unmatched | None = None) -> Matches | None:
+    """The keypoints' matches; None without flow or without a previous frame.
+
+    Args:
+        frame: The current frame.
+        state: With the flow.
+        unmatched: None tests every valid match. Else only keypoints that earlier filters kept are tested; ``judge``
+            includes those whose flow failed, at the place where it lost them.
+    """
+    flow = state.flow
+    if flow is None or state.previous is None:
+        return None
+    tested = flow.valid
+    if unmatched is not None:
+        tested = state.keep & (np.isfinite(flow.xy).all(axis=1) if unmatched == "judge" else flow.valid)
+    return Matches(state.camera.undistort_points(flow.xy), frame.xy, flow.valid, tested)
 
 
 class EpipolarFilter(Rule[EpipolarSettings]):
@@ -49,48 +136,70 @@ class EpipolarFilter(Rule[EpipolarSettings]):
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
     provenance: Provenance = "faithful-paper"
-    stats_names = ("dropped", *STATS)
+    stats_names = (
+        *("dropped", "matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate"),
+        *("moving_objects", "f_asked", "f_judged"),
+    )
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
-        stats = dict.fromkeys(STATS, 0.0)
-        keep = np.ones(len(frame), dtype=bool)
-        matches = Matches.by_flow(frame, state)
-        if matches is None or state.flow is None:
-            return FilterResult.of(keep, stats)
-        valid = state.flow.valid
-        fit = valid & state.keep
-        stats |= f_stats(asked=True) | {"matches": float(np.count_nonzero(fit)), "degenerate": 1.0}
-        if stats["matches"] < MIN_MATCHES or self._is_degenerate(matches, fit, state.camera, stats):
-            return FilterResult.of(keep, stats)
-        distance = matches.distances(fit, valid, Estimator())
+        keep = np.ones(len(frame.xy), dtype=bool)
+        matches = matches_by_flow(frame, state)
+        if matches is None:
+            return self.verdict(keep)
+        fit = matches.valid & state.keep
+        stats: dict[str, Number] = {"matches": np.count_nonzero(fit), "degenerate": 1, "f_asked": 1}
+        if self._is_degenerate(matches.before[fit], matches.now[fit], state.camera, stats):
+            return self.verdict(keep, **stats)
+        distance = matches.distances(fit)
         if distance is None:
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep, **stats)
         failing = distance > self.settings.threshold_px
-        stats["inliers"] = float(np.count_nonzero(fit & ~failing))
+        stats["inliers"] = np.count_nonzero(fit & ~failing)
         if self.settings.max_contradiction < 1:
-            stats["contradiction"] = contradiction(frame, state, failing, matches.before)
-            if stats["contradiction"] > self.settings.max_contradiction:
-                return FilterResult.of(keep, stats)
-        stats |= f_stats(asked=True, judged=True) | {"degenerate": 0.0}
-        if self.settings.mode == "point":
-            moving = coherent(failing, valid, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
-            return FilterResult.of(~moving, stats)
-        keep, stats["moving_objects"] = vote_on_objects(frame, failing, valid)
-        return FilterResult.of(keep, stats)
+            share = stats["contradiction"] = contradiction(frame, state, failing, matches)
+            if share > self.settings.max_contradiction:
+                return self.verdict(keep, **stats)
+        stats |= {"degenerate": 0, "f_judged": 1}
+        if self.settings.mode == "object":
+            keep, stats["moving_objects"] = vote_on_objects(frame, failing, matches.valid)
+            return self.verdict(keep, **stats)
+        xy, shape = frame.keypoints.xy, frame.gray.shape
+        return self.verdict(~coherent(failing, matches.valid, xy, self.settings.min_share, shape), **stats)
 
-    def _is_degenerate(self, matches: Matches, fit: NDArray[np.bool_], camera: Camera, stats: dict[str, float]) -> bool:
-        """Whether the parallax is too small or one homography explains the view; fills in both stats."""
-        before, now = matches.before[fit], matches.now[fit]
-        stats["parallax_px"] = rotation_residual(before, now, camera)
-        flow_px = float(np.median(np.linalg.norm(before - now, axis=1)))
-        if stats["parallax_px"] < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
+    def _is_degenerate(self, before: Points, now: Points, camera: Camera, stats: dict[str, Number]) -> bool:
+        """Whether matches or parallax are too small or one homography explains the view; fills in both stats."""
+        if len(before) < MIN_MATCHES:
             return True
-        stats["homography_share"] = homography_share(before, now)
-        return stats["homography_share"] > self.settings.homography_share
+        parallax_px = stats["parallax_px"] = rotation_residual(before, now, camera)
+        flow_px = float(np.median(np.linalg.norm(before - now, axis=1)))
+        if parallax_px < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
+            return True
+        share = stats["homography_share"] = homography_share(before, now)
+        return share > self.settings.homography_share
 
 
-def contradiction(frame: FrameBundle, state: FilterState, failing: NDArray[np.bool_], before: Points) -> float:
+def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
+    """Median distance in pixels between matches ``[N, 2]`` and the best pure rotation: the parallax."""
+    rays = [camera.unproject(xy, np.ones(len(xy))) for xy in (first, second)]
+    rays = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]
+    weight = np.ones(len(first))
+    residual = np.zeros(len(first))
+    for _ in range(3):  # iteratively reweighted, so that moving objects do not influence the rotation
+        u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
+        weight = 1.0 / np.maximum(residual, 0.5)
+    return float(np.median(residual))
+
+
+def homography_share(first: Points, second: Points) -> float:
+    """Share of the matches ``[N, 2]`` within 1 px of one homography: 1 for a plane or a pure rotation."""
+    matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=300, confidence=0.99)
+    return 0.0 if matrix is None else float(np.mean(mask))
+
+
+def contradiction(frame: FrameBundle, state: FilterState, failing: Flags, matches: Matches) -> float:
     """Share of the points that fit the camera's motion in depth and fail the epipolar test.
 
     Where a person fills the image, the largest consistent set of matches may lie on the person. The camera's motion is
@@ -98,23 +207,21 @@ def contradiction(frame: FrameBundle, state: FilterState, failing: NDArray[np.bo
 
     Args:
         frame: The current frame.
-        state: With flow, previous and predicted pose.
+        state: With previous and predicted pose.
         failing: bool ``[N]``, points that fail the epipolar test.
-        before: Undistorted pixels ``[N, 2]`` in the previous image.
+        matches: Of the points.
 
     Returns:
         The share, 0 to 1; 0 where too few points have depth or no pose is known.
     """
-    if state.flow is None or state.T_world_prev is None or state.T_world_pred is None:
+    if state.T_world_prev is None or state.T_world_pred is None:
         return 0.0
-    rows = state.flow.valid & state.keep & (frame.z > 0)
-    rows[rows] = np.linalg.norm(rigid_flow(frame, state, rows)[1] - before[rows], axis=1) < RIGID_PX
+    rows = matches.valid & state.keep & (frame.z > 0)
+    rows[rows] = np.linalg.norm(rigid_flow(frame, state, rows)[1] - matches.before[rows], axis=1) < RIGID_PX
     return float(failing[rows].mean()) if np.count_nonzero(rows) >= MIN_MATCHES else 0.0
 
 
-def vote_on_objects(
-    frame: FrameBundle, failing: NDArray[np.bool_], tested: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], float]:
+def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[Flags, float]:
     """B11: an object moves if enough of its tested points fail; then all of its points are dropped.
 
     Args:
@@ -125,7 +232,7 @@ def vote_on_objects(
     Returns:
         bool ``[N]`` keep, and the number of moving objects.
     """
-    keep = np.ones(len(frame), dtype=bool)
+    keep = np.ones(len(frame.xy), dtype=bool)
     moving = 0
     for mask in () if frame.instances is None else frame.instances.masks:
         on_object = inside(mask, frame.keypoints.xy)
@@ -133,4 +240,96 @@ def vote_on_objects(
         if voters.any() and failing[voters].mean() >= VOTE_SHARE:
             keep &= ~on_object
             moving += 1
-    return keep, float(moving)
+    return keep, moving
+
+
+class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
+    """B3 with boxes: drops points off their epipolar line, with one limit inside dynamic boxes and another outside.
+
+    Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail where F is degenerate.
+    The setting ``unmatched`` decides about features whose flow failed. Stats: ``dropped``, ``matches``, ``boxes``,
+    ``lost`` (features whose flow failed), ``failed`` (1 where F could not be estimated).
+    """
+
+    name = "box_epipolar"
+    needs: frozenset[Need] = frozenset({"flow", "boxes", "previous"})
+    provenance: Provenance = "faithful-paper"
+    stats_names = ("dropped", "matches", "lost", "failed", "boxes", "f_asked", "f_judged")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Test the flow of this frame's keypoints to the previous image."""
+        settings, keep = self.settings, np.ones(len(frame.xy), dtype=bool)
+        matches = matches_by_flow(frame, state, settings.unmatched)
+        boxes = dynamic_boxes(frame, self.segmentation)
+        if matches is None or state.flow is None or state.previous is None:
+            return self.verdict(keep, boxes=len(boxes))
+        lost, tested = state.keep & ~matches.valid, matches.tested
+        if settings.unmatched == "drop":
+            keep &= ~lost
+        in_box = in_boxes(frame.keypoints.xy, boxes).any(axis=0)
+        fit = tested & ~in_box
+        if settings.fit == "kept":
+            fit = tested
+        elif settings.fit == "outside previous":
+            previous = dynamic_boxes(state.previous, self.segmentation)
+            fit = tested & ~in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), previous).any(axis=0)
+        if np.count_nonzero(fit) < MIN_OUTSIDE:
+            fit = tested
+        stats: dict[str, Number] = {
+            "matches": np.count_nonzero(fit),
+            "lost": np.count_nonzero(lost),
+            "boxes": len(boxes),
+            "f_asked": 1,
+        }
+        distance = matches.distances(fit, settings.inlier_px)
+        if distance is None:
+            return self.verdict(keep, failed=1, **stats)
+        limit = np.where(in_box, settings.inside_px, settings.outside_px if settings.test_outside else np.inf)
+        keep[tested] = (distance <= limit)[tested]
+        return self.verdict(keep, f_judged=1, **stats)
+
+
+class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
+    """B15, class, depth and epipolar line (SEG-SLAM): drops people, and points on movable objects that fail a test.
+
+    The setting ``unmatched`` decides about a feature on a movable object whose flow failed.
+    Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``, ``lost`` (features whose flow failed).
+    """
+
+    name = "class_rule"
+    needs: frozenset[Need] = frozenset({"masks", "flow", "previous", "depth"})
+    provenance: Provenance = "inspired"
+    stats_names = ("dropped", "on_people", "on_movable", "moving_objects", "lost", "f_asked", "f_judged")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Drop by class first, then test movable objects by geometry."""
+        settings, xy = self.settings, frame.keypoints.xy
+        keep, none = np.ones(len(xy), dtype=bool), np.zeros(len(xy), dtype=bool)
+        matches = matches_by_flow(frame, state, settings.unmatched)
+        stats: dict[str, Number] = {"f_asked": matches is not None, "on_movable": 0, "moving_objects": 0}
+        if frame.instances is None or not len(frame.instances):
+            return self.verdict(keep, **stats)
+        people = dynamic_mask(frame.instances, self.segmentation, frame.depth)
+        keep &= ~inside(people, xy)
+        stats["on_people"] = np.count_nonzero(~keep)
+        movable = select(frame.instances, self.segmentation.model_copy(update={"classes": settings.movable}))
+        off_line, tested, lost = none, none, none
+        if matches is not None:
+            lost = state.keep & ~matches.valid
+            distance = matches.distances(matches.tested & keep & ~inside(movable.union(), xy))
+            if distance is not None:
+                off_line, tested = distance > settings.threshold_px, matches.tested
+        stats |= {"lost": np.count_nonzero(lost), "f_judged": tested.any()}
+        for mask in movable.masks:
+            on_object = inside(mask, xy) & keep
+            stats["on_movable"] += np.count_nonzero(on_object)
+            voters = on_object & tested
+            drop = on_object & (off_line | lost) if settings.unmatched == "drop" else on_object & off_line
+            if voters.any() and off_line[voters].mean() >= settings.vote_share:
+                stats["moving_objects"] += 1
+                depth = frame.depth[mask]
+                depth = depth[np.isfinite(depth) & (depth > 0)]
+                if len(depth):
+                    drop |= on_object & (np.abs(frame.z - np.median(depth)) < settings.depth_m)
+            keep &= ~drop
+        return self.verdict(keep, people, **stats)

@@ -44,12 +44,11 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         """Count for each point the keyframes that measured beyond it."""
         recent = [view for view in state.keyframes if frame.timestamp - view.timestamp <= MAX_AGE_S]
         keyframes = [view for view in recent if view.depth is not None][:KEYFRAMES]
-        rows = np.flatnonzero(frame.z > 0)
+        xy, rows = frame.keypoints.xy, np.flatnonzero(frame.z > 0)
         if state.T_world_pred is None or not keyframes or not len(rows):
-            return FilterResult.of(np.ones(len(frame), dtype=bool), {"asked": 0.0, "tested": 0.0})
+            return self.verdict(np.ones(len(xy), dtype=bool))
         points = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
-        votes = np.zeros(len(frame), dtype=int)
-        tested = np.zeros(len(frame), dtype=bool)
+        votes, tested = np.zeros(len(xy), dtype=int), np.zeros(len(xy), dtype=bool)
         for view in keyframes:
             violated, observed = self._violations(view, points, state.camera)
             votes[rows] += violated
@@ -57,8 +56,8 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         compared = {id(view.depth) for view in keyframes}
         self._nearest = {image: depths for image, depths in self._nearest.items() if image in compared}
         violating = votes >= min(self.settings.min_votes, len(keyframes))
-        moving = coherent(violating, tested, frame.keypoints.xy, self.settings.min_share, frame.gray.shape)
-        return FilterResult.of(~moving, {"asked": float(len(keyframes)), "tested": float(np.count_nonzero(tested))})
+        moving = coherent(violating, tested, xy, self.settings.min_share, frame.gray.shape)
+        return self.verdict(~moving, asked=len(keyframes), tested=np.count_nonzero(tested))
 
     def _violations(
         self, view: KeyframeView, points: NDArray[np.float64], camera: Camera

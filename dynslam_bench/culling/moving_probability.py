@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import ObjectRule
-from dynslam_bench.culling.matches import link_to_previous
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.geometry.camera import Camera, inside
@@ -55,37 +54,50 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Update the probabilities by this frame's masks."""
-        link = link_to_previous(frame, state, self.settings.link_px)
-        if state.previous is None or len(self._probability) != len(state.previous):
+        settings, xy = self.settings, frame.keypoints.xy
+        link = link_to_previous(frame, state, settings.link_px)
+        if state.previous is None or len(self._probability) != len(state.previous.xy):
             link[:] = -1
-        prior = np.full(len(link), UNKNOWN)
-        prior[link >= 0] = self._probability[link[link >= 0]]
-        if self.settings.expand_px > 0:
-            prior = expand(frame.keypoints.xy, prior, link >= 0, self.settings.expand_px)
+        linked = link >= 0
+        moving = np.full(len(link), UNKNOWN)
+        moving[linked] = self._probability[link[linked]]
+        if settings.expand_px > 0:
+            moving = expand(xy, moving, linked, settings.expand_px)
         if frame.instances is not None:
-            prior = self._update(prior, self._observe(frame))
-        self._probability = prior
-        mean = float(prior.mean()) if len(prior) else UNKNOWN
-        verdict = FilterResult.of(
-            prior <= self.settings.threshold,
-            {"linked": float(np.count_nonzero(link >= 0)), "mean_probability": mean},
-        )
-        if self.settings.soft:
-            return replace(verdict, weight=np.where(verdict.keep, 1 - prior, 0).astype(np.float32))
+            if self._boxes:
+                on_object = in_boxes(xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
+            else:
+                on_object = inside(dynamic_mask(frame.instances, self.segmentation, frame.depth), xy)
+            if settings.rule == "average":
+                moving = (1 - RATE) * moving + RATE * on_object
+            else:
+                likelihood = np.where(on_object, HIT, 1 - HIT)
+                evidence = likelihood * moving
+                moving = (evidence / (evidence + (1 - likelihood) * (1 - moving))).clip(0.01, 0.99)
+        self._probability = moving
+        mean = moving.mean() if len(moving) else UNKNOWN
+        verdict = self.verdict(moving <= settings.threshold, linked=np.count_nonzero(linked), mean_probability=mean)
+        if settings.soft:
+            return replace(verdict, weight=np.where(verdict.keep, 1 - moving, 0).astype(np.float32))
         return verdict
 
-    def _observe(self, frame: FrameBundle) -> NDArray[np.bool_]:
-        assert frame.instances is not None
-        if self._boxes:
-            return np.asarray(in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self.segmentation)).any(axis=0))
-        return inside(dynamic_mask(frame.instances, self.segmentation, frame.depth), frame.keypoints.xy)
 
-    def _update(self, prior: NDArray[np.float64], on_mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-        if self.settings.rule == "average":
-            return (1 - RATE) * prior + RATE * on_mask
-        moving = np.where(on_mask, HIT, 1 - HIT)
-        posterior = moving * prior / (moving * prior + (1 - moving) * (1 - prior))
-        return np.asarray(posterior.clip(0.01, 0.99))
+def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 2.5) -> NDArray[np.intp]:
+    """Index of the previous frame's keypoint that each keypoint continues, ``[N]``; -1 for none.
+
+    Args:
+        frame: The current frame.
+        state: With the flow to the previous image.
+        radius_px: Largest distance between the end of the flow and an earlier keypoint.
+    """
+    link = np.full(len(frame.xy), -1, dtype=np.intp)
+    if state.flow is None or state.previous is None or not len(state.previous.xy):
+        return link
+    rows = np.flatnonzero(state.flow.valid & np.isfinite(state.flow.xy).all(axis=1))
+    distance, nearest = cKDTree(state.previous.keypoints.xy).query(state.flow.xy[rows], distance_upper_bound=radius_px)
+    near = np.isfinite(distance)
+    link[rows[near]] = np.asarray(nearest)[near]
+    return link
 
 
 def expand(

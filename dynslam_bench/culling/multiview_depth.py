@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import Number, Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.features.matching import CellGrid, as_words, search_in_radius
@@ -44,23 +44,29 @@ class MultiViewFilter(Rule[MultiViewSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Project the references' points into the frame and find the objects that hide them."""
-        keep = np.ones(len(frame), dtype=bool)
-        stats = {"references": 0.0, "seeds": 0.0, "mask_fraction": 0.0}
+        keep = np.ones(len(frame.xy), dtype=bool)
         if state.T_world_pred is None or len(state.keyframes) < self.settings.min_keyframes:
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep)
         pose = refine_by_matches(frame, state)
         assert pose is not None
         references = self._choose(state.keyframes, pose)
         depth = np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0)
         depth = np.ascontiguousarray(np.where((depth > 0) & (depth < MAX_DEPTH_M), depth, 0), dtype=np.float32)
         seeds = self._seeds(references, depth, pose, state.camera)
-        stats |= {"references": float(len(references)), "seeds": float(len(seeds))}
         if not len(seeds):
-            return FilterResult.of(keep, stats)
-        mask = self._region(seeds, depth)
-        stats["mask_fraction"] = float(mask.mean())
+            return self.verdict(keep, references=len(references))
+        region = np.zeros(depth.shape, np.uint8)
+        if self.settings.grow:
+            region = grow(depth, np.ascontiguousarray(seeds), GROW_M, BIN_M)
+        region[seeds[:, 1], seeds[:, 0]] = 1
+        mask = dilate(region.astype(bool), self.settings.dilation_px)
         dropped = inside(dilate(mask, self.settings.border_px), frame.keypoints.xy)
-        return FilterResult.of(~dropped, stats, mask)
+        stats: dict[str, Number] = {
+            "references": len(references),
+            "seeds": len(seeds),
+            "mask_fraction": float(mask.mean()),
+        }
+        return self.verdict(~dropped, mask, **stats)
 
     def _choose(self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]) -> list[KeyframeView]:
         """At most `references` keyframes by 0.7 normalised distance + 0.3 normalised rotation."""
@@ -91,19 +97,9 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         visible &= local[:, 2] < MAX_PROJECTED_DEPTH_M
         size = (camera.width - MARGIN_PX - 2, camera.height - MARGIN_PX - 2)
         visible &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
-        if not visible.any():
-            return np.zeros((0, 2), np.int64)
         centre = np.ceil(pixels[visible]).astype(np.int64)
         seeds = centre[hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)]
         return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
-
-    def _region(self, seeds: NDArray[np.int64], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-        if self.settings.grow:
-            mask = grow(depth, np.ascontiguousarray(seeds), GROW_M, BIN_M)
-        else:
-            mask = np.zeros(depth.shape, np.uint8)
-        mask[seeds[:, 1], seeds[:, 0]] = 1
-        return dilate(mask.astype(bool), self.settings.dilation_px)
 
 
 def _cosine(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -117,17 +113,14 @@ def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArra
 
     Missing depth counts as 0, as in the authors' code: no seed lies beside missing depth.
     """
-    if not len(xy):
-        return np.zeros(0)
     height, width = depth.shape
-    total, squares = cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
     (x0, y0), (x1, y1) = (xy - MARGIN_PX).clip(0).T, np.minimum(xy + MARGIN_PX + 1, (width, height)).T
-
-    def within(table: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
-        return np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64)
-
     n = (x1 - x0) * (y1 - y0)
-    return np.asarray(within(squares) / n - np.square(within(total) / n))
+    total, squares = (
+        np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64) / n
+        for table in cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    )
+    return np.asarray(squares - np.square(total))
 
 
 # Compiled loops of DynaSLAM's multi-view geometry: which projected points are hidden, and what hides them.
@@ -260,43 +253,31 @@ def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float =
     previous = state.previous
     if state.flow is not None or previous is None or state.T_world_prev is None or state.T_world_pred is None:
         return state.T_world_pred
-    trusted = np.ones(len(previous), dtype=bool) if state.previous_keep is None else state.previous_keep
-    rows = np.flatnonzero(trusted & (previous.z > 0))
+    trusted = previous.z > 0 if state.previous_keep is None else state.previous_keep & (previous.z > 0)
+    rows = np.flatnonzero(trusted)
     if len(rows) < MIN_MATCHES or np.count_nonzero(state.keep) < MIN_MATCHES:
         return state.T_world_pred
+    camera, xy = state.camera, np.ascontiguousarray(frame.xy, dtype=np.float64)
     T_cur_prev = se3.inverse(state.T_world_pred) @ state.T_world_prev
-    points = se3.transform(T_cur_prev, state.camera.unproject(previous.xy[rows], previous.z[rows]))
+    points = se3.transform(T_cur_prev, camera.unproject(previous.xy[rows], previous.z[rows]))
     rows, points = rows[points[:, 2] > 0.1], points[points[:, 2] > 0.1]
-    expected = np.asarray(state.camera.project(points), dtype=np.float64)
+    expected = np.asarray(camera.project(points), dtype=np.float64)
+    octave, before = (keypoints.octave.astype(np.int64) for keypoints in (frame.keypoints, previous.keypoints))
     for radius in (radius_px, 2 * radius_px):
-        match = _match(frame, state, rows, expected, radius)
-        matched = match >= 0
-        if np.count_nonzero(matched) >= MIN_MATCHES:
-            xy = np.full((len(frame), 2), np.nan, np.float32)
-            valid = np.zeros(len(frame), dtype=bool)
-            xy[match[matched]] = previous.keypoints.xy[rows[matched]]
-            valid[match[matched]] = True
-            matches = FlowResult(xy, valid, np.zeros(len(frame), np.float32))
+        match, _ = search_in_radius(
+            CellGrid.of(xy, camera.width, camera.height),
+            (xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors)),
+            state.keep,
+            (expected, np.full(len(rows), np.nan), np.full(len(rows), radius)),
+            (before[rows] - 1, before[rows] + 1),
+            as_words(previous.keypoints.descriptors[rows]),
+            max_distance=MAX_DISTANCE,
+        )
+        rows_matched, now = rows[match >= 0], match[match >= 0]
+        if len(now) >= MIN_MATCHES:
+            ends = np.full((len(xy), 2), np.nan, np.float32)
+            ends[now] = previous.keypoints.xy[rows_matched]
+            valid = np.isin(np.arange(len(xy)), now)
+            matches = FlowResult(ends, valid, np.zeros(len(xy), np.float32))
             return refine_prediction(frame, replace(state, flow=matches))
     return state.T_world_pred
-
-
-def _match(
-    frame: FrameBundle, state: FilterState, rows: NDArray[np.intp], expected: NDArray[np.float64], radius: float
-) -> NDArray[np.int64]:
-    """The current keypoint of each of the previous frame's `rows`, ``[M]``; -1 for none."""
-    assert state.previous is not None
-    xy = np.ascontiguousarray(frame.xy, dtype=np.float64)
-    octave = frame.keypoints.octave.astype(np.int64)
-    unknown = np.full(len(frame), np.nan)
-    before = state.previous.keypoints.octave[rows].astype(np.int64)
-    match, _ = search_in_radius(
-        CellGrid.of(xy, state.camera.width, state.camera.height),
-        (xy, unknown, octave, as_words(frame.keypoints.descriptors)),
-        state.keep,
-        (expected, np.full(len(rows), np.nan), np.full(len(rows), radius)),
-        (before - 1, before + 1),
-        as_words(state.previous.keypoints.descriptors[rows]),
-        max_distance=MAX_DISTANCE,
-    )
-    return match

@@ -34,7 +34,7 @@ class ReseedingFilter(Rule[ReseedingSettings]):
     name = "reseeding"
     needs: frozenset[Need] = frozenset()
     provenance: Provenance = "inspired"
-    stats_names = ("dropped", "static", "reseeded", "missing")
+    stats_names = ("static", "reseeded", "missing", "dropped")
 
     def __init__(self, settings: ReseedingSettings, features: FeatureSettings) -> None:
         super().__init__(settings)
@@ -44,21 +44,19 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         """Choose the features that are used."""
         static = state.keep
         used = self._choose(frame, static)
-        usual = self._choose(frame, np.ones(len(frame), dtype=bool))
-        stats = {
-            "static": float(np.count_nonzero(static)),
-            "reseeded": float(np.count_nonzero(used & ~usual)),
-            "missing": float(max(self.settings.budget - int(np.count_nonzero(used)), 0)),
-            "dropped": float(np.count_nonzero(static & ~used)),
-        }
-        keep = used | ~static  # features that earlier filters dropped are not judged again
-        return FilterResult(keep, keep.astype(np.float32), stats)
+        usual = self._choose(frame, np.ones(len(static), dtype=bool))
+        return self.verdict(
+            used | ~static,  # features that earlier filters dropped are not judged again
+            static=np.count_nonzero(static),
+            reseeded=np.count_nonzero(used & ~usual),
+            missing=max(self.settings.budget - int(np.count_nonzero(used)), 0),
+        )
 
     def _choose(self, frame: FrameBundle, allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """At most `budget` of the allowed features, bool ``[N]``, shared among levels and cells."""
         if np.count_nonzero(allowed) <= self.settings.budget:
             return allowed.copy()
-        chosen = np.zeros(len(frame), dtype=bool)
+        chosen = np.zeros(len(allowed), dtype=bool)
         octave = frame.keypoints.octave
         levels = max(self._features.levels, int(octave.max()) + 1)
         quotas = level_quotas(self.settings.budget, levels, self._features.scale_factor)
@@ -66,16 +64,11 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         for level in range(levels - 1, -1, -1):
             rows = np.flatnonzero((octave == level) & allowed)
             quota = quotas[level] + missing
-            picked = rows[self._spread(frame, rows, level, quota)]
+            xy = np.rint(frame.keypoints.xy[rows] / self._features.scale_factor**level - ORIGIN).clip(0)
+            column, row = (xy / self._features.cell_px).astype(np.int64).T
+            # ranks of the responses, so that equal ones stay equal and keep their order
+            strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(np.int16)
+            picked = rows[spread(row * (1 << 20) + column, strength, np.ones(len(rows), dtype=bool), quota)]
             missing = quota - len(picked)  # a coarse level's missing features are added to the next finer level
             chosen[picked] = True
         return chosen
-
-    def _spread(self, frame: FrameBundle, rows: NDArray[np.intp], level: int, quota: int) -> NDArray[np.int64]:
-        """Indices into `rows`, the strongest of every cell first."""
-        xy = np.rint(frame.keypoints.xy[rows] / self._features.scale_factor**level - ORIGIN).clip(0)
-        cell = (xy / self._features.cell_px).astype(np.int64)
-        # ranks of the responses, so that equal ones stay equal and keep their order
-        strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(np.int16)
-        cell_index = cell[:, 1] * (1 << 20) + cell[:, 0]
-        return spread(cell_index, strength, np.ones(len(rows), dtype=bool), quota)

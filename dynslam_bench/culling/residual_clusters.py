@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import inside
@@ -37,15 +37,14 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Cluster the image, warp it, classify the clusters."""
-        keep = np.ones(len(frame), dtype=bool)
-        stats = dict.fromkeys(("clusters", "moving", "mask_fraction"), 0.0)
+        keep = np.ones(len(frame.xy), dtype=bool)
         if state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep)
         rows, columns = np.mgrid[STEP // 2 : frame.depth.shape[0] : STEP, STEP // 2 : frame.depth.shape[1] : STEP]
         z = np.nan_to_num(frame.depth[rows, columns]).ravel()
         valid = z > 0
         if np.count_nonzero(valid) < 4 * self.settings.clusters:
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep)
         xy = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)[valid]
         residual = self._residual(frame, state, xy, z[valid])
         label = self._cluster(xy, z[valid], state.seed)
@@ -55,11 +54,14 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         moving = self._moving_clusters(residual, label, people)
         sampled = np.zeros(rows.size, dtype=np.uint8)
         sampled[valid] = moving[label]
-        size = (frame.depth.shape[1], frame.depth.shape[0])
+        size = frame.depth.shape[::-1]
         mask = cv2.resize(sampled.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-        stats |= {"clusters": float(len(moving)), "moving": float(np.count_nonzero(moving))}
-        stats["mask_fraction"] = float(mask.mean())
-        return FilterResult.of(~inside(mask, frame.keypoints.xy), stats, mask)
+        stats: dict[str, Number] = {
+            "clusters": len(moving),
+            "moving": np.count_nonzero(moving),
+            "mask_fraction": float(mask.mean()),
+        }
+        return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
 
     def _residual(
         self, frame: FrameBundle, state: FilterState, xy: NDArray[np.float64], z: NDArray[np.floating]

@@ -27,13 +27,12 @@ class SemanticFilter(Rule[SegmentationSettings]):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Drop what lies on the masks; without a segmenter, keep all."""
         if frame.instances is None or not len(frame.instances):
-            return FilterResult.of(np.ones(len(frame), bool), {"objects": 0.0, "mask_fraction": 0.0})
+            return self.verdict(np.ones(len(frame.xy), bool))
         mask = frame.mask
         if mask is None:
             mask = dynamic_mask(frame.instances, self.settings, depth=frame.depth)
-        keep = ~inside(mask, frame.keypoints.xy)
-        stats = {"objects": float(len(select(frame.instances, self.settings))), "mask_fraction": float(mask.mean())}
-        return FilterResult.of(keep, stats, mask)
+        objects = len(select(frame.instances, self.settings))
+        return self.verdict(~inside(mask, frame.keypoints.xy), mask, objects=objects, mask_fraction=mask.mean())
 
 
 # B2: drop the features inside the boxes of a-priori dynamic classes.

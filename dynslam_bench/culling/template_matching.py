@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
 from dynslam_bench.geometry import se3
@@ -29,7 +27,7 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
 
     def __init__(self, settings: TemplateSettings, segmentation: SegmentationSettings) -> None:
         super().__init__(settings, segmentation)
-        self._window: deque[tuple[NDArray[np.uint8], NDArray[np.float64]]] = deque()
+        self._window: list[tuple[NDArray[np.uint8], NDArray[np.float64]]] = []
 
     def reset(self, camera: Camera) -> None:
         """Forget the window."""
@@ -38,17 +36,16 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Compare patches; features in boxes without depth or history are dropped."""
         if state.previous is not None and state.T_world_prev is not None:
-            self._window.appendleft((state.previous.gray, state.T_world_prev))
-        while len(self._window) > self.settings.window:
-            self._window.pop()
-        boxed = in_boxes(frame.keypoints.xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
-        keep = np.asarray(~boxed)
-        rows = np.flatnonzero(boxed & (frame.z > 0))
-        stats = {"in_boxes": float(np.count_nonzero(boxed)), "tested": 0.0, "median_zncc": 0.0}
+            self._window = [(state.previous.gray, state.T_world_prev), *self._window]
+        self._window = self._window[: self.settings.window]
+        xy = frame.keypoints.xy
+        boxed = in_boxes(xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
+        keep, rows = np.asarray(~boxed), np.flatnonzero(boxed & (frame.z > 0))
+        stats: dict[str, Number] = {"in_boxes": float(np.count_nonzero(boxed))}
         if state.T_world_pred is None or not self._window or not len(rows):
-            return FilterResult.of(keep, stats)
+            return self.verdict(keep, **stats)
         world = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
-        current = patches(frame.gray, frame.keypoints.xy[rows].astype(np.float64), self.settings.patch_px)
+        current = patches(frame.gray, xy[rows].astype(np.float64), self.settings.patch_px)
         scores = np.full((len(self._window), len(rows)), np.nan)
         for number, (gray, pose) in enumerate(self._window):
             local = se3.transform(se3.inverse(pose), world)
@@ -60,9 +57,9 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
         median = np.full(len(rows), -1.0)
         median[tested] = np.nanmedian(scores[:, tested], axis=0)
         keep[rows] = median >= self.settings.zncc
-        stats["tested"] = float(np.count_nonzero(tested))
-        stats["median_zncc"] = float(np.median(median[tested])) if tested.any() else 0.0
-        return FilterResult.of(keep, stats)
+        if tested.any():
+            stats |= {"tested": np.count_nonzero(tested), "median_zncc": float(np.median(median[tested]))}
+        return self.verdict(keep, **stats)
 
 
 def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDArray[np.float64]:

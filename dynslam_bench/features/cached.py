@@ -40,7 +40,7 @@ class CachedExtractor:
         self._extractor = extractor
         self._cache = cache
         self._threads = threads
-        self._code = code_of(settings)
+        self._code = code_of(str(getattr(settings, "extractor", "orb")))
         self._address(settings)
         self.hit = False
         self.saved_s = 0.0
@@ -65,14 +65,12 @@ class CachedExtractor:
         entry = self._cache.get("features", key)
         self.hit = entry is not None
         if entry is not None:
-            stored = entry.arrays
-            keypoints = Keypoints(*(stored[name] for name in ("xy", "octave", "angle", "response", "descriptors")))
-            self.saved_s = entry.cost_s - (time.perf_counter() - begin)
-            return keypoints
-        start = time.perf_counter()
-        keypoints = compute()
-        cost = time.perf_counter() - start
-        self._cache.put("features", key, vars(keypoints), cost)
+            keypoints, cost = Keypoints(**entry.arrays), entry.cost_s
+        else:
+            start = time.perf_counter()
+            keypoints = compute()
+            cost = time.perf_counter() - start
+            self._cache.put("features", key, vars(keypoints), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
         return keypoints
 
@@ -96,17 +94,13 @@ def cached_extractor(
     return kind(extractor, settings, cache, threads)
 
 
-def code_of(settings: Settings) -> str:
-    """Digest of the code of the extractor that feature settings name: this package's, and a plug-in's own.
+@cache
+def code_of(extractor: str) -> str:
+    """Digest of the code of an extractor: this package's, and a plug-in's own.
 
     It is read once a process, when the plug-in is loaded: later edits of the file do not change the running code.
 
     Raises:
         PluginError: No such extractor, or its code cannot be read.
     """
-    return _code_behind(FEATURES.get(str(getattr(settings, "extractor", "orb"))).entry_point)
-
-
-@cache
-def _code_behind(entry_point: str) -> str:
-    return code_digest(entry_point, _PACKAGES)
+    return code_digest(FEATURES.get(extractor).entry_point, _PACKAGES)

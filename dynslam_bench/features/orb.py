@@ -49,16 +49,6 @@ class _Level:
     cells: NDArray[np.int64]
     n_cells: int
 
-    def choose(self, quota: int, threshold: int, allowed: NDArray[np.bool_] | None) -> NDArray[np.int64]:
-        """Indices of up to `quota` corners, spread over the cells; weak corners only in cells without a strong one."""
-        strong = self.response >= threshold
-        if allowed is not None:
-            strong = strong & allowed
-        filled = np.zeros(self.n_cells, bool)
-        filled[self.cells[strong]] = True
-        weak = ~filled[self.cells] if allowed is None else allowed & ~filled[self.cells]
-        return spread(self.cells, self.response, strong | weak, quota)
-
 
 class OrbExtractor:
     """Finds oriented FAST corners and describes them with rotated BRIEF (32 bytes).
@@ -101,49 +91,49 @@ class OrbExtractor:
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
         levels = self._levels(gray)
-        return self._describe(gray, levels, self._chosen(levels))
+        return self._describe(gray, levels, self._choose(levels, [np.ones(len(level.xy), bool) for level in levels]))
 
     def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
         """As `extract`; with less than a share of `n_features` outside the mask, all of them are extracted there."""
         levels = self._levels(gray)
-        chosen = self._chosen(levels)
+        chosen = self._choose(levels, [np.ones(len(level.xy), bool) for level in levels])
         outside = [~inside(mask, level.xy * level.scale) for level in levels]
         count = sum(np.count_nonzero(out[index]) for out, index in zip(outside, chosen, strict=True))
         if count < share * self.settings.n_features:
-            more = self._chosen(levels, outside)
-            triples = zip(outside, chosen, more, strict=True)
-            chosen = [np.concatenate([index[~out[index]], other]) for out, index, other in triples]
+            triples = zip(outside, chosen, self._choose(levels, outside), strict=True)
+            chosen = [np.concatenate([index[~out[index]], more]) for out, index, more in triples]
         return self._describe(gray, levels, chosen)
 
     def _levels(self, gray: NDArray[np.uint8]) -> list[_Level]:
         """All corners of every level of the pyramid."""
-        gray = np.ascontiguousarray(gray, dtype=np.uint8)
-        return [self._corners(image, self.settings.scale_factor**i) for i, image in enumerate(self._pyramid(gray))]
+        image = gray = np.ascontiguousarray(gray, dtype=np.uint8)
+        levels: list[_Level] = []
+        for number in range(self.settings.levels):
+            scale = self.settings.scale_factor**number
+            size = round(gray.shape[1] / scale), round(gray.shape[0] / scale)
+            if min(size) <= 2 * EDGE:
+                break
+            if number > 0:
+                image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+            levels.append(self._corners(image, scale))
+        return levels
 
-    def _chosen(
-        self, levels: Sequence[_Level], allowed: Sequence[NDArray[np.bool_]] | None = None
-    ) -> list[NDArray[np.int64]]:
-        """Indices of the chosen corners of every level, `n_features` in all, among the allowed ones."""
+    def _choose(self, levels: Sequence[_Level], allowed: Sequence[NDArray[np.bool_]]) -> list[NDArray[np.int64]]:
+        """Indices of up to `n_features` allowed corners, by level, spread over the cells of each.
+
+        A corner below the first threshold is taken only in a cell without a stronger one.
+        """
         quotas = level_quotas(self.settings.n_features, len(levels), self.settings.scale_factor)
         chosen: list[NDArray[np.int64]] = []
         missing = 0
-        for i in reversed(range(len(levels))):
-            among = None if allowed is None else allowed[i]
-            index = levels[i].choose(quotas[i] + missing, self.settings.fast_threshold, among)
-            missing += quotas[i] - len(index)  # a coarse level's missing features are added to the next finer level
-            chosen.append(index)
+        for level, quota, among in list(zip(levels, quotas, allowed, strict=True))[::-1]:
+            strong = among & (level.response >= self.settings.fast_threshold)
+            filled = np.zeros(level.n_cells, bool)
+            filled[level.cells[strong]] = True
+            eligible = strong | among & ~filled[level.cells]
+            chosen.append(spread(level.cells, level.response, eligible, quota + missing))
+            missing += quota - len(chosen[-1])  # a coarse level's missing features are added to the next finer level
         return chosen[::-1]
-
-    def _pyramid(self, gray: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-        height, width = gray.shape
-        levels = [gray]
-        for level in range(1, self.settings.levels):
-            scale = self.settings.scale_factor**level
-            size = round(width / scale), round(height / scale)
-            if min(size) <= 2 * EDGE:
-                break
-            levels.append(np.asarray(cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8))
-        return levels if min(height, width) > 2 * EDGE else []
 
     def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
         inner = image[EDGE - 3 : image.shape[0] - EDGE + 3, EDGE - 3 : image.shape[1] - EDGE + 3]
@@ -158,15 +148,9 @@ class OrbExtractor:
     def _describe(
         self, gray: NDArray[np.uint8], levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]
     ) -> Keypoints:
-        count = sum(len(index) for index in chosen)
-        if count == 0:
-            return Keypoints(
-                np.zeros((0, 2), np.float32),
-                np.zeros(0, np.int32),
-                np.zeros(0, np.float32),
-                np.zeros(0, np.float32),
-                np.zeros((0, 32), np.uint8),
-            )
+        if not any(len(index) for index in chosen):
+            none = np.zeros(0, np.float32)
+            return Keypoints(none.reshape(0, 2), none.astype(np.int32), none, none, np.zeros((0, 32), np.uint8))
         pairs = list(zip(levels, chosen, strict=True))
         scales = np.array([level.scale for level in levels])
         octave = np.repeat(np.arange(len(levels), dtype=np.int32), [len(index) for index in chosen])
@@ -177,13 +161,8 @@ class OrbExtractor:
             [orientations(level.image, at, self._half_widths) for level, at in zip(levels, level_xy, strict=True)]
         )
         size = (2 * PATCH_RADIUS + 1) * scales[octave]
-        make = cv2.KeyPoint
-        points = [
-            make(x, y, s, a, r, o, i)
-            for i, ((x, y), s, a, r, o) in enumerate(
-                zip(xy.tolist(), size.tolist(), angle.tolist(), response.tolist(), octave.tolist(), strict=True)
-            )
-        ]
+        columns = (*xy.T, size, angle, response, octave, np.arange(len(xy)))
+        points = [cv2.KeyPoint(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
         kept, descriptors = self._describer.compute(np.ascontiguousarray(gray), points)
         if descriptors is None or not len(kept):
             return self._describe(gray, [], [])
@@ -193,12 +172,10 @@ class OrbExtractor:
 
 def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:
     """How many features each level gets: in proportion to its side length, `n_features` in all."""
-    if levels == 0:
-        return []
     shares = scale_factor ** -np.arange(levels, dtype=np.float64)
     quotas = np.floor(n_features * shares / shares.sum()).astype(int)
-    quotas[0] += n_features - int(quotas.sum())
-    return [int(quota) for quota in quotas]
+    quotas[:1] += n_features - quotas.sum()
+    return list(map(int, quotas))
 
 
 def spread(
@@ -258,12 +235,7 @@ def orientations(
                 m10 += dx * value
                 row += value
             m01 += dy * row
-        angle = math.degrees(math.atan2(float(m01), float(m10)))
-        if angle < 0.0:
-            angle += 360.0
-        if angle >= 360.0:
-            angle = 0.0
-        out[i] = angle
+        out[i] = math.degrees(math.atan2(float(m01), float(m10))) % 360.0
         if out[i] >= 360.0:  # rounded up by float32
             out[i] = 0.0
     return out

@@ -44,16 +44,14 @@ def is_degenerate(reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> bo
         raise ValueError(f"images must be uint8 [H, W], got {reference.dtype} {reference.shape} and {target.dtype}")
     if reference is target or not reference.size:
         return True
-    flat = any(int(image.max()) - int(image.min()) <= FLAT_RANGE for image in (reference, target))
-    return flat or bool(np.array_equal(reference, target))
+    flat = any(np.ptp(image) <= FLAT_RANGE for image in (reference, target))
+    return flat or np.array_equal(reference, target)
 
 
 def usable_points(points: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Finite points inside an image of shape ``(H, W)``."""
     height, width = shape[:2]
-    with np.errstate(invalid="ignore"):
-        inside = (points >= 0).all(axis=1) & (points <= (width - 1, height - 1)).all(axis=1)
-    return np.asarray(inside, dtype=np.bool_)
+    return np.asarray(((points >= 0) & (points <= (width - 1, height - 1))).all(axis=1))
 
 
 def clean_points(

@@ -20,13 +20,12 @@ from scipy.spatial import cKDTree
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, is_degenerate, usable_points
 from dynslam_bench.flow.dense_kernels import Superpixels, aggregate_and_choose, spread_labels, superpixels
-from dynslam_bench.flow.label_search import PROPAGATING
-from dynslam_bench.flow.matching_cost import MAX_COST, side, tables_for
+from dynslam_bench.flow.matching_cost import MAX_COST, cost_tables
 from dynslam_bench.flow.orientation_maps import OrientationMaps
-from dynslam_bench.flow.propagation import label_turns, transported_labels
+from dynslam_bench.flow.propagation import labels_as_seen
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
-from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 
 NEIGHBOURS = 9
 """Reliable regions that a regional motion is fitted to."""
@@ -42,17 +41,17 @@ class DenseFlow:
 
     Attributes:
         flow: float32 ``[H, W, 2]``, displacement (x, y) in pixels.
-        valid: bool ``[H, W]``, consistent with the flow of the other direction (all True without that check).
+        valid: bool ``[H, W]``, consistent with the flow of the other direction.
         cost: float32 ``[H, W]``, aggregated matching cost as a share of the largest possible.
         stats: Diagnostics.
-        back: float32 ``[H, W, 2]``, flow of every target pixel to the reference; None without the check.
+        back: float32 ``[H, W, 2]``, flow of every target pixel to the reference.
     """
 
     flow: NDArray[np.float32]
     valid: NDArray[np.bool_]
     cost: NDArray[np.float32]
     stats: dict[str, float]
-    back: NDArray[np.float32] | None = None
+    back: NDArray[np.float32]
 
 
 class DenseDaisyFlow:
@@ -99,15 +98,13 @@ class DenseDaisyFlow:
             return cleaned
         clean, usable = cleaned
         dense = self.flow(reference, target, seed=seed)
-        column, row = _pixels(clean)
-        xy = (clean + dense.flow[row, column]).astype(np.float32)
-        cost = dense.cost[row, column]
-        valid = usable & dense.valid[row, column] & usable_points(xy, target.gray.shape)
-        valid &= cost < MAX_COST
-        if self.settings.forward_backward_px > 0 and dense.back is not None:
+        pixel = _pixels(clean)
+        xy = (clean + dense.flow[pixel]).astype(np.float32)
+        cost = dense.cost[pixel]
+        valid = usable & dense.valid[pixel] & usable_points(xy, target.gray.shape) & (cost < MAX_COST)
+        if self.settings.forward_backward_px > 0:
             ends = np.where(valid[:, None], xy, clean)
-            column, row = _pixels(ends)
-            error = np.linalg.norm(ends + dense.back[row, column] - clean, axis=1)
+            error = np.linalg.norm(ends + dense.back[_pixels(ends)] - clean, axis=1)
             valid &= error <= self.settings.forward_backward_px
         stats = flow_stats(len(clean), int(valid.sum()), int(dense.stats["evaluations"]))
         return FlowResult(xy, valid, cost, stats)
@@ -120,31 +117,29 @@ class DenseDaisyFlow:
         shape = reference.gray.shape
         if is_degenerate(reference.gray, target.gray):
             stats = {"evaluations": 0.0, "valid": 0.0, "degenerate": 1.0}
-            no_cost = np.zeros(shape, np.float32)
-            return DenseFlow(np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_), no_cost, stats)
+            zero = np.zeros((*shape, 2), np.float32)
+            return DenseFlow(zero, np.zeros(shape, np.bool_), np.zeros(shape, np.float32), stats, zero)
+        tolerance = self.settings.consistency_px
         forward = _RegionLabels(self.settings, self._sparse, reference, target, seed)
-        flow, valid, back = forward.flow(), np.ones(shape, dtype=np.bool_), None
-        evaluations, tolerance = forward.evaluations, self.settings.consistency_px
-        if tolerance > 0:
-            backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
-            back = backward.flow()
-            if self.settings.second_round:
-                forward.try_regional_motion(consistent(flow, back, tolerance))
-                backward.try_regional_motion(consistent(back, flow, tolerance))
-                flow, back = forward.flow(), backward.flow()
-            valid = consistent(flow, back, tolerance)
-            fitted = fit_regional_motion(flow, valid, forward.regions, forward.half)
-            if fitted is not None:
-                flow = fill_and_smooth(flow, valid, fitted)
-            evaluations = forward.evaluations + backward.evaluations
+        backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
+        flow, back = forward.flow(), backward.flow()
+        if self.settings.second_round:
+            forward.try_regional_motion(consistent(flow, back, tolerance))
+            backward.try_regional_motion(consistent(back, flow, tolerance))
+            flow, back = forward.flow(), backward.flow()
+        valid = consistent(flow, back, tolerance)
+        fitted = fit_regional_motion(flow, valid, forward.regions, forward.half)
+        if fitted is not None:
+            flow = fill_and_smooth(flow, valid, fitted)
+        evaluations = forward.evaluations + backward.evaluations
         stats = {"evaluations": float(evaluations), "valid": float(valid.sum()), "degenerate": 0.0}
         return DenseFlow(flow, valid, forward.cost(), stats, back)
 
 
 def _pixels(points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Column and row of the pixels that contain points inside an image."""
+    """Row and column of the pixels that contain points inside an image."""
     column, row = np.rint(points).astype(np.intp).T
-    return column, row
+    return row, column
 
 
 class _RegionLabels:
@@ -162,66 +157,51 @@ class _RegionLabels:
         seed: int,
     ) -> None:
         self.settings, self._sparse = settings, sparse
-        shape = reference.gray.shape
-        self._pair = Pair(reference, target, tables_for(shape, sparse.settings))
+        self._pair = sparse.pair(reference, target)
         self.half = np.ascontiguousarray(reference.framed_half[BORDER:-BORDER, BORDER:-BORDER])
         self.regions = superpixels(self.half, max(2, settings.superpixel_px // 2))
         self.centres = self.regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
-        self.evaluations = 0
-        self._tables = tables_for(shape, sparse.settings.model_copy(update={"support": 1}))
+        self._tables = cost_tables(reference.gray.shape, settings.terms)
         self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
-        self._search(seed)
-
-    def _search(self, seed: int) -> None:
-        sparse, pair, centres = self._sparse, self._pair, self.centres
+        pair, centres = self._pair, self.centres
         neighbours = sparse.nearest(centres)
         described = sparse.describe(pair.reference, centres, pair.tables)
         state = sparse.search(described, pair, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
-        if self.settings.refinement == "lucas-kanade":
-            correlation = sparse.refine(centres, labels, pair)
-            if self.settings.search in PROPAGATING and neighbours.shape[1] > 1:
-                sparse.neighbour_consensus(centres, labels, correlation, neighbours, pair)
-        elif self.settings.refinement == "parabola":
-            sparse.parabola(described, labels, pair, state.used)
-        self.evaluations += int(state.used.sum())
-        near = np.ascontiguousarray(neighbours[:, : self.settings.candidates - 1])
-        transported = np.empty((*near.shape, 4), dtype=np.float32)
-        extent, no_motion = np.full((len(labels), 4), 8.0, dtype=np.float32), np.empty((0, 4), dtype=np.float32)
-        sources = (centres, labels, label_turns(labels), near, no_motion)
-        transported_labels(0, len(labels), *sources, -extent, extent, transported)
-        self._choose(np.concatenate([labels[:, None], transported], axis=1))
+        if settings.refinement == "lucas-kanade":
+            sparse.refine_together(centres, labels, neighbours, pair)
+        self.evaluations = int(state.used.sum())
+        near = np.ascontiguousarray(neighbours[:, : settings.candidates - 1])
+        self._choose(np.concatenate([labels[:, None], labels_as_seen(centres, labels, near)], axis=1))
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
         """Try, on every region, the motion of the consistent regions around it, as fitted and refined."""
         fitted = fit_regional_motion(self.flow(), valid, self.regions, self.half)
         if fitted is None:
             return
-        suggested = fitted.labels()
-        if self.settings.refinement != "lucas-kanade":
-            self._choose(np.ascontiguousarray(suggested[:, None]))
-            return
-        refined = suggested.copy()
-        self._sparse.refine(self.centres, refined, self._pair)
-        self._choose(np.stack([suggested, refined], axis=1))
+        candidates = [fitted.labels()]
+        if self.settings.refinement == "lucas-kanade":
+            candidates.append(candidates[0].copy())
+            self._sparse.refine(self.centres, candidates[1], self._pair)
+        self._choose(np.stack(candidates, axis=1))
 
     def _choose(self, candidates: NDArray[np.float32]) -> None:
         """Let every pixel take the best of its region's candidates ``[K, C, 4]``, if it beats the label it has."""
         evaluations = np.zeros(len(self.centres), dtype=np.int64)
         regions = (self.regions.members, self.regions.starts, self.centres, candidates)
-        sides = (side(self._pair.reference), side(self._pair.target), self._tables)
+        sides = (self._pair.reference.side, self._pair.target.side, self._tables)
         guide, radius = self.half.astype(np.float32) / np.float32(255), max(1, self.settings.filter_radius_px // 2)
         smoothing = (guide, radius, np.float32(self.settings.filter_epsilon))
         chosen = (self._best, self._winner, evaluations)
-        self._sparse.workers.run(aggregate_and_choose, len(self.centres), *regions, *sides, *smoothing, *chosen)
+        self._sparse.workers.run(aggregate_and_choose, 0, len(self.centres), *regions, *sides, *smoothing, *chosen)
         self.evaluations += int(evaluations.sum())
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
         height, width = self._pair.reference.gray.shape
         flow = np.empty((height, width, 2), dtype=np.float32)
-        self._sparse.workers.run(spread_labels, height, self._winner, self.regions.labels, self.centres, flow)
+        self._sparse.workers.run(spread_labels, 0, height, self._winner, self.regions.labels, self.centres, flow)
         return flow
 
     def cost(self) -> NDArray[np.float32]:

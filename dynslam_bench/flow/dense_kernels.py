@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.flow.matching_cost import CostTables, Side, appearance, describe_once, descriptor_distance, quantised
+from dynslam_bench.flow.matching_cost import CostTables, appearance, describe_once, descriptor_distance, quantised
+from dynslam_bench.flow.orientation_maps import Side
 from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs
 
 
@@ -179,8 +180,8 @@ def aggregate_and_choose(
         starts: `Superpixels.starts`.
         centres: float32 ``[K, 2]``, full-image pixels.
         candidates: float32 ``[K, C, 4]``, labels around the centres; NaN means none.
-        reference: `matching_cost.Side`.
-        target: `matching_cost.Side`.
+        reference: `orientation_maps.Side`.
+        target: `orientation_maps.Side`.
         tables: `matching_cost.CostTables` without support.
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
         radius: Of the guided filter, half-resolution pixels.

@@ -6,7 +6,6 @@ The layout is DAISY Filter Flow's: radius 16 px, two rings of eight histograms a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -47,19 +46,6 @@ SUBPIXEL = 4
 """Positions are quantised to a quarter of a pixel before the map is indexed."""
 
 
-@dataclass(frozen=True, eq=False)
-class SamplingTable:
-    """Integer sampling pattern of all quantised labels.
-
-    Attributes:
-        offsets: int32 ``[SCALES, ROTATIONS, HISTOGRAMS, 2]``, displacement (x, y) from the centre in quarter pixels.
-        ring_level: int32 ``[SCALES, RINGS]``, map level of each ring at each scale.
-    """
-
-    offsets: NDArray[np.int32]
-    ring_level: NDArray[np.int32]
-
-
 def unit_pattern() -> NDArray[np.float64]:
     """The 17 sampling points of the unscaled, unrotated descriptor, ``[HISTOGRAMS, 2]`` px: centre, ring 0, ring 1."""
     angles = np.arange(ANGLES) * (2 * np.pi / ANGLES)
@@ -67,21 +53,22 @@ def unit_pattern() -> NDArray[np.float64]:
     return np.concatenate([np.zeros((1, 2)), *rings])
 
 
-def level_of(sigma: float) -> int:
-    """The map level whose Gaussian is closest to `sigma` in ratio."""
-    return int(np.argmin(np.abs(np.log(np.asarray(LEVEL_SIGMAS)) - np.log(sigma))))
+def sampling_table() -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """The pattern for every scale and rotation index: ``s * R(theta) * g_k`` (Eq. 1's D_{s,theta}).
 
-
-def sampling_table() -> SamplingTable:
-    """The pattern for every scale and rotation index: ``s * R(theta) * g_k`` (Eq. 1's D_{s,theta})."""
+    Returns:
+        int32 ``[SCALES, ROTATIONS, HISTOGRAMS, 2]``, displacement (x, y) from the centre in quarter pixels, and int64
+        ``[SCALES, RINGS]``, map level of each ring at each scale: the one whose Gaussian is closest in ratio.
+    """
     pattern = unit_pattern()
     scales = 2.0 ** (np.arange(SCALE_LOW, SCALE_HIGH + 1) * SCALE_STEP_OCTAVES)
     theta = np.deg2rad(np.arange(ANGLE_LOW, ANGLE_HIGH + 1) * ANGLE_STEP_DEG)
     c, s = np.cos(theta), np.sin(theta)
     rotation = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
     points = np.einsum("s,rij,kj->srki", scales, rotation, pattern)
-    levels = [[level_of(scale * sigma) for sigma in RING_SIGMAS] for scale in scales]
-    return SamplingTable(np.rint(points * SUBPIXEL).astype(np.int32), np.asarray(levels, dtype=np.int32))
+    sigmas = scales[:, None] * RING_SIGMAS
+    levels = np.abs(np.log(LEVEL_SIGMAS) - np.log(sigmas)[..., None]).argmin(axis=-1)
+    return np.rint(points * SUBPIXEL).astype(np.int32), levels
 
 
 class MapGeometry(NamedTuple):
@@ -102,23 +89,16 @@ class MapGeometry(NamedTuple):
     total: int
 
 
-def level_shape(height: int, width: int, step: int) -> tuple[int, int]:
-    """Rows and columns of a level with `step` full-image pixels a map pixel; an odd last row or column is dropped."""
-    for _ in range(int(np.log2(step))):
-        height, width = max(1, height // 2), max(1, width // 2)
-    return height, width
-
-
 @lru_cache(maxsize=16)
 def map_geometry(height: int, width: int) -> MapGeometry:
     """The arrangement of the seven levels for an image size in pixels."""
     levels, total = [], 0
     for step in LEVEL_STEPS:
-        rows, columns = level_shape(height, width, step)
+        rows, columns = max(1, height // step), max(1, width // step)  # an odd last row or column is dropped
         margin = MARGIN // step
         # full-image x (pixel centres at integers) lies in map pixel floor((x + 0.5) / step)
         shift, bias = int(np.log2(step * SUBPIXEL)), SUBPIXEL // 2 + margin * step * SUBPIXEL
         levels.append((total, columns + 2 * margin, shift, bias))
         total += (rows + 2 * margin) * (columns + 2 * margin)
-    table = np.array(levels, dtype=np.int64).T.copy()
-    return MapGeometry(table[0], table[1], table[2], table[3], total)
+    base, stride, shift, bias = np.array(levels, dtype=np.int64).T.copy()
+    return MapGeometry(base, stride, shift, bias, total)

@@ -18,13 +18,8 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.layout import map_geometry
-from dynslam_bench.flow.orientation_maps import OrientationMaps
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.orientation_maps import Side
 from dynslam_bench.flow.simd import Bytes, Floats, Ints, Longs, descriptor_sum
-
-Term = tuple[float, float]
-"""Weight and limit of a term of Eq. 1."""
 
 OUTSIDE = 1 << 20
 """Cost of a label that leaves the target image."""
@@ -32,9 +27,9 @@ MAX_COST = 0.75
 """Share of the largest cost above which a point is not valid."""
 TRUNCATION = 0.882
 """t of Eq. 1: largest L1 distance of one histogram of unit norm (not stated in the paper)."""
-INTENSITY: Term = (55.0, 7 / 255)
+INTENSITY = (55.0, 7 / 255)
 """alpha and t1 of Eq. 1, for images in [0, 1] (not stated in the paper)."""
-GRADIENT: Term = (190.0, 2 / 255)
+GRADIENT = (190.0, 2 / 255)
 """beta and t2 of Eq. 1, likewise."""
 
 
@@ -65,13 +60,6 @@ class CostTables(NamedTuple):
     ceiling: int
 
 
-class Side(NamedTuple):
-    """One image as the kernels see it: flat histogram bytes and grey levels."""
-
-    histograms: NDArray[np.uint8]
-    gray: NDArray[np.uint8]
-
-
 class Reference(NamedTuple):
     """The points as the kernels see them.
 
@@ -86,61 +74,39 @@ class Reference(NamedTuple):
     appearance: NDArray[np.int32]
 
 
-class MatchingCosts(NamedTuple):
-    """Arguments of the cost: points, target image, tables."""
-
-    reference: Reference
-    target: Side
-    tables: CostTables
-
-
-def side(maps: OrientationMaps) -> Side:
-    """The kernels' view of a prepared image."""
-    return Side(maps.histograms.reshape(-1), maps.gray)
-
-
-def tables_for(shape: tuple[int, ...], settings: FlowSettings) -> CostTables:
-    """The tables of an image's shape ``(H, W)`` under the settings' terms and support of Eq. 1."""
-    terms = (INTENSITY, GRADIENT) if settings.terms == 3 else ((0.0, 0.0), (0.0, 0.0))
-    return cost_tables(shape[0], shape[1], *terms, settings.support, settings.support_spacing_px)
-
-
 @lru_cache(maxsize=32)
-def cost_tables(
-    height: int, width: int, grey_level: Term, slope: Term, support: int = 1, spacing: int = 4
-) -> CostTables:
-    """Tables for an image size and the weights of Eq. 1.
+def cost_tables(shape: tuple[int, int], terms: int = 1, support: int = 1, spacing: int = 4) -> CostTables:
+    """Tables for an image size and the terms and support of Eq. 1.
 
     Args:
-        height: Image height in pixels.
-        width: Image width in pixels.
-        grey_level: alpha and t1 (grey levels) of the grey-level term, for images in [0, 1].
-        slope: beta and t2 (grey levels a pixel) of the gradient term, likewise.
+        shape: Image height and width in pixels.
+        terms: 1 for the descriptors' term alone, 3 for grey level and gradient too.
         support: Number of points around p (1, 5 for a cross, 9 for a square).
         spacing: Their distance in pixels.
     """
-    (alpha, intensity_limit), (beta, gradient_limit) = grey_level, slope
-    pattern = layout.sampling_table()
-    geometry = map_geometry(height, width)
+    offsets, ring_level = layout.sampling_table()
+    geometry = layout.map_geometry(*shape)
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
-    level = np.repeat(pattern.ring_level, (9, 8), axis=1)  # [SCALES, 17]
+    level = np.repeat(ring_level, (9, 8), axis=1)  # [SCALES, 17]
     steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
     half_cell = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])[None, None, :, None, :]
-    cells = np.floor(half_cell + pattern.offsets[:, :, None] / (layout.SUBPIXEL * steps)).astype(np.int64)
+    cells = np.floor(half_cell + offsets[:, :, None] / (layout.SUBPIXEL * steps)).astype(np.int64)
     samples = 8 * (cells[..., 1] * geometry.stride[level][:, None, None, :] + cells[..., 0])
     grey = np.arange(256) / 255.0
     square = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)][:support]
-    intensity = np.rint(255 * alpha * np.minimum(grey, intensity_limit)).astype(np.int32)
-    gradient = np.rint(255 * beta * np.minimum(grey, gradient_limit)).astype(np.int32)
+    intensity, gradient = (
+        np.rint(255 * weight * np.minimum(grey, limit) * (terms == 3)).astype(np.int32)
+        for weight, limit in (INTENSITY, GRADIENT)
+    )
     limit = round(TRUNCATION * 255)
     return CostTables(
         samples.astype(np.int32),
-        np.ascontiguousarray(per_level[pattern.ring_level[:, 0]]),
-        np.ascontiguousarray(per_level[pattern.ring_level[:, 1]]),
+        per_level[ring_level[:, 0]],
+        per_level[ring_level[:, 1]],
         limit,
         intensity,
         gradient,
-        bool(intensity.any() or gradient.any()),
+        terms == 3,
         np.asarray(square, dtype=np.int64) * spacing,
         support * (layout.HISTOGRAMS * limit + int(intensity.max()) + int(gradient.max())),
     )
@@ -327,9 +293,9 @@ def parabola(
         stop: One past the last.
         labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
         step: Pixels.
-        reference: `matching_cost.Reference`.
-        target: `matching_cost.Side`.
-        tables: `matching_cost.CostTables`.
+        reference: `Reference`.
+        target: `orientation_maps.Side`.
+        tables: `CostTables`.
         used: int64 ``[N]``, cost evaluations, counted on.
     """
     far = np.int64(1 << 40)

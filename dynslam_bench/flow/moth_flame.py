@@ -1,9 +1,8 @@
 """The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
 
-All searches take them from here: the batched torch search (`torch_flow`), the compiled label search (`search_kernels`,
-which reads `flight_table`, `spiral_table` and `cauchy_table`) and the Optuna sampler (`dynslam_bench.tuning.samplers`).
-`xp` is numpy or torch. Moths and flames are arrays of any leading shape with the dimensions of the problem last;
-`uniform(shape)` draws from [0, 1).
+All searches take them from here: the compiled label search (`label_search`, which reads `flight_table`, `spiral_table`
+and `cauchy_table`) and the Optuna sampler (`dynslam_bench.tuning.samplers`). Moths and flames are arrays of any leading
+shape with the dimensions of the problem last; `uniform(shape)` draws from [0, 1).
 """
 
 from __future__ import annotations
@@ -91,23 +90,20 @@ def flight(progress: Any, rules: MothFlameRules) -> Flight:
     return Flight(r - 1, share * a, share * (1 - a), stepping)
 
 
-def spiral(xp: Any, distance: Any, t: Any) -> Any:
+def spiral(distance: Any, t: Any) -> Any:
     """``D e^(b t) cos(2 pi t)`` of Eq. 8 and 12, with b = 1."""
-    return distance * xp.exp(t) * xp.cos(2 * np.pi * t)
+    return distance * np.exp(t) * np.cos(2 * np.pi * t)
 
 
-def cauchy(xp: Any, uniform: Any) -> Any:
+def cauchy(uniform: Any) -> Any:
     """A Cauchy number ``tan(pi (U - 1/2))`` (Eq. 14-16, g = 1)."""
-    return xp.tan(np.pi * (uniform - 0.5))
+    return np.tan(np.pi * (uniform - 0.5))
 
 
-def moth_positions(
-    xp: Any, moths: Any, own: Any, flames: Any, best: Any, now: Flight, scale: Any, uniform: Uniform
-) -> Any:
+def moth_positions(moths: Any, own: Any, flames: Any, best: Any, now: Flight, scale: Any, uniform: Uniform) -> Any:
     """New positions: a spiral around the flame, attraction to the best flame, a Cauchy step (Eq. 8, 10, 12, 13, 17).
 
     Args:
-        xp: numpy or torch.
         moths: Where they are.
         own: Flames of their own number, which the distance is taken from.
         flames: The flames they fly around: their own, or the last that is left (Eq. 8).
@@ -118,46 +114,16 @@ def moth_positions(
     """
     t = now.span * uniform(moths.shape) + 1  # Eq. 10
     goal = now.own * flames + now.best * best if now.best else flames  # Eq. 17
-    position = spiral(xp, xp.abs(own - moths), t) + goal  # Eq. 8, 12
+    position = spiral(np.abs(own - moths), t) + goal  # Eq. 8, 12
     if now.stepping:
-        position = position + cauchy(xp, uniform(moths.shape)) * scale  # Eq. 13
+        position = position + cauchy(uniform(moths.shape)) * scale  # Eq. 13
     return position
 
 
-def population_positions(
-    xp: Any,
-    moths: Any,
-    flames: Any,
-    iteration: int,
-    iterations: int,
-    rules: MothFlameRules,
-    scale: Any,
-    uniform: Uniform,
-) -> Any:
-    """New positions of whole populations in iteration 1..T: `moth_positions` with its coefficients (Eq. 8-18).
-
-    Args:
-        xp: numpy or torch.
-        moths: ``[B, N, D]``, where B populations are.
-        flames: ``[B, N, D]``, their flames, best first.
-        iteration: Its number, from 1.
-        iterations: T.
-        rules: Which equations are in force.
-        scale: Of the Cauchy steps, per dimension.
-        uniform: Draws.
-    """
-    population = flames.shape[1]
-    last = int(flame_counts(population, iterations, rules)[iteration - 1]) - 1
-    around = flames[:, [min(number, last) for number in range(population)]]  # Eq. 8, 11
-    now = flight(iteration / iterations, rules)
-    return moth_positions(xp, moths, flames, around, flames[:, :1], now, scale, uniform)
-
-
-def opposites(xp: Any, members: Any, least: Any, greatest: Any, low: Any, high: Any, uniform: Uniform) -> Any:
+def opposites(members: Any, least: Any, greatest: Any, low: Any, high: Any, uniform: Uniform) -> Any:
     """Elite opposition-based learning (Eq. 19-22).
 
     Args:
-        xp: numpy or torch.
         members: Of the population.
         least: Lower dynamic bounds of the population (dy of Eq. 20).
         greatest: Upper dynamic bounds (dz).
@@ -167,7 +133,7 @@ def opposites(xp: Any, members: Any, least: Any, greatest: Any, low: Any, high: 
     """
     opposite = uniform((*members.shape[:-1], 1)) * (least + greatest) - members  # Eq. 19
     outside = (opposite < low) | (opposite > high)
-    return xp.where(outside, low + (high - low) * uniform(members.shape), opposite)  # Eq. 21-22
+    return np.where(outside, low + (high - low) * uniform(members.shape), opposite)  # Eq. 21-22
 
 
 class FlightTable(NamedTuple):
@@ -190,6 +156,7 @@ class FlightTable(NamedTuple):
     opposition: bool
 
 
+@lru_cache(maxsize=64)
 def flight_table(population: int, iterations: int, rules: MothFlameRules) -> FlightTable:
     """The flights of T iterations, computed in float32."""
     last = np.float32(iterations)
@@ -203,10 +170,10 @@ def flight_table(population: int, iterations: int, rules: MothFlameRules) -> Fli
 def spiral_table() -> NDArray[np.float32]:
     """`spiral` of distance 1 for t in [-2, 2), 1,024 steps a unit."""
     t = SPIRAL_LOW + (np.arange(4 * SPIRAL_STEPS) + 0.5) / SPIRAL_STEPS
-    return np.asarray(spiral(np, 1.0, t), dtype=np.float32)
+    return np.asarray(spiral(1.0, t), dtype=np.float32)
 
 
 @lru_cache(maxsize=1)
 def cauchy_table() -> NDArray[np.float32]:
     """`cauchy` for 4,096 values of U."""
-    return np.asarray(cauchy(np, (np.arange(CAUCHY_STEPS) + 0.5) / CAUCHY_STEPS), dtype=np.float32)
+    return np.asarray(cauchy((np.arange(CAUCHY_STEPS) + 0.5) / CAUCHY_STEPS), dtype=np.float32)

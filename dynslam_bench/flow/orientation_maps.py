@@ -13,15 +13,17 @@ they share twice.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import inlined, kernel
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.layout import MapGeometry, level_shape, map_geometry
-from dynslam_bench.flow.refinement import BORDER, pad_image
+from dynslam_bench.flow.layout import MapGeometry, map_geometry
+from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.simd import (
     Bytes,
     Halves,
@@ -33,16 +35,58 @@ from dynslam_bench.flow.simd import (
     store_normalised,
     store_uint16,
 )
-from dynslam_bench.flow.workers import BufferPool, Workers
+from dynslam_bench.flow.workers import Workers
 
 NORM_FLOOR = 0.01 * 255.0
 """Added to a histogram's norm before dividing, so that flat regions stay near zero (0.01 for images in [0, 1])."""
 FIXED_POINT = 256
 """Units a grey level in the blurred derivatives."""
+Arrays = tuple[NDArray[np.uint8], ...]
 RING = 16
 """Lines stored of each level; a power of two above twice the farthest tap."""
 SPILL = 64
 """Numbers that vector code may access beyond a line's end."""
+
+
+def _references(arrays: Arrays) -> int:
+    """The largest number of references to one of a set's arrays, this function's own included."""
+    return max(sys.getrefcount(array) for array in arrays)
+
+
+_UNREFERENCED = _references((np.zeros(1, dtype=np.uint8),))
+"""Of a set that only its tuple refers to."""
+
+
+class BufferPool:
+    """Sets of zeroed uint8 arrays, reused once nothing else refers to any of them or to a view.
+
+    The first access to a page of fresh memory costs more than computing its content (`docs/flow.md`, Speed). A reused
+    set keeps its old content: callers must not write where they rely on zeros.
+
+    Args:
+        most: Sets kept at most; older ones are left to the garbage collector.
+    """
+
+    def __init__(self, most: int = 4) -> None:
+        self._most = most
+        self._sets: list[Arrays] = []
+
+    def take(self, *shapes: tuple[int, ...]) -> Arrays:
+        """Arrays of these shapes: a used set where one is free, else new ones, zeroed."""
+        for number, arrays in enumerate(self._sets):
+            if tuple(array.shape for array in arrays) == shapes and _references(arrays) <= _UNREFERENCED:
+                self._sets.append(self._sets.pop(number))  # the longest unused first
+                return tuple([*arrays])  # a tuple of its own, so that its holder counts as a reference
+        fresh = tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
+        self._sets = [*self._sets, fresh][-self._most :]
+        return tuple([*fresh])
+
+
+class Side(NamedTuple):
+    """One image as the kernels see it: flat histogram bytes and grey levels."""
+
+    histograms: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +97,16 @@ class OrientationMaps:
         gray: uint8 ``[H, W]``, the image.
         framed: uint8 ``[H + 96, W + 96]``, the image with its edges repeated (`refinement.BORDER`).
         framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, likewise.
-        histograms: uint8 ``[total, 8]``, all levels; a unit-norm histogram has Euclidean length 255.
-        geometry: How to index them.
+        histograms: uint8 ``[total, 8]``, all levels as `layout.map_geometry` arranges them; a unit-norm histogram has
+            Euclidean length 255.
+        side: Histograms and image for the kernels.
     """
 
     gray: NDArray[np.uint8]
     framed: NDArray[np.uint8]
     framed_half: NDArray[np.uint8]
     histograms: NDArray[np.uint8]
-    geometry: MapGeometry
+    side: Side
 
 
 def orientation_maps(
@@ -74,11 +119,11 @@ def orientation_maps(
         workers: Threads over which rows are divided; None for the calling thread alone.
         buffers: Reuses the memory of maps that are no longer referenced; None allocates.
     """
-    workers, buffers = workers or Workers(), buffers or BufferPool()
+    run, buffers = (workers or Workers()).run, buffers or BufferPool()
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
-    (rows, columns), (quarter_rows, quarter_columns) = level_shape(height, width, 2), level_shape(height, width, 4)
+    (rows, quarter_rows), (columns, quarter_columns) = ((max(1, n // 2), max(1, n // 4)) for n in gray.shape)
     histograms, whole, half = buffers.take(
         (geometry.total, layout.BINS),
         (height + 2 * BORDER, width + 2 * BORDER),
@@ -89,11 +134,19 @@ def orientation_maps(
     blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)
     fine = layout.LEVEL_STEPS.count(2)
     cells = histograms.reshape(-1)
-    workers.run(fine_levels, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
-    workers.run(coarse_levels, quarter_rows, coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells)
-    pad_image(half[BORDER : BORDER + rows, BORDER : BORDER + columns], BORDER, half)
-    pad_image(gray, BORDER, whole)
-    return OrientationMaps(gray, whole, half, histograms, geometry)
+    run(fine_levels, 0, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
+    run(coarse_levels, 0, quarter_rows, coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells)
+    whole[BORDER:-BORDER, BORDER:-BORDER] = gray
+    for framed in (half, whole):
+        repeat_edges(framed)
+    return OrientationMaps(gray, whole, half, histograms, Side(cells, gray))
+
+
+def repeat_edges(framed: NDArray[np.uint8]) -> None:
+    """Fill the border of an image, `BORDER` wide, with its outermost pixels."""
+    rows = framed[BORDER:-BORDER]
+    rows[:, :BORDER], rows[:, -BORDER:] = rows[:, BORDER : BORDER + 1], rows[:, -BORDER - 1 : -BORDER]
+    framed[:BORDER], framed[-BORDER:] = rows[0], rows[-1]
 
 
 @inlined

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.flow.search_kernels import advance, scrambled
+from dynslam_bench.flow.label_search import advance, scrambled
 from dynslam_bench.flow.simd import Flags, Floats, Longs
 
+NO_MOTION = np.empty((0, 4), dtype=np.float32)
 VOTERS = 256
 """Approximate number of points that vote on a hypothesis."""
 
@@ -78,6 +79,15 @@ def label_turns(labels: Floats) -> Floats:
         turns[i, 0] = np.float32(np.cos(labels[i, 3])) * scale
         turns[i, 1] = np.float32(np.sin(labels[i, 3])) * scale
     return turns
+
+
+def labels_as_seen(points: Floats, labels: Floats, neighbours: Longs, motions: Floats = NO_MOTION) -> Floats:
+    """`transported_labels` without bounds that matter, float32 ``[N, K + M, 4]``."""
+    count = len(points)
+    extent = np.full((count, 4), 8.0, dtype=np.float32)
+    out = np.empty((count, neighbours.shape[1] + len(motions), 4), dtype=np.float32)
+    transported_labels(0, count, points, labels, label_turns(labels), neighbours, motions, -extent, extent, out)
+    return out
 
 
 def common_motions(
@@ -235,40 +245,23 @@ def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, wid
             out[i, slot] = index[slot]
 
 
-@kernel
-def dissenting_labels(
-    predictions: Floats, labels: Floats, tolerance: Scalar, alternative: Floats, dissents: Flags
-) -> None:
+def dissenting_labels(predictions: Floats, labels: Floats, tolerance: Scalar) -> tuple[Floats, Flags]:
     """Find points whose neighbours agree with each other but not with the point, e.g. one period off on a texture.
 
     Args:
         predictions: float32 ``[N, K, 4]``, the neighbours' labels as seen from each point; NaN means none.
         labels: float32 ``[N, 4]``, the points' own labels.
         tolerance: Displacements this close agree, pixels.
-        alternative: float32 ``[N, 4]``, filled with the prediction on which most neighbours agree.
-        dissents: bool ``[N]``, filled: the prediction has more support than the point's own label.
+
+    Returns:
+        float32 ``[N, 4]``, the prediction on which most neighbours agree, and bool ``[N]``, whether it has more support
+        than the point's own label.
     """
-    limit = tolerance * tolerance
-    for i in range(len(labels)):
-        dissents[i] = False
-        own, most, choice = 0, 1, -1
-        for k in range(predictions.shape[1]):
-            u, v = predictions[i, k, 0], predictions[i, k, 1]
-            if not np.isfinite(u + v):
-                continue
-            du, dv = u - labels[i, 0], v - labels[i, 1]
-            if du * du + dv * dv < limit:
-                own += 1
-            support = 0
-            for other in range(predictions.shape[1]):
-                du, dv = predictions[i, other, 0] - u, predictions[i, other, 1] - v
-                if du * du + dv * dv < limit:
-                    support += 1
-            if support > most:
-                most, choice = support, k
-        if choice >= 0 and most > own:
-            du, dv = predictions[i, choice, 0] - labels[i, 0], predictions[i, choice, 1] - labels[i, 1]
-            if du * du + dv * dv >= limit:
-                dissents[i] = True
-                for j in range(4):
-                    alternative[i, j] = predictions[i, choice, j]
+    limit, (u, v) = tolerance * tolerance, np.moveaxis(predictions[:, :, :2], 2, 0)
+    du, dv = u[:, :, None] - u[:, None], v[:, :, None] - v[:, None]
+    support = np.count_nonzero(du * du + dv * dv < limit, axis=2)
+    du, dv = u - labels[:, :1], v - labels[:, 1:2]
+    away = du * du + dv * dv
+    choice = np.arange(len(labels)), support.argmax(axis=1)
+    most, own = support[choice], np.count_nonzero(away < limit, axis=1)
+    return predictions[choice], (most > 1) & (most > own) & (away[choice] >= limit)

@@ -39,16 +39,8 @@ class Window(NamedTuple):
     radius: int
     margin: int
     warps: int
-    iterations: int
-    tolerance: np.float32
-
-
-def pad_image(image: Bytes, margin: int, out: Bytes) -> None:
-    """Copy a uint8 image into the middle of `out`, unless it lies there, and repeat its edges over `margin` pixels."""
-    rows = out[margin:-margin]
-    rows[:, margin:-margin] = image
-    rows[:, :margin], rows[:, -margin:] = image[:, :1], image[:, -1:]
-    out[:margin], out[-margin:] = rows[0], rows[-1]
+    iterations: int = 3
+    tolerance: np.float32 = np.float32(0.03)
 
 
 @inlined

@@ -33,7 +33,7 @@ def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu
 
     Args:
         settings: Which flow, and its options; None for the defaults.
-        device: ``cpu`` uses the compiled kernels, any other torch device the batched torch path (DAISY only).
+        device: Where a plug-in may compute; the built-in flows use the processor.
         threads: Processor threads; results do not depend on their number.
 
     Raises:
@@ -55,7 +55,7 @@ def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu
 
 
 def build_daisy(settings: FlowMethodSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
-    """DAISY Filter Flow, sparse or dense; the dense one on the processor, whatever the device."""
+    """DAISY Filter Flow, sparse or dense; on the processor, whatever the device."""
     if isinstance(settings, DenseFlowSettings):
         from dynslam_bench.flow.dense_flow import DenseDaisyFlow
 
@@ -64,8 +64,4 @@ def build_daisy(settings: FlowMethodSettings, *, device: str = "cpu", threads: i
 
     if not isinstance(settings, FlowSettings):  # a system with another flow by default: DAISY's own options are absent
         settings = FlowSettings(**settings.model_dump())
-    if device != "cpu":
-        from dynslam_bench.flow.torch_flow import TorchSparseFlow
-
-        return TorchSparseFlow(settings, device=device, threads=threads)
     return SparseDaisyFlow(settings, threads=threads)

@@ -63,9 +63,9 @@ class DaisySettings(FlowMethodSettings):
     terms: Literal[1, 3] = Field(
         1, description="terms of Eq. 1: the descriptors' alone, as in DAISY Filter Flow, or grey level and gradient too"
     )
-    refinement: Literal["none", "parabola", "lucas-kanade"] = Field(
+    refinement: Literal["none", "lucas-kanade"] = Field(
         "lucas-kanade",
-        description="sub-pixel step: none, a parabola through the costs, or a similarity Lucas-Kanade",
+        description="sub-pixel step: none, or a parabola through the costs and a similarity Lucas-Kanade",
     )
     refinement_window_px: int = Field(17, ge=5, le=41, description="side of the refinement's window, odd")
 
@@ -89,14 +89,9 @@ class DenseFlowSettings(DaisySettings):
     )
     sweeps: int = tunable(12, low=1, high=16, limits=(1, 32), meaning="times superpixels exchange their best labels")
     range_px: float = tunable(
-        160.0,
-        low=16.0,
-        high=256.0,
-        limits=(1.0, 1024.0),
-        scale="log",
-        unit="px",
+        160.0, low=16.0, high=256.0, limits=(1.0, 1024.0), scale="log", unit="px",
         meaning="largest displacement searched",
-    )
+    )  # fmt: skip
     superpixel_px: int = Field(12, ge=4, le=128, description="side of a superpixel")
     candidates: int = Field(
         5, ge=1, le=9, description="labels tried at each pixel: its superpixel's own and its neighbours'"
@@ -106,7 +101,7 @@ class DenseFlowSettings(DaisySettings):
         0.01, ge=1e-9, le=10.0, description="guided filter's regularisation, images in [0, 1] (Eq. 2)"
     )
     consistency_px: float = Field(
-        3.0, ge=0.0, le=100.0, description="largest forward-backward error of a consistent pixel; 0 disables the check"
+        3.0, gt=0.0, le=100.0, description="largest forward-backward error of a consistent pixel"
     )
     second_round: bool = Field(
         True, description="try on every region the motion that consistent regions nearby suggest"

@@ -80,17 +80,13 @@ class _Arithmetic(AbstractTemplate):
         return signature(FLOAT32X16, *arguments) if arguments == (FLOAT32X16, FLOAT32X16) else None
 
 
-def _define(symbol: Code, operation: str) -> None:
-    infer_global(symbol)(type(f"_Lanes_{operation}", (_Arithmetic,), {}))
+for _symbol, _operation in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    infer_global(_symbol)(type(f"_Lanes_{_operation}", (_Arithmetic,), {}))
 
-    def lowered(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+    def _lower(context: Code, builder: Code, kind: Code, arguments: Code, operation: str = _operation) -> Code:
         return getattr(builder, operation)(*arguments)
 
-    lower_builtin(symbol, SimdType, SimdType)(lowered)
-
-
-for _symbol, _operation in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
-    _define(_symbol, _operation)
+    lower_builtin(_symbol, SimdType, SimdType)(_lower)
 
 
 def pointer_to(context: Code, builder: Code, kind: Code, array: Code, index: Code, vector: ir.VectorType) -> Code:
@@ -99,50 +95,73 @@ def pointer_to(context: Code, builder: Code, kind: Code, array: Code, index: Cod
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
-def _float_constant(kind: ir.VectorType, value: float) -> Code:
-    return ir.Constant(kind, [value] * FLOAT_LANES)
+def constant(kind: ir.VectorType, value: float) -> Code:
+    """A vector constant of equal numbers."""
+    return ir.Constant(kind, [value] * kind.count)
+
+
+def _places(*places: int) -> Code:
+    """The constant that tells `shuffle_vector` which numbers to take."""
+    return ir.Constant(ir.VectorType(_INT32, len(places)), list(places))
+
+
+_EACH_EIGHT_TIMES = _places(*(pixel for pixel in range(4) for _ in range(8)))
 
 
 def splat(builder: Code, kind: ir.VectorType, value: Code) -> Code:
-    """Code for a vector of sixteen equal numbers."""
+    """Code for a vector of equal numbers."""
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT32, 0))
-    return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _float_constant(_INTS, 0))
+    return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _places(*([0] * kind.count)))
 
 
-@instruction
-def load(typing_context: Code, array: Code, index: Code) -> Definition:
-    """Sixteen adjacent numbers of a flat float32 array; nothing is checked."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS))
-        loaded.align = 4
-        return loaded
-
-    return FLOAT32X16(array, types.int64), generate
+def load_vector(
+    context: Code, builder: Code, kind: Code, array: Code, index: Code, vector: ir.VectorType, align: int
+) -> Code:
+    """Code that reads adjacent elements of an array from an index on."""
+    loaded = builder.load(pointer_to(context, builder, kind, array, index, vector))
+    loaded.align = align
+    return loaded
 
 
-@instruction
-def load_bytes(typing_context: Code, array: Code, index: Code) -> Definition:
-    """Sixteen adjacent numbers of a flat uint8 array, as floats; nothing is checked."""
+def _loading(result: SimdType, vector: ir.VectorType, align: int, convert: Callable[[Code, Code], Code]) -> Code:
+    """The instruction ``load(array, index)``; nothing is checked."""
 
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _BYTES16))
-        loaded.align = 1
-        return builder.sitofp(builder.zext(loaded, _INTS), _FLOATS)
+    def load(typing_context: Code, array: Code, index: Code) -> Definition:
+        def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+            array, index = arguments
+            return convert(builder, load_vector(context, builder, kind.args[0], array, index, vector, align))
 
-    return FLOAT32X16(array, types.int64), generate
+        return result(array, types.int64), generate
+
+    return instruction(load)
 
 
-@instruction
-def store(typing_context: Code, array: Code, index: Code, vector: Code) -> Definition:
-    """Write sixteen adjacent numbers of a flat float32 array; nothing is checked."""
+def _storing(value: SimdType, align: int) -> Code:
+    """The instruction ``store(array, index, vector)``; nothing is checked."""
 
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        pointer = pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _FLOATS)
-        builder.store(arguments[2], pointer, align=4)
-        return context.get_dummy_value()
+    def store(typing_context: Code, array: Code, index: Code, vector: Code) -> Definition:
+        def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+            array, index, vector = arguments
+            builder.store(vector, pointer_to(context, builder, kind.args[0], array, index, value.vector), align=align)
+            return context.get_dummy_value()
 
-    return types.void(array, types.int64, FLOAT32X16), generate
+        return types.void(array, types.int64, value), generate
+
+    return instruction(store)
+
+
+load = _loading(FLOAT32X16, _FLOATS, 4, lambda builder, loaded: loaded)
+"""Sixteen adjacent numbers of a flat float32 array."""
+load_bytes = _loading(
+    FLOAT32X16, _BYTES16, 1, lambda builder, loaded: builder.sitofp(builder.zext(loaded, _INTS), _FLOATS)
+)
+"""Sixteen adjacent numbers of a flat uint8 array, as floats."""
+load_uint16 = _loading(UINT16X32, _HALVES, 2, lambda builder, loaded: loaded)
+"""Thirty-two adjacent numbers of a flat uint16 array."""
+store = _storing(FLOAT32X16, 4)
+"""Write sixteen adjacent numbers of a flat float32 array."""
+store_uint16 = _storing(UINT16X32, 2)
+"""Write thirty-two adjacent numbers of a flat uint16 array."""
 
 
 @instruction
@@ -163,13 +182,8 @@ def total(typing_context: Code, vector: Code) -> Definition:
         rest, width = arguments[0], FLOAT_LANES
         while width > 1:
             width //= 2
-            parts = [
-                builder.shuffle_vector(
-                    rest, rest, ir.Constant(ir.VectorType(_INT32, width), list(range(first, first + width)))
-                )
-                for first in (0, width)
-            ]
-            rest = builder.fadd(*parts)
+            halves = (builder.shuffle_vector(rest, rest, _places(*range(k, k + width))) for k in (0, width))
+            rest = builder.fadd(*halves)
         return builder.extract_element(rest, ir.Constant(_INT32, 0))
 
     return types.float32(vector), generate
@@ -200,20 +214,18 @@ def sample(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         pixels, stride, columns, rows, at, column, row, step_x, step_y = arguments
-        grid = []
-        for k, array in ((2, columns), (3, rows)):
-            loaded = builder.load(pointer_to(context, builder, kind.args[k], array, at, _INTS))
-            loaded.align = 4
-            grid.append(loaded)
+        grid = [
+            load_vector(context, builder, kind.args[k], array, at, _INTS, 4) for k, array in ((2, columns), (3, rows))
+        ]
         dx, dy = (splat(builder, _INTS, step) for step in (step_x, step_y))
         x = builder.add(splat(builder, _INTS, column), builder.mul(grid[0], dx))
         x = builder.sub(x, builder.mul(grid[1], dy))
         y = builder.add(splat(builder, _INTS, row), builder.mul(grid[0], dy))
         y = builder.add(y, builder.mul(grid[1], dx))
-        sixteen, low = _float_constant(_INTS, 16), _float_constant(_INTS, 65535)
+        sixteen, low = constant(_INTS, 16), constant(_INTS, 65535)
         whole = [builder.ashr(value, sixteen) for value in (x, y)]
         share = [
-            builder.fmul(builder.sitofp(builder.and_(value, low), _FLOATS), _float_constant(_FLOATS, 1 / 65536))
+            builder.fmul(builder.sitofp(builder.and_(value, low), _FLOATS), constant(_FLOATS, 1 / 65536))
             for value in (x, y)
         ]
         offset = builder.add(builder.mul(whole[1], splat(builder, _INTS, stride)), whole[0])
@@ -230,51 +242,19 @@ def sample(
         lines = []
         for pair in pairs:
             both = builder.zext(pair, _INTS)
-            left = builder.sitofp(builder.and_(both, _float_constant(_INTS, 255)), _FLOATS)
-            right = builder.sitofp(builder.lshr(both, _float_constant(_INTS, 8)), _FLOATS)
+            left = builder.sitofp(builder.and_(both, constant(_INTS, 255)), _FLOATS)
+            right = builder.sitofp(builder.lshr(both, constant(_INTS, 8)), _FLOATS)
             lines.append(builder.fadd(left, builder.fmul(share[0], builder.fsub(right, left))))
         return builder.fadd(lines[0], builder.fmul(share[1], builder.fsub(lines[1], lines[0])))
 
     return FLOAT32X16(image, types.int32, columns, rows, types.int64, *([types.int32] * 4)), generate
 
 
-def _mask(places: list[int]) -> Code:
-    return ir.Constant(ir.VectorType(_INT32, len(places)), places)
-
-
-def _vector(element: Code, values: Code) -> Code:
-    return ir.Constant(ir.VectorType(element, len(values)), list(values))
-
-
 def _average(builder: Code, first: Code, second: Code) -> Code:
     wide = ir.VectorType(_INT32, UINT16_LANES)
     total = builder.add(builder.zext(first, wide), builder.zext(second, wide))
-    one = _vector(_INT32, [1] * UINT16_LANES)
+    one = constant(wide, 1)
     return builder.trunc(builder.lshr(builder.add(total, one), one), _HALVES)
-
-
-@instruction
-def load_uint16(typing_context: Code, array: Code, index: Code) -> Definition:
-    """Thirty-two adjacent numbers of a flat uint16 array; nothing is checked."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _HALVES))
-        loaded.align = 2
-        return loaded
-
-    return UINT16X32(array, types.int64), generate
-
-
-@instruction
-def store_uint16(typing_context: Code, array: Code, index: Code, halves: Code) -> Definition:
-    """Write thirty-two adjacent numbers of a flat uint16 array; nothing is checked."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        pointer = pointer_to(context, builder, kind.args[0], arguments[0], arguments[1], _HALVES)
-        builder.store(arguments[2], pointer, align=2)
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, UINT16X32), generate
 
 
 @instruction
@@ -293,7 +273,7 @@ def average_of_pairs(typing_context: Code, first: Code, second: Code) -> Definit
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         parts = [
-            builder.shuffle_vector(*arguments, _mask([16 * pair + odd + b for pair in range(4) for b in range(8)]))
+            builder.shuffle_vector(*arguments, _places(*(16 * pair + odd + b for pair in range(4) for b in range(8))))
             for odd in (0, 8)
         ]
         return _average(builder, *parts)
@@ -320,20 +300,17 @@ def derivatives(typing_context: Code, sums: Code, here: Code, above: Code, below
         four, wide = ir.VectorType(_UINT16, 4), ir.VectorType(_INT32, 4)
 
         def pixels(index: Code) -> Code:
-            loaded = builder.load(pointer_to(context, builder, kind.args[0], arguments[0], index, four))
-            loaded.align = 2
-            return builder.zext(loaded, wide)
+            return builder.zext(load_vector(context, builder, kind.args[0], arguments[0], index, four, 2), wide)
 
         one = ir.Constant(ir.IntType(64), 1)
         gx = builder.sub(pixels(builder.add(arguments[1], one)), pixels(builder.sub(arguments[1], one)))
         gy = builder.sub(pixels(arguments[3]), pixels(arguments[2]))
-        spread = _mask([pixel for pixel in range(4) for _ in range(8)])
-        gx, gy = (builder.shuffle_vector(g, g, spread) for g in (gx, gy))
-        sines = [COSINES[(b - 2) % 8] for b in range(8)]
-        along = builder.add(builder.mul(gx, _vector(_INT32, COSINES * 4)), builder.mul(gy, _vector(_INT32, sines * 4)))
-        rounded = builder.add(along, _vector(_INT32, [1 << (DERIVATIVE_SHIFT - 1)] * UINT16_LANES))
-        value = builder.ashr(rounded, _vector(_INT32, [DERIVATIVE_SHIFT] * UINT16_LANES))
-        zero = _vector(_INT32, [0] * UINT16_LANES)
+        gx, gy = (builder.shuffle_vector(g, g, _EACH_EIGHT_TIMES) for g in (gx, gy))
+        cosines, sines = (_places(*(COSINES[(b - turn) % 8] for b in range(UINT16_LANES))) for turn in (0, 2))
+        along = builder.add(builder.mul(gx, cosines), builder.mul(gy, sines))
+        rounded = builder.add(along, constant(cosines.type, 1 << (DERIVATIVE_SHIFT - 1)))
+        value = builder.ashr(rounded, constant(cosines.type, DERIVATIVE_SHIFT))
+        zero = constant(cosines.type, 0)
         return builder.trunc(builder.select(builder.icmp_signed(">", value, zero), value, zero), _HALVES)
 
     return UINT16X32(sums, types.int64, types.int64, types.int64), generate
@@ -345,35 +322,24 @@ def store_normalised(typing_context: Code, array: Code, index: Code, halves: Cod
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         array, index, halves, floor = arguments
-        wide = builder.zext(halves, ir.VectorType(_INT32, UINT16_LANES))
-        squares, count = builder.mul(wide, wide), UINT16_LANES
-        while count > 4:
-            parts = [builder.shuffle_vector(squares, squares, _mask(list(range(odd, count, 2)))) for odd in (0, 1)]
-            squares, count = builder.add(*parts), count // 2
+        ints, many = ir.VectorType(_INT32, UINT16_LANES), ir.VectorType(_FLOAT, UINT16_LANES)
+        wide = builder.zext(halves, ints)
+        squares = builder.mul(wide, wide)
+        for count in (32, 16, 8):
+            parts = (builder.shuffle_vector(squares, squares, _places(*range(odd, count, 2))) for odd in (0, 1))
+            squares = builder.add(*parts)
         floats = ir.VectorType(_FLOAT, 4)
         root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(floats, [floats]), "llvm.sqrt.v4f32")
         norm = builder.call(root, [builder.sitofp(squares, floats)])
-        spread = _mask([pixel for pixel in range(4) for _ in range(8)])
-        first = builder.insert_element(ir.Constant(floats, ir.Undefined), floor, ir.Constant(_INT32, 0))
-        floors = builder.shuffle_vector(first, first, _mask([0] * 4))
-        gain = builder.fdiv(_vector(_FLOAT, [255.0] * 4), builder.fadd(norm, floors))
-        gains = builder.shuffle_vector(gain, gain, spread)
-        scaled = builder.fmul(builder.sitofp(wide, ir.VectorType(_FLOAT, UINT16_LANES)), gains)
-        rounded = builder.fptosi(
-            builder.fadd(scaled, _vector(_FLOAT, [0.5] * UINT16_LANES)), ir.VectorType(_INT32, UINT16_LANES)
-        )
-        builder.store(
-            builder.trunc(rounded, _BYTES32),
-            pointer_to(context, builder, kind.args[0], array, index, _BYTES32),
-            align=1,
-        )
+        gain = builder.fdiv(constant(floats, 255.0), builder.fadd(norm, splat(builder, floats, floor)))
+        gains = builder.shuffle_vector(gain, gain, _EACH_EIGHT_TIMES)
+        scaled = builder.fmul(builder.sitofp(wide, many), gains)
+        rounded = builder.fptosi(builder.fadd(scaled, constant(many, 0.5)), ints)
+        pointer = pointer_to(context, builder, kind.args[0], array, index, _BYTES32)
+        builder.store(builder.trunc(rounded, _BYTES32), pointer, align=1)
         return context.get_dummy_value()
 
     return types.void(array, types.int64, UINT16X32, types.float32), generate
-
-
-def _repeated(element: Code, value: int, count: int) -> Code:
-    return ir.Constant(ir.VectorType(element, count), [value] * count)
 
 
 def _histogram_distances(builder: Code, first: Code, second: Code, count: int) -> Code:
@@ -383,10 +349,10 @@ def _histogram_distances(builder: Code, first: Code, second: Code, count: int) -
     above = builder.icmp_unsigned(">", first, second)
     total = builder.sub(builder.select(above, first, second), builder.select(above, second, first))
     for bits in (8, 16, 32):  # add neighbours until a histogram is one number
-        element, lanes = ir.IntType(2 * bits), 8 * count * 8 // (2 * bits)
-        total = builder.bitcast(total, ir.VectorType(element, lanes))
-        low = builder.and_(total, _repeated(element, (1 << bits) - 1, lanes))
-        total = builder.add(low, builder.lshr(total, _repeated(element, bits, lanes)))
+        pairs = ir.VectorType(ir.IntType(2 * bits), 32 * count // bits)
+        total = builder.bitcast(total, pairs)
+        low = builder.and_(total, constant(pairs, (1 << bits) - 1))
+        total = builder.add(low, builder.lshr(total, constant(pairs, bits)))
     return total
 
 
@@ -434,9 +400,7 @@ def descriptor_sum(
             own = builder.load(builder.bitcast(builder.gep(mine, [ir.Constant(_INT64, 8 * first)]), lanes.as_pointer()))
             own.align = 1
             distances = _histogram_distances(builder, theirs, own, count)
-            limit = ir.Constant(lanes, ir.Undefined)
-            for k in range(count):
-                limit = builder.insert_element(limit, truncation, ir.Constant(_INT32, k))
+            limit = splat(builder, lanes, truncation)
             below = builder.icmp_unsigned("<", distances, limit)
             kept = builder.select(below, distances, limit)
             for k in range(count):

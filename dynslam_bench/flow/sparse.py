@@ -13,43 +13,37 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result
-from dynslam_bench.flow.label_search import PROPAGATING, Phase, Plan, make_plan, phase_runner
+from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result, usable_points
+from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, new_state, run_phase
 from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
-    MatchingCosts,
     Reference,
+    cost_tables,
     describe,
     parabola,
     reference_appearance,
-    side,
-    tables_for,
 )
-from dynslam_bench.flow.orientation_maps import OrientationMaps, orientation_maps
+from dynslam_bench.flow.orientation_maps import BufferPool, OrientationMaps, orientation_maps
 from dynslam_bench.flow.propagation import (
     common_motions,
     dissenting_labels,
     label_turns,
+    labels_as_seen,
     nearest_neighbours,
     transported_labels,
 )
 from dynslam_bench.flow.refinement import Window, similarity_lucas_kanade
-from dynslam_bench.flow.search_kernels import SearchState, new_state
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.workers import BufferPool, Workers
+from dynslam_bench.flow.workers import Workers
 
 VOTE = (192, np.float32(5.0))
 """Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
 NEIGHBOUR_WINDOW = 40
 """Points compared on each side, in the order of x, to find the nearest neighbours."""
 PARABOLA_STEP_PX = np.float32(2.0)
-COARSE = (7, 3, 2)
-"""Radius, margin and warps of the refinement at half resolution."""
-FINE_MARGIN, FINE_WARPS, BACK_MARGIN = 2, 2, 3
-ITERATIONS = 3
-"""Most translation steps a warp of the refinement."""
-TOLERANCE_PX = np.float32(0.03)
+COARSE = Window(step=2, radius=7, margin=3, warps=2)
+"""The refinement at half resolution."""
 MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
 
 
@@ -101,52 +95,47 @@ class SparseDaisyFlow:
         cleaned = clean_points(reference.gray, target.gray, points)
         if isinstance(cleaned, FlowResult):
             return cleaned
-        clean, usable = cleaned
+        xy, usable = cleaned
         if not usable.any():
-            return invalid_result(clean, degenerate=False)
-        pair = Pair(reference, target, tables_for(reference.gray.shape, self.settings))
-        if usable.all():
-            return self._track(pair, clean, guess, seed)
-        inner = self._track(pair, clean[usable], None if guess is None else guess[usable], seed)
-        xy, valid, cost = clean, np.zeros(len(clean), np.bool_), np.ones(len(clean), np.float32)
-        xy[usable], valid[usable], cost[usable] = inner.xy, inner.valid, inner.cost
-        return FlowResult(xy, valid, cost, {**inner.stats, "points": float(len(clean))})
-
-    def _track(
-        self, pair: Pair, points: NDArray[np.float32], guess: NDArray[np.float32] | None, seed: int
-    ) -> FlowResult:
-        settings = self.settings
-        described = self.describe(pair.reference, points, pair.tables)
-        neighbours = self.nearest(points)
+            return invalid_result(xy, degenerate=False)
+        settings, points = self.settings, xy[usable]
+        pair = self.pair(reference, target)
+        if guess is not None:
+            guess = np.asarray(guess, dtype=np.float32).reshape(-1, 2)[usable]
+        described, neighbours = self.describe(reference, points, pair.tables), self.nearest(points)
         state = self.search(described, pair, neighbours, guess, seed)
-        labels, cost = state.flames[:, 0].copy(), state.costs[:, 0]
-        evaluations = state.used.copy()
-        if settings.refinement != "none":
-            self.parabola(described, labels, pair, evaluations)
-        valid = (cost < MAX_COST * pair.tables.ceiling) & (evaluations > 0)
+        labels, cost, evaluations = state.flames[:, 0].copy(), state.costs[:, 0], state.used
         if settings.refinement == "lucas-kanade":
-            correlation = self.refine(points, labels, pair)
-            if settings.search in PROPAGATING and len(points) > 2:
-                self.neighbour_consensus(points, labels, correlation, neighbours, pair)
-            valid &= correlation > settings.min_correlation
-        xy = points + labels[:, :2]
-        height, width = pair.target.gray.shape
-        valid &= (xy >= 0).all(axis=1) & (xy <= (width - 1, height - 1)).all(axis=1)
+            costs = (described, target.side, pair.tables)
+            self.workers.run(parabola, 0, len(points), labels, PARABOLA_STEP_PX, *costs, evaluations)
+        good = (cost < MAX_COST * pair.tables.ceiling) & (evaluations > 0)
+        if settings.refinement == "lucas-kanade":
+            good &= self.refine_together(points, labels, neighbours, pair) > settings.min_correlation
+        ends = points + labels[:, :2]
+        good &= usable_points(ends, target.gray.shape)
         if settings.forward_backward_px > 0:
-            rows = np.flatnonzero(valid)
-            error = self._forward_backward_error(points[rows], xy[rows], labels[rows], pair)
-            valid[rows] = error <= settings.forward_backward_px
-        stats = flow_stats(len(points), int(valid.sum()), int(evaluations.sum()))
-        return FlowResult(xy, valid, np.asarray(cost / pair.tables.ceiling, dtype=np.float32), stats)
+            rows = np.flatnonzero(good)
+            error = self._forward_backward_error(points[rows], ends[rows], labels[rows], pair)
+            good[rows] = error <= settings.forward_backward_px
+        valid, share = np.zeros(len(xy), np.bool_), np.ones(len(xy), np.float32)
+        xy[usable], valid[usable], share[usable] = ends, good, cost / pair.tables.ceiling
+        return FlowResult(xy, valid, share, flow_stats(len(xy), int(good.sum()), int(evaluations.sum())))
+
+    def pair(self, reference: OrientationMaps, target: OrientationMaps) -> Pair:
+        """Two images with the tables of the settings' terms and support of Eq. 1."""
+        settings, shape = self.settings, reference.gray.shape
+        return Pair(
+            reference, target, cost_tables(shape, settings.terms, settings.support, settings.support_spacing_px)
+        )
 
     def describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
         """What the search needs of the reference points: their rotated descriptors and appearance."""
         count, supports = len(points), len(tables.support)
         descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
-        self.workers.run(describe, count, points, side(image), tables, descriptors)
+        self.workers.run(describe, 0, count, points, image.side, tables, descriptors)
         appearance = np.zeros((count, supports, 2), dtype=np.int32)
         if tables.appearance:
-            reference_appearance(points, side(image), tables, appearance)
+            reference_appearance(points, image.side, tables, appearance)
         return Reference(points, descriptors, appearance)
 
     def nearest(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -155,13 +144,8 @@ class SparseDaisyFlow:
         neighbours = np.empty((n, min(MOST_NEIGHBOURS, n - 1)), dtype=np.int64)
         if n > 1:
             order = np.argsort(points[:, 0], kind="stable")
-            self.workers.run(nearest_neighbours, n, points[order], order, NEIGHBOUR_WINDOW, neighbours)
+            self.workers.run(nearest_neighbours, 0, n, points[order], order, NEIGHBOUR_WINDOW, neighbours)
         return neighbours
-
-    def _runner(self, plan: Plan, described: Reference, pair: Pair, state: SearchState, seed: int) -> Phase:
-        """The function that spends one phase's evaluations on all points."""
-        costs = MatchingCosts(described, side(pair.target), pair.tables)
-        return phase_runner(plan, self.settings, costs, state, seed, self.workers)
 
     def search(
         self,
@@ -176,11 +160,11 @@ class SparseDaisyFlow:
         Returns:
             The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
         """
-        settings, points = self.settings, described.points
+        settings, points, run = self.settings, described.points, self.workers.run
         n = len(points)
         start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
         if guess is not None:
-            offset = np.asarray(guess, dtype=np.float32).reshape(-1, 2) - points
+            offset = guess - points
             start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
         rotation = np.deg2rad(settings.rotation_range_deg)
         extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32)
@@ -188,85 +172,47 @@ class SparseDaisyFlow:
         plan = make_plan(settings)
         state = new_state(n, plan.population, lower, upper, pair.tables.ceiling)
         state.flames[:, :] = start
-        run = self._runner(plan, described, pair, state, seed)
-        run(0, start if plan.shrink > 0 else _with_zero_flow(start))
-        if settings.search in PROPAGATING:
-            neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
-            motions = np.full((2, 4), np.nan, dtype=np.float32)
-            candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
-            for number in range(1, len(plan.ends)):
+        candidates = start
+        if STRATEGIES[settings.search].shrink == 0:  # nothing is drawn: zero flow is tried beside the prediction
+            zero = np.where(start.any(axis=2, keepdims=True), np.float32(0), np.float32(np.nan))
+            candidates = np.concatenate([start, np.broadcast_to(zero, start.shape)], axis=1)
+        neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
+        motions = np.full((2, 4), np.nan, dtype=np.float32)
+        for phase, end in enumerate(plan.ends):
+            if phase > 0:
                 best = state.flames[:, 0].copy()
                 if settings.similarity_seeds:
-                    common_motions(points, best, state.costs[:, 0].copy(), *VOTE, np.uint64(seed + number), motions)
+                    common_motions(points, best, state.costs[:, 0].copy(), *VOTE, np.uint64(seed + phase), motions)
+                candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
                 sources = (points, best, label_turns(best), neighbours, motions)
-                self.workers.run(transported_labels, n, *sources, lower, upper, candidates)
-                run(number, candidates)
+                run(transported_labels, 0, n, *sources, lower, upper, candidates)
+            costs = (described, pair.target.side, pair.tables)
+            run(run_phase, 0, n, *costs, state, candidates, end, phase, np.uint64(seed), *plan.options)
         return state
 
-    def parabola(
-        self, described: Reference, labels: NDArray[np.float32], pair: Pair, evaluations: NDArray[np.int64]
-    ) -> None:
-        """Move labels in place to the lowest point of a parabola through the costs around them; counts evaluations."""
-        costs = (described, side(pair.target), pair.tables)
-        self.workers.run(parabola, len(labels), labels, PARABOLA_STEP_PX, *costs, evaluations)
-
-    def refine(self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
-        """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
-        reference, target = pair.reference, pair.target
-        self._align(
-            points, labels, reference.framed_half, target.framed_half, Window(2, *COARSE, ITERATIONS, TOLERANCE_PX)
-        )
-        window = self._window(FINE_MARGIN, FINE_WARPS)
-        return self._align(points, labels, reference.framed, target.framed, window)
-
-    def _window(self, margin: int, warps: int) -> Window:
-        """The window at full resolution."""
-        return Window(1, self.settings.refinement_window_px // 2, margin, warps, ITERATIONS, TOLERANCE_PX)
-
-    def _align(
-        self,
-        points: NDArray[np.float32],
-        labels: NDArray[np.float32],
-        template: NDArray[np.uint8],
-        target: NDArray[np.uint8],
-        window: Window,
+    def refine_together(
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], neighbours: NDArray[np.int64], pair: Pair
     ) -> NDArray[np.float32]:
-        correlation = np.empty(len(points), dtype=np.float32)
-        self.workers.run(similarity_lucas_kanade, len(points), points, labels, template, target, window, correlation)
-        return correlation
+        """Refine labels in place; where neighbours agree on another one, try that. Returns the correlation ``[N]``.
 
-    def neighbour_consensus(
-        self,
-        points: NDArray[np.float32],
-        labels: NDArray[np.float32],
-        correlation: NDArray[np.float32],
-        neighbours: NDArray[np.int64],
-        pair: Pair,
-    ) -> None:
-        """Try the label of agreeing neighbours, then the common motion, where it contradicts a point's own label.
-
-        The other label is taken where its refined correlation is as high: repetitive textures match one period off.
+        The label of agreeing neighbours, then the common motion, is taken where it contradicts a point's own label and
+        its refined correlation is as high: repetitive textures match one period off.
         """
-        n = len(points)
-        extent = np.full((n, 4), 8.0, dtype=np.float32)
-        turns, no_motion = label_turns(labels), np.empty((0, 4), np.float32)
-        predictions = np.empty((n, neighbours.shape[1], 4), dtype=np.float32)
-        transported_labels(0, n, points, labels, turns, neighbours, no_motion, -extent, extent, predictions)
-        alternative, dissents = np.empty((n, 4), dtype=np.float32), np.empty(n, dtype=np.bool_)
-        dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX), alternative, dissents)
+        correlation = self.refine(points, labels, pair)
+        if not STRATEGIES[self.settings.search].propagates or len(points) < 3:
+            return correlation
+        predictions = labels_as_seen(points, labels, neighbours)
+        alternative, dissents = dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX))
         self._take_better(points, labels, correlation, alternative, dissents, pair)
-        if not self.settings.similarity_seeds:
-            return
-        motions = np.empty((2, 4), dtype=np.float32)
-        doubt = np.rint(1000 * (1 - correlation)).astype(np.int64)
-        common_motions(points, labels, doubt, *VOTE, np.uint64(1), motions)
-        predictions = np.empty((n, 2, 4), dtype=np.float32)
-        no_neighbours = np.empty((n, 0), np.int64)
-        transported_labels(0, n, points, labels, turns, no_neighbours, motions, -extent, extent, predictions)
-        alternative = np.ascontiguousarray(predictions[:, 0])
-        with np.errstate(invalid="ignore"):
-            dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX
-        self._take_better(points, labels, correlation, alternative, dissents, pair)
+        if self.settings.similarity_seeds:
+            motions = np.empty((2, 4), dtype=np.float32)
+            doubt = np.rint(1000 * (1 - correlation)).astype(np.int64)
+            common_motions(points, labels, doubt, *VOTE, np.uint64(1), motions)
+            alternative = labels_as_seen(points, labels, np.empty((len(points), 0), np.int64), motions)[:, 0]
+            with np.errstate(invalid="ignore"):
+                dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX
+            self._take_better(points, labels, correlation, alternative, dissents, pair)
+        return correlation
 
     def _take_better(
         self,
@@ -279,25 +225,29 @@ class SparseDaisyFlow:
     ) -> None:
         """Replace labels in place where the alternative, refined, correlates as well."""
         rows = np.flatnonzero(dissents)
-        if not len(rows):
-            return
-        other = alternative[rows]
-        other_correlation = self.refine(points[rows], other, pair)
-        better = other_correlation > correlation[rows] - CONSENSUS_MARGIN
-        labels[rows[better]], correlation[rows[better]] = other[better], other_correlation[better]
+        if len(rows):
+            other = alternative[rows]
+            other_correlation = self.refine(points[rows], other, pair)
+            better = other_correlation > correlation[rows] - CONSENSUS_MARGIN
+            labels[rows[better]], correlation[rows[better]] = other[better], other_correlation[better]
+
+    def refine(self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
+        """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
+        reference, target = pair.reference, pair.target
+        correlation = np.empty(len(points), dtype=np.float32)
+        arguments = (similarity_lucas_kanade, 0, len(points), points, labels)
+        self.workers.run(*arguments, reference.framed_half, target.framed_half, COARSE, correlation)
+        window = Window(1, self.settings.refinement_window_px // 2, margin=2, warps=2)
+        self.workers.run(*arguments, reference.framed, target.framed, window, correlation)
+        return correlation
 
     def _forward_backward_error(
         self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
     ) -> NDArray[np.float32]:
         """Distance in pixels between each point and the end of its inverse label, refined in the other direction."""
-        inverse, ends = -labels, np.ascontiguousarray(xy)
-        self._align(ends, inverse, pair.target.framed, pair.reference.framed, self._window(BACK_MARGIN, 1))
+        inverse, correlation = -labels, np.empty(len(points), dtype=np.float32)
+        window = Window(1, self.settings.refinement_window_px // 2, margin=3, warps=1)
+        images = pair.target.framed, pair.reference.framed
+        self.workers.run(similarity_lucas_kanade, 0, len(xy), xy, inverse, *images, window, correlation)
         distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
         return distance
-
-
-def _with_zero_flow(start: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Start labels ``[N, 1, 4]`` and, where they are no zero flow, that too: ``[N, 2, 4]``, NaN means none."""
-    zero = np.zeros_like(start)
-    zero[~start.any(axis=2)] = np.nan
-    return np.concatenate([start, zero], axis=1)

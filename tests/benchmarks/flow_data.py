@@ -25,7 +25,6 @@ class Pair:
     """Two images and where points of the first lie in the second.
 
     `guess` is where the motion over the gap before the first image, kept up, takes the points; NaN without depth.
-    `start` is the first image's number in its recording.
     """
 
     name: str
@@ -34,7 +33,6 @@ class Pair:
     points: np.ndarray
     truth: np.ndarray
     guess: np.ndarray | None = None
-    start: int = 0
 
 
 def corners(gray: np.ndarray, count: int = 1000) -> np.ndarray:
@@ -235,9 +233,7 @@ def _motion(first: _Shot, second: _Shot, camera: Camera) -> np.ndarray | None:
     return motion if residual < 1.0 else None
 
 
-def real(
-    name: str, gaps: tuple[int, ...], every: int = 4, limit: int = 1000, starts: tuple[int, ...] = ()
-) -> list[Pair]:
+def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
     """Pairs of real frames; truth is depth and the relative pose, refined on ORB matches near the raw ground truth.
 
     Points whose depth in the second image contradicts the prediction (occluded, moved) are left out.
@@ -246,20 +242,17 @@ def real(
         name: Of `RECORDINGS`.
         gaps: Frames between the two images.
         every: First images are this far apart, further for wide gaps.
-        limit: Points a frame.
-        starts: First images, in place of `every`; then pairs also carry the motion model's guess, and those without
-            a known motion before are left out.
     """
     folder, camera = RECORDINGS[name]
     frames = _shots(folder)
     pairs = []
     for gap in gaps:
-        for start in starts or range(0, len(frames) - gap, every * max(1, gap // 2)):
+        for start in range(0, len(frames) - gap, every * max(1, gap // 2)):
             first, second = _read(frames[start]), _read(frames[start + gap])
             motion = _motion(first, second, camera)
             if motion is None:
                 continue
-            points = corners(first.gray, limit)
+            points = corners(first.gray)
             space, smooth = _lift(points, first.depth, camera)
             moved = space @ motion[:3, :3].T + motion[:3, 3]
             truth = camera.distort_points(camera.project(moved))
@@ -269,14 +262,7 @@ def real(
             seen &= (there > 0) & (abs(there - moved[:, 2]) < 0.04 * moved[:, 2])
             if seen.sum() < 50:
                 continue
-            before = _motion(_read(frames[start - gap]), first, camera) if starts else None
-            if starts and before is None:
-                continue
-            guess = None
-            if before is not None:  # constant velocity: the camera moves on as it did over the gap before
-                kept_up = camera.project(space[seen] @ before[:3, :3].T + before[:3, 3])
-                guess = camera.distort_points(kept_up).astype(np.float32)
-            pairs.append(Pair(f"{name} +{gap}", first.gray, second.gray, points[seen], truth[seen], guess, start))
+            pairs.append(Pair(f"{name} +{gap}", first.gray, second.gray, points[seen], truth[seen]))
     return pairs
 
 

@@ -1,11 +1,11 @@
 """What each part of the label search is worth: every search at equal budgets, with and without a guess, over strides.
 
-    PYTHONPATH=. python tests/benchmarks/flow_share.py [--instances 12] [--starts 40 100] [--budget 64] [--sets ...]
+    PYTHONPATH=. python tests/benchmarks/flow_share.py [--scenes 12] [--starts 40 100] [--budget 64]
 
 Every row uses the default settings but for the search (and the budget). A cell is the share of all points, valid or
 not, within `--within` pixels of the truth: mean +- standard deviation over the units; then the mean paired difference
-to `emfoa+propagation` with Student's 95 % interval over the units. A unit is an instance of a rendered sequence (its
-start offsets averaged), a first image of a recording, or, on the one KITTI pair, a seed of the search.
+to `emfoa+propagation` with Student's 95 % interval over the units. A unit is a scene of a rendered sequence, its start
+offsets averaged.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 
+import cv2
 import numpy as np
-from flow_accuracy import kitti_pair
-from flow_data import Pair, real
-from flow_rendered import rendered
+from flow_data import Pair, corners
 from scipy import stats
 
 from dynslam_bench.flow.label_search import STRATEGIES
 from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.geometry import se3
+from dynslam_bench.sequences.catalogue import open_sequence
 
+MOTIONS = ("walking_xyz", "walking_halfsphere", "walking_rpy")
+HIDDEN_PX = 1.0
+MARGIN_PX = 4
 BASE = "emfoa+propagation"
 STRIDES = (1, 2, 4, 6)
 FEWEST = 30
@@ -86,64 +90,63 @@ def table(title: str, rows: dict[str, FlowSettings], columns: dict[str, Units], 
         print(f"| {name} | {spent:.0f} | {' | '.join(cells)} |", flush=True)
 
 
-def rendered_sets(instances: int, starts: Sequence[int], strides: Sequence[int], points: int) -> dict[str, Units]:
-    """Held-out instances by stride."""
-    columns: dict[str, Units] = {f"stride {stride}": {} for stride in strides}
-    for instance in range(100, 100 + instances):
-        for start in starts:
-            for pair in rendered(instance, start, strides, points):
-                if len(pair.points) >= FEWEST:
-                    columns[f"stride {pair.name.split('+')[1]}"].setdefault(str(instance), []).append(pair)
-    return columns
+def rendered(scene: int, start: int, strides: Sequence[int], count: int) -> list[Pair]:
+    """Pairs ``(start, start + stride)`` of a rendered sequence; truth is the exact flow, also of what moves by itself.
 
+    Points lie on whole pixels. Those that leave the second image or are hidden there (exact flow there and back does
+    not return) are left out. The guess is the constant-velocity prediction from the exact poses at ``start - stride``
+    and ``start`` with the noisy depth, what a motion model at this frame rate would say; NaN where depth is missing.
 
-def recorded_sets(names: Sequence[str], points: int, every: int) -> dict[str, Units]:
-    """First images of recordings by stride."""
-    lengths = {"fr1_xyz": 100, "fr1_rpy": 40, "bonn": 180}
-    columns: dict[str, Units] = {}
-    for stride in STRIDES:
-        units = columns.setdefault(f"stride {stride}", {})
-        for name in names:
-            starts = tuple(range(stride, lengths[name] - stride - 3, every))
-            for pair in real(name, (stride,), limit=points, starts=starts):
-                units[f"{name} {pair.start}"] = [pair]
-    return columns
+    Args:
+        scene: 100-199 are held out.
+        start: Number of the first frame, at least the largest stride.
+        strides: Gaps in frames (30 a second).
+        count: Points a frame, before any is left out.
+    """
+    motion = MOTIONS[scene % len(MOTIONS)]
+    sequence = open_sequence(f"synthetic/{motion}?scene={scene}&frames={start + max(strides) + 1}")
+    frame, camera, poses = sequence[start], sequence.camera, sequence.ground_truth.T_world_cam
+    gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+    points = np.unique(np.rint(corners(gray, count)), axis=0).astype(np.float32)
+    column, row = points.astype(int).T
+    pairs = []
+    for stride in strides:
+        truth = points + sequence.flow(start, start + stride)[row, column]
+        inside = ((truth >= MARGIN_PX) & (truth < (camera.width - MARGIN_PX, camera.height - MARGIN_PX))).all(axis=1)
+        there = np.where(inside[:, None], truth, 0).astype(np.float32)
+        way_back = cv2.remap(sequence.flow(start + stride, start), *there.T[:, None], cv2.INTER_LINEAR)[0]
+        with np.errstate(invalid="ignore"):
+            seen = inside & (np.hypot(*(truth + way_back - points).T) < HIDDEN_PX)
+        kept_up = se3.inverse(poses[start]) @ poses[start - stride]  # T_next_now, as T_now_before was
+        z = frame.depth[row, column]
+        moved = se3.transform(kept_up, camera.unproject(points, np.maximum(z, 0.1)))
+        guess = np.where((z > 0)[:, None] & (moved[:, 2:] > 0.1), camera.project(moved), np.nan).astype(np.float32)
+        target = cv2.cvtColor(sequence[start + stride].rgb, cv2.COLOR_RGB2GRAY)
+        name = f"{motion}?scene={scene} +{stride}"
+        pairs.append(Pair(name, gray, target, points[seen], truth[seen], guess[seen], start))
+    return pairs
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--instances", type=int, default=12)
+    parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--starts", type=int, nargs="+", default=[40, 100])
-    parser.add_argument("--every", type=int, default=10, help="first images of recordings are so many frames apart")
     parser.add_argument("--points", type=int, default=400)
     parser.add_argument("--budget", type=int, default=FlowSettings().budget)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--within", type=float, default=3.0)
-    parser.add_argument("--sets", nargs="+", default=["rendered", "fr1", "bonn", "kitti"])
     options = parser.parse_args()
     names = sorted(STRATEGIES, key=lambda name: (name != BASE, not STRATEGIES[name].propagates))
     rows = {name: FlowSettings(search=name, budget=options.budget) for name in names}
-    sets: dict[str, dict[str, Units]] = {}
-    if "rendered" in options.sets:
-        sets["Rendered"] = rendered_sets(options.instances, options.starts, STRIDES, options.points)
-    if "fr1" in options.sets:
-        sets["TUM fr1_xyz, fr1_rpy"] = recorded_sets(("fr1_xyz", "fr1_rpy"), options.points, options.every)
-    if "bonn" in options.sets:
-        sets["Bonn crowd, static points"] = recorded_sets(("bonn",), options.points, options.every)
-    for title, columns in sets.items():
-        table(f"{title}, guess given", rows, columns, True, options)
-        table(f"{title}, no guess", rows, columns, False, options)
-    if "kitti" in options.sets:
-        pair, seeds = kitti_pair(), range(8)
-        columns = {"one pair, 8 seeds": {str(seed): [pair] for seed in seeds}}
-        measured = {
-            name: np.array([share(settings, pair, False, [seed], options.within)[0] for seed in seeds])
-            for name, settings in rows.items()
-        }
-        print(f"\n### KITTI, no guess\n\n| search | {next(iter(columns))} |\n| --- | --- |")
-        for name, values in measured.items():
-            print(f"| {name} | {paired(values, measured[BASE])} |")
+    columns: dict[str, Units] = {f"stride {stride}": {} for stride in STRIDES}
+    for scene in range(100, 100 + options.scenes):
+        for start in options.starts:
+            for pair, units in zip(rendered(scene, start, STRIDES, options.points), columns.values(), strict=True):
+                if len(pair.points) >= FEWEST:
+                    units.setdefault(str(scene), []).append(pair)
+    table("Rendered, guess given", rows, columns, True, options)
+    table("Rendered, no guess", rows, columns, False, options)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""Time of the sparse flow by stage, budget and thread count; of the dense flow; and time against iterations.
+"""Time of the sparse flow by budget and thread count, and of the dense flow.
 
-    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40] [--bars | --searches]
+    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40] [--bars]
 
 ``--bars`` prints the sparse mode at its defaults only: wall and processor time on one thread, wall time on two.
-``--searches`` prints time and correct tracks over the budget for each search.
 
 1,000 points, 640x480. Minimum and median over repeats; pyramidal Lucas-Kanade on the same points is the yardstick
 for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
@@ -18,7 +17,6 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from flow_accuracy import SEARCHES
 from flow_data import Pair, corners, synthetic
 
 from dynslam_bench.contracts.flow import FlowEstimator
@@ -64,38 +62,17 @@ def bars(pair: Pair, repeats: int) -> None:
         print(f"| {threads} | {median:.1f} | {low:.1f} | {processor} | {aim} |", flush=True)
 
 
-def searches(pairs: list[Pair], repeats: int) -> None:
-    """Processor time of one frame and correct tracks, for each search over the budget, on the same pairs."""
-    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores\n")
-    print("| search | budget | processor ms, minimum | median | % < 1.5 px |\n| --- | --- | --- | --- | --- |")
-    for search in SEARCHES:
-        for budget in (48, 64, 96, 192, 384):
-            settings = FlowSettings(search=search, budget=budget)
-            flow = build_flow(settings)
-            points = a_thousand(pairs[0].reference)
-            _, _, used, often = timed(one_frame(flow, pairs[0].reference, pairs[0].target, points), repeats)
-            good = []
-            for pair in pairs:
-                result = flow.track(flow.prepare(pair.reference), flow.prepare(pair.target), pair.points)
-                good.append(np.hypot(*(result.xy - pair.truth).T) < 1.5)
-            star = " (default)" if settings == FlowSettings() else ""
-            share = 100 * np.concatenate(good).mean()
-            print(f"| {search} | {budget}{star} | {used:.1f} | {often:.1f} | {share:.1f} |", flush=True)
-
-
 def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeats", type=int, default=40)
     parser.add_argument("--bars", action="store_true")
-    parser.add_argument("--searches", action="store_true")
     options = parser.parse_args()
     repeats = options.repeats
     cv2.setNumThreads(1)
-    pairs = synthetic(("similarity", "homography", "foreground") if options.searches else ("similarity",), 3)
-    pair = pairs[-1]
-    if options.bars or options.searches:
-        bars(pair, repeats) if options.bars else searches(pairs, repeats)
+    pair = synthetic(("similarity",), 3)[-1]
+    if options.bars:
+        bars(pair, repeats)
         return
     first, second = pair.reference, pair.target
     points = a_thousand(first)
@@ -129,18 +106,6 @@ def main() -> None:
         took = timed(lambda dense=dense: dense.flow(dense.prepare(first), dense.prepare(second)), 3)
         print(
             f"dense 640x480 both ways, {threads} thread(s): {took[0]:.0f} / {took[1]:.0f} ms (processor {took[2]:.0f})"
-        )
-    print(
-        "\n| evaluations a point n | search ms | per n | per n log2 n (the paper's claim) |\n| --- | --- | --- | --- |"
-    )
-    flow = build_flow(FlowSettings())
-    for budget in (48, 96, 192, 384, 768, 1536):
-        settings = FlowSettings(budget=budget, refinement="none", search="emfoa")
-        flow = build_flow(settings)
-        reference, target = flow.prepare(first), flow.prepare(second)
-        took = timed(lambda f=flow, r=reference, t=target: f.track(r, t, points), max(3, repeats // 4))[2]
-        print(
-            f"| {budget} | {took:.1f} | {1e3 * took / budget:.1f} us | {1e3 * took / budget / np.log2(budget):.1f} us |"
         )
 
 

@@ -10,12 +10,17 @@ from scenes import ACROSS, CAMERA, ROTATION, SIDEWAYS, Scene, box_instance, keyf
 
 from dynslam_bench.contracts.filter import FilterState
 from dynslam_bench.culling.correlation_graph import CorrelationFilter, depth_variance, point_covariance
-from dynslam_bench.culling.ego_motion import CORRELATION, coherent, depth_sigma, prior_information, refine_prediction
-from dynslam_bench.culling.epipolar import EpipolarFilter
+from dynslam_bench.culling.ego_motion import (
+    CORRELATION,
+    RigidMotionFilter,
+    coherent,
+    depth_sigma,
+    prior_information,
+    refine_prediction,
+)
+from dynslam_bench.culling.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.free_space import MAX_AGE_S, FreeSpaceFilter
-from dynslam_bench.culling.matches import Estimator, epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.multiview_depth import refine_by_matches
-from dynslam_bench.culling.rigid_motion import RigidMotionFilter
 from dynslam_bench.culling.settings import (
     CorrelationSettings,
     EpipolarSettings,
@@ -180,12 +185,12 @@ def test_epipolar_distance_agrees_with_the_definition() -> None:
 
 def test_fundamental_matrix_is_that_of_the_true_motion() -> None:
     made, clean = scene(SIDEWAYS, n_moving=0, noise_px=0.05), scene(SIDEWAYS, n_moving=0, noise_px=0.0, seed=5)
-    matrix = fundamental_matrix(made.state.flow.xy.astype(float), made.frame.xy, Estimator())
+    matrix = fundamental_matrix(made.state.flow.xy.astype(float), made.frame.xy)
     T_cur_prev, inverse = se3.inverse(SIDEWAYS), np.linalg.inv(CAMERA.matrix)
     true = inverse.T @ se3.hat(T_cur_prev[:3, 3]) @ T_cur_prev[:3, :3] @ inverse
     matches = clean.state.flow.xy.astype(float), clean.frame.xy
     assert epipolar_distance(true, *matches).max() < 1e-3 and np.median(epipolar_distance(matrix, *matches)) < 0.1
-    assert fundamental_matrix(matches[0][:15], matches[1][:15], Estimator()) is None
+    assert fundamental_matrix(matches[0][:15], matches[1][:15]) is None
 
 
 def test_a_region_that_fails_moves_and_a_lone_point_is_noise() -> None:

@@ -22,11 +22,8 @@ from scenes import (
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import build
-from dynslam_bench.culling.box_depth import BoxDepthFilter
-from dynslam_bench.culling.box_epipolar import BoxEpipolarFilter
-from dynslam_bench.culling.class_rule import ClassRuleFilter
-from dynslam_bench.culling.depth_blocks import DepthBlockFilter, covered_blocks
-from dynslam_bench.culling.depth_ransac import DepthRansacFilter
+from dynslam_bench.culling.depth_regions import BoxDepthFilter, DepthBlockFilter, DepthRansacFilter, covered_blocks
+from dynslam_bench.culling.epipolar import BoxEpipolarFilter, ClassRuleFilter
 from dynslam_bench.culling.moving_probability import ProbabilityFilter, expand
 from dynslam_bench.culling.moving_vote import MovingVoteFilter
 from dynslam_bench.culling.residual_clusters import ResidualFilter

@@ -12,10 +12,9 @@ from test_culling_multiview import in_front
 
 from dynslam_bench.contracts.filter import FilterState
 from dynslam_bench.core.settings import Settings, parameters
-from dynslam_bench.culling.box_depth import BoxDepthFilter
-from dynslam_bench.culling.class_rule import ClassRuleFilter
 from dynslam_bench.culling.correlation_graph import CorrelationFilter
-from dynslam_bench.culling.depth_ransac import person_set
+from dynslam_bench.culling.depth_regions import BoxDepthFilter, person_set
+from dynslam_bench.culling.epipolar import ClassRuleFilter
 from dynslam_bench.culling.moving_vote import MovingVoteFilter
 from dynslam_bench.culling.multiview_depth import MultiViewFilter
 from dynslam_bench.culling.settings import (

@@ -6,7 +6,7 @@ import pytest
 
 from dynslam_bench.contracts.features import FeatureExtractor, MaskedExtractor
 from dynslam_bench.core.errors import PluginError, SettingsError
-from dynslam_bench.features.orb import OrbExtractor, level_quotas, spread
+from dynslam_bench.features.orb import OrbExtractor, spread
 from dynslam_bench.features.registry import FEATURES, build_extractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry.camera import inside
@@ -105,11 +105,6 @@ def test_what_lies_on_a_mask_takes_no_place_of_what_lies_outside():
     assert len(np.unique(np.c_[beside.xy, beside.octave], axis=0)) == len(beside)
     enough = extractor.extract_masked(image, mask, share=0.02)
     assert np.array_equal(enough.xy, plain.xy) and np.array_equal(enough.descriptors, plain.descriptors)
-
-
-def test_quotas_sum_up_and_fall():
-    quotas = level_quotas(1000, 8, 1.2)
-    assert sum(quotas) == 1000 and sorted(quotas, reverse=True) == quotas
 
 
 def test_spread_takes_every_cells_best_first():

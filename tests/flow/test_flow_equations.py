@@ -1,4 +1,4 @@
-"""The moth-flame equations: against loops that follow the paper, in every library, and against stored results."""
+"""The moth-flame equations: against loops that follow the paper, and against stored results."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import hashlib
 
 import numpy as np
 import pytest
-import torch
 
 from dynslam_bench.flow import moth_flame as rules
-from dynslam_bench.flow.matching_cost import tables_for
-from dynslam_bench.flow.search_kernels import advance, move_moths, scrambled
+from dynslam_bench.flow.label_search import advance, move_moths, scrambled
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.sparse import Pair, SparseDaisyFlow
-from dynslam_bench.flow.torch_flow import TorchSparseFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 
 FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}
 POPULATION, ITERATIONS = 6, 10
@@ -62,18 +59,16 @@ def drawn(seed, stepping):
 
 @pytest.mark.parametrize("iteration", [1, 5, 6, 10])
 @pytest.mark.parametrize("family", FAMILY.values(), ids=FAMILY)
-def test_numpy_torch_and_the_kernel_follow_the_equations(family, iteration):
+def test_numpy_and_the_kernel_follow_the_equations(family, iteration):
     now = rules.flight(iteration / ITERATIONS, family)
     moths, flames, uniform, jumps = drawn(iteration, now.stepping)
     scale = np.array([2.0, 2.0, 0.1, 0.087])
     expected = by_hand(moths.astype(np.float64), flames.astype(np.float64), iteration, family, uniform, jumps, scale)
     left = rules.flame_counts(POPULATION, ITERATIONS, family)[iteration - 1]
     around = flames[np.minimum(np.arange(POPULATION), left - 1)]
-    for xp, cast in ((np, np.float64), (torch, torch.tensor)):
-        numbers = iter((uniform, jumps))
-        args = [cast(array) for array in (moths, flames, around, flames[:1])]
-        found = rules.moth_positions(xp, *args, now, cast(scale), lambda _: cast(next(numbers)))  # noqa: B023
-        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-5, atol=1e-4)
+    numbers = iter((uniform, jumps))
+    positions = rules.moth_positions(moths, flames, around, flames[:1], now, scale, lambda _: next(numbers))
+    np.testing.assert_allclose(positions, expected, rtol=1e-5, atol=1e-4)
     table = rules.flight_table(POPULATION, ITERATIONS, family)
     box = np.full(4, 1e9, np.float32)
     flying, steps = moths.copy(), scale.astype(np.float32)
@@ -86,34 +81,28 @@ def test_numpy_torch_and_the_kernel_follow_the_equations(family, iteration):
     assert (abs(flying - expected) <= looked_up + 1e-4 * abs(expected)).all()
 
 
-def test_opposites_keep_to_their_bounds_in_numpy_and_torch():
+def test_opposites_keep_to_their_bounds():
     members = np.random.default_rng(0).uniform(-3, 3, (5, 7, 4))
     least, greatest = members.min(1, keepdims=True), members.max(1, keepdims=True)
     numbers = [np.random.default_rng(1).random((5, 7, 1)), np.random.default_rng(2).random((5, 7, 4))]
-    found = []
-    for xp, cast in ((np, np.asarray), (torch, torch.tensor)):
-        draws = iter(numbers)
-        bounds = [cast(array) for array in (members, least, greatest, np.full(4, -2.0), np.full(4, 2.5))]
-        found.append(np.asarray(rules.opposites(xp, *bounds, lambda _: cast(next(draws)))))  # noqa: B023
-    np.testing.assert_allclose(found[0], found[1])
+    draws = iter(numbers)
+    opposite = rules.opposites(members, least, greatest, np.full(4, -2.0), np.full(4, 2.5), lambda _: next(draws))
     mirrored = numbers[0] * (least + greatest) - members
     kept = (mirrored >= -2) & (mirrored <= 2.5)
-    np.testing.assert_allclose(found[0][kept], mirrored[kept])
-    assert 0.3 < kept.mean() < 1 and (found[0] >= -2).all() and (found[0] <= 2.5).all()
+    np.testing.assert_allclose(opposite[kept], mirrored[kept])
+    assert 0.3 < kept.mean() < 1 and (opposite >= -2).all() and (opposite <= 2.5).all()
 
 
-def searched(kind, search):
+def searched(search):
     """The state of a label search with a guess for every second point."""
     image = picture()
     target = np.roll(image, (4, -7), axis=(0, 1))
     points = np.stack(np.meshgrid(np.arange(40, 150, 10), np.arange(40, 100, 10)), -1).reshape(-1, 2).astype(np.float32)
     guess = points + np.float32(3)
     guess[::2] = np.nan
-    flow = kind(FlowSettings(search=search))
-    tables = tables_for(image.shape, flow.settings)
-    first, second = flow.prepare(image), flow.prepare(target)
-    described = flow.describe(first, points, tables)
-    return flow.search(described, Pair(first, second, tables), flow.nearest(points), guess, 9)
+    flow = SparseDaisyFlow(FlowSettings(search=search))
+    pair = flow.pair(flow.prepare(image), flow.prepare(target))
+    return flow.search(flow.describe(pair.reference, points, pair.tables), pair, flow.nearest(points), guess, 9)
 
 
 STORED = {
@@ -132,18 +121,9 @@ STORED = {
 
 @pytest.mark.parametrize("search", sorted(STORED))
 def test_label_searches_are_as_before_to_the_bit(search):
-    state = searched(SparseDaisyFlow, search)
+    state = searched(search)
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in (state.flames, state.costs, state.used))
     assert hashlib.sha256(content).hexdigest()[:16] == STORED[search]
-
-
-STORED_MEANS = {"emfoa": 1026.106, "emfoa+propagation": 374.03, "emfoa-literal": 1424.424, "mfo": 1124.894}
-"""Mean best costs of the torch search, likewise; its exp, cos and tan may differ in a last bit between machines."""
-
-
-@pytest.mark.parametrize("search", sorted(STORED_MEANS))
-def test_torch_searches_are_as_before(search):
-    assert searched(TorchSparseFlow, search).costs[:, 0].mean() == pytest.approx(STORED_MEANS[search], rel=0.01)
 
 
 def test_flame_counts_follow_equation_11():

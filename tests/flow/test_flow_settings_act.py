@@ -24,7 +24,7 @@ BASES = {
 FIXED = {
     "sparse": {
         "neighbours": 0, "similarity_seeds": False, "scale_range_octaves": 0.1, "rotation_range_deg": 5.0,
-        "support": 5, "terms": 3, "refinement": "parabola", "refinement_window_px": 9,
+        "support": 5, "terms": 3, "refinement": "none", "refinement_window_px": 9,
     },
     "dense": {
         "terms": 3, "refinement": "none", "superpixel_px": 20, "candidates": 2, "filter_radius_px": 12,

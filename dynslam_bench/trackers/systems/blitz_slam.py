@@ -24,8 +24,8 @@ class BlitzSlamSettings(SemanticSystemSettings):
 
 
 build = composed(
-    ("depth_blocks:DepthBlockFilter", "depth_blocks", "segmentation"),
-    ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"),
+    ("depth_regions:DepthBlockFilter", "depth_blocks", "segmentation"),
+    ("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"),
 )
 
 SPEC = TrackerSpec(

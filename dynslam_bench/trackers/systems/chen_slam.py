@@ -34,7 +34,7 @@ class ChenSlamMonoSettings(MonocularSemanticSettings):
 
 
 build = composed(
-    ("semantic:SemanticFilter", "segmentation"), ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
+    ("semantic:SemanticFilter", "segmentation"), ("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
 )
 
 

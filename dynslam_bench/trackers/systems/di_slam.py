@@ -26,7 +26,7 @@ class DiSlamSettings(SemanticSystemSettings):
 
 
 build = composed(
-    ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"), ("multiview_depth:MultiViewFilter", "multiview")
+    ("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"), ("multiview_depth:MultiViewFilter", "multiview")
 )
 
 SPEC = TrackerSpec(

@@ -120,7 +120,7 @@ def _build(settings: SystemSettings, context: TrackerContext, *, masks: bool) ->
     blocks = (
         ("semantic:SemanticFilter", "segmentation", masks),
         ("epipolar:EpipolarFilter", "epipolar", True),
-        ("rigid_motion:RigidMotionFilter", "motion", True),
+        ("ego_motion:RigidMotionFilter", "motion", True),
         ("free_space:FreeSpaceFilter", "free_space", True),
     )
     filters = []

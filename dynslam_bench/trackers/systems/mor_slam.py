@@ -23,7 +23,7 @@ class MorSlamSettings(SemanticSystemSettings):
 
 
 build = composed(
-    ("semantic:SemanticFilter", "segmentation"), ("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
+    ("semantic:SemanticFilter", "segmentation"), ("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
 )
 
 SPEC = TrackerSpec(

@@ -18,7 +18,7 @@ class NgdSlamSettings(SemanticSystemSettings):
 
 
 build = composed(
-    ("box_depth:BoxDepthFilter", "box_depth", "segmentation"), ("reseeding:ReseedingFilter", "reseeding", "features")
+    ("depth_regions:BoxDepthFilter", "box_depth", "segmentation"), ("reseeding:ReseedingFilter", "reseeding", "features")
 )
 
 SPEC = TrackerSpec(

@@ -21,7 +21,7 @@ class SegSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-build = composed(("class_rule:ClassRuleFilter", "class_rule", "segmentation"))
+build = composed(("epipolar:ClassRuleFilter", "class_rule", "segmentation"))
 
 SPEC = TrackerSpec(
     id="seg-slam",

@@ -22,7 +22,7 @@ class SgcSlamSettings(SemanticSystemSettings):
     flow: PublishedFlowSettings = PublishedFlowSettings()
 
 
-build = composed(("box_epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"))
+build = composed(("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation"))
 
 SPEC = TrackerSpec(
     id="sgc-slam",

@@ -14,7 +14,7 @@ class YoloSlamSettings(SemanticSystemSettings):
     depth_ransac: DepthRansacSettings = DepthRansacSettings()
 
 
-build = composed(("depth_ransac:DepthRansacFilter", "depth_ransac", "segmentation"))
+build = composed(("depth_regions:DepthRansacFilter", "depth_ransac", "segmentation"))
 
 SPEC = TrackerSpec(
     id="yolo-slam",

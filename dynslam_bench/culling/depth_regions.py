@@ -1,0 +1,190 @@
+"""Rules that tell a person from the background by depth: depth RANSAC (B6), blocks of depth (B9), depth of a box."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.culling import Number, ObjectRule
+from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
+from dynslam_bench.culling.settings import BoxDepthSettings, DepthBlockSettings, DepthRansacSettings
+from dynslam_bench.geometry.camera import inside
+from dynslam_bench.segmentation.postprocess import dilate, select
+
+MIN_POINTS = 3
+"""Fewest features with depth in a box for depth RANSAC."""
+
+
+class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
+    """B6, YOLO-SLAM: in each dynamic box the largest set of features of similar depth is dropped, the rest is kept.
+
+    Stats: ``dropped``, ``objects``, ``in_boxes``.
+    """
+
+    name = "depth_ransac"
+    needs: frozenset[Need] = frozenset({"boxes", "depth"})
+    provenance: Provenance = "faithful-paper"
+    stats_names = ("dropped", "objects", "in_boxes")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Find the person among the features of every box; features without depth are dropped too."""
+        keep = np.ones(len(frame.xy), dtype=bool)
+        boxes = dynamic_boxes(frame, self.segmentation)
+        member = in_boxes(frame.keypoints.xy, boxes)
+        for number, in_box in enumerate(member):
+            measured = np.flatnonzero(in_box & (frame.z > 0))
+            person = person_set(frame.z[measured], self.settings, stream(state.seed, self.name, number))
+            keep[measured[person]] = False
+            keep[in_box & ~(frame.z > 0)] = False
+        return self.verdict(keep, objects=len(boxes), in_boxes=np.count_nonzero(member.any(axis=0)))
+
+
+def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """The largest set of features whose depth variance stays below the limit.
+
+    From each drawn pair, the set grows by the nearest depths while its variance stays below the limit. The paper
+    does not state the order; nearest first gives the largest set from that pair.
+
+    Args:
+        z: Depths ``[N]`` of the features in one box, metres, all valid.
+        settings: Variance limit and number of draws.
+        rng: Source of the draws.
+
+    Returns:
+        Bool ``[N]``.
+    """
+    count, draws, drawn = len(z), settings.max_draws, 0
+    best = np.zeros(count, dtype=bool)
+    while drawn < draws and count >= MIN_POINTS:
+        drawn += 1
+        pair = rng.choice(count, 2, replace=False)
+        order = np.argsort(np.abs(z - z[pair].mean()), kind="stable")
+        order = np.concatenate([pair, order[~np.isin(order, pair)]])
+        chosen = z[order].astype(np.float64)
+        n = np.arange(1, count + 1)
+        variance = np.cumsum(chosen**2) / n - np.square(np.cumsum(chosen) / n)
+        size = int(np.argmax(np.append(variance, np.inf) >= settings.variance_m2))
+        if size > np.count_nonzero(best):
+            best[:] = False
+            best[order[:size]] = True
+            share = size / count
+            needed = np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12)) if share < 1 else 0
+            draws = min(draws, max(drawn, int(np.ceil(needed))))
+    return best
+
+
+class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
+    """NGD-SLAM's masks: drops the features on the largest connected region at the depth of a box's middle.
+
+    A box with too little depth, or whose region would cover most of the image, is ignored.
+    Stats: ``dropped``, ``objects``, ``ignored``, ``mask_fraction``.
+    """
+
+    name = "box_depth"
+    needs: frozenset[Need] = frozenset({"boxes", "depth"})
+    provenance: Provenance = "inspired"
+    stats_names = ("dropped", "objects", "ignored", "mask_fraction")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Segment the person in every box and drop the features on them."""
+        depth = np.nan_to_num(frame.depth)
+        boxes = dynamic_boxes(frame, self.segmentation)
+        people = [mask for mask in (self._segment(box, depth) for box in boxes) if mask is not None]
+        mask = dilate(np.logical_or.reduce([np.zeros(depth.shape, bool), *people]), self.settings.dilation_px)
+        stats: dict[str, Number] = {
+            "objects": len(boxes),
+            "ignored": len(boxes) - len(people),
+            "mask_fraction": float(mask.mean()),
+        }
+        return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
+
+    def _segment(self, box: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+        """The mask ``[H, W]`` of the person in a box; None where the box is ignored."""
+        x0, y0, x1, y1 = box.astype(np.float64)
+        shrink = (1 - self.settings.core) / 2
+        core = depth[_window(box, -shrink * (x1 - x0), -shrink * (y1 - y0), depth.shape)]
+        valid = core[core > 0]
+        if not core.size or len(valid) < max(self.settings.min_valid * core.size, 1):
+            return None
+        place = _window(box, self.settings.margin_px, self.settings.margin_px, depth.shape)
+        window = depth[place]
+        near = (window > 0) & (np.abs(window - np.median(valid)) <= self.settings.depth_m)
+        count, label, stats, _ = cv2.connectedComponentsWithStats(near.astype(np.uint8), connectivity=8)
+        if count < 2:
+            return None
+        person = np.zeros(depth.shape, bool)
+        person[place] = label == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+        return person if person.mean() <= self.settings.max_cover else None
+
+
+def _window(box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a box that is grown on all sides, within an image of a shape."""
+    x0, y0, x1, y1 = box.astype(np.float64)
+    low = np.clip((y0 - grow_y, x0 - grow_x), 0, shape).astype(int)
+    high = np.clip(np.ceil((y1 + grow_y, x1 + grow_x)), 0, shape).astype(int)
+    return slice(low[0], high[0]), slice(low[1], high[1])
+
+
+class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
+    """B9, Blitz-SLAM: drops the features on people, whose masks depth completes, and on movable objects they touch.
+
+    The depth image is divided into blocks along its edges. A block of which enough lies on the mask is added to the
+    mask as a whole. A person in front of a wall is a block; a person on a floor forms one block with the floor.
+    Stats: ``dropped``, ``objects``, ``touched`` (movable objects that a person touches), ``blocks`` (added as a
+    whole), ``mask_fraction``.
+    """
+
+    name = "depth_blocks"
+    needs: frozenset[Need] = frozenset({"masks", "depth"})
+    provenance: Provenance = "faithful-paper"
+    stats_names = ("dropped", "objects", "touched", "blocks", "mask_fraction")
+
+    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
+        """Complete the masks and drop what lies on them."""
+        if frame.instances is None or not len(frame.instances):
+            return self.verdict(np.ones(len(frame.xy), dtype=bool))
+        people = select(frame.instances, self.segmentation)
+        mask, blocks = people.union(), 0
+        movable = select(frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
+        neighbourhood = dilate(mask, 1) if len(movable) else mask
+        touched = [other for other in movable.masks if (other & neighbourhood).any() and (other & ~mask).any()]
+        mask = np.logical_or.reduce([mask, *touched])
+        if mask.any():
+            whole, blocks = covered_blocks(mask, frame.depth, self.settings)
+            mask = dilate(mask | whole, self.segmentation.dilation_px)
+        stats: dict[str, Number] = {
+            "objects": len(people),
+            "touched": len(touched),
+            "blocks": blocks,
+            "mask_fraction": float(mask.mean()),
+        }
+        return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
+
+
+def covered_blocks(
+    mask: NDArray[np.bool_], depth: NDArray[np.float32], settings: DepthBlockSettings
+) -> tuple[NDArray[np.bool_], int]:
+    """The blocks of continuous depth of which a mask covers enough.
+
+    Args:
+        mask: Bool ``[H, W]``.
+        depth: float32 ``[H, W]`` metres, 0 or not finite where missing.
+        settings: Depth range, step at an edge and the share that must be covered.
+
+    Returns:
+        Bool ``[H, W]`` of the pixels in such blocks, and the number of blocks.
+    """
+    z = np.nan_to_num(np.asarray(depth, np.float32), posinf=0.0, neginf=0.0)
+    valid = (z > 0) & (z <= settings.max_depth_m)
+    z = np.where(valid, z, 0).astype(np.float32)
+    square = np.ones((2, 2), np.uint8)
+    edge = cv2.dilate(z, square) - cv2.erode(z, square) > settings.edge_m
+    count, label = cv2.connectedComponents((valid & ~edge).view(np.uint8), connectivity=4)
+    size = np.bincount(label.ravel(), minlength=count)
+    covered = np.bincount(label[mask], minlength=count)
+    whole = covered >= np.maximum(settings.min_share * size, 1)
+    whole[0] = False  # label 0: edges and pixels without depth
+    return np.asarray(whole[label]), int(np.count_nonzero(whole))
