@@ -445,7 +445,7 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
                 row = Summary(name, True, license=dataset.spec.license, dataset=dataset.spec.summary or dataset.spec.id)
                 if dataset.spec.id == "synthetic":
                     parsed = parse_synthetic_id(name)
-                    row = replace(row, size="rendered", tags=parsed.tags, split=parsed.split)
+                    row = replace(row, size="rendered", tags=(parsed.variant.tag,), split=parsed.split)
             rows.append(row)
     return rows
 
