@@ -31,6 +31,7 @@ from dynslam_bench.sequences.synthetic.textures import Atlas
 Array = NDArray[np.float64]
 SIZE = CAMERA.height, CAMERA.width
 _INTRINSICS = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
+_FOCAL, _CENTRE = _INTRINSICS[:2], _INTRINSICS[2:]
 _ROUNDS = 5
 """Rounds of the search for the row that sees a point; each shrinks the error by the rows' motion a row, 0.1 or less."""
 _MARGIN_PX = 2.0
@@ -84,24 +85,29 @@ def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -
     return flow.astype(np.float32)
 
 
-def bounds_of(points: Array) -> Array:
-    """Where in the image boxes can be seen.
+_EDGES = np.array([(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i >> axis & 1]).T
+"""The twelve edges of a box, as pairs of corners; bit k of a corner's number is its side along axis k."""
+
+
+def bounds_of(corners: Array) -> Array:
+    """Where in the image boxes can be seen: around the parts of them that lie before the camera.
 
     Args:
-        points: Corners ``[P, 8, 3]`` in the camera frame, metres.
+        corners: ``[P, 8, 3]`` in the camera frame, metres.
 
     Returns:
-        ``[5, P]``: least depth of all corners, and least u, least v, greatest u, greatest v (pixels, with a margin):
-        the whole image for a box that reaches behind the camera, nothing (least above greatest) for one that lies there.
+        ``[5, P]``: least depth of all corners, and least u, least v, greatest u, greatest v (pixels, with a margin);
+        least above greatest where a box lies behind the camera.
     """
-    depth = points[:, :, 2]
-    hidden, whole = depth.max(axis=1) <= NEAR_M, depth.min(axis=1) > NEAR_M
-    z = np.where(whole[:, None], depth, 1.0)
-    u, v = points[..., 0] / z * CAMERA.fx + CAMERA.cx, points[..., 1] / z * CAMERA.fy + CAMERA.cy
-    reach = np.where(hidden, -np.inf, np.inf)
-    low = [np.where(whole, x.min(axis=1), -reach) - _MARGIN_PX for x in (u, v)]
-    high = [np.where(whole, x.max(axis=1), reach) + _MARGIN_PX for x in (u, v)]
-    return np.stack([depth.min(axis=1), *low, *high])
+    start, end = corners[:, _EDGES[0]], corners[:, _EDGES[1]]
+    cut = (start[..., 2] > NEAR_M) != (end[..., 2] > NEAR_M)
+    share = (NEAR_M - start[..., 2]) / np.where(cut, end[..., 2] - start[..., 2], 1.0)
+    points = np.concatenate([corners, start + share[..., None] * (end - start)], axis=1)
+    valid = np.concatenate([corners[..., 2] > NEAR_M, cut], axis=1)
+    pixels = points[..., :2] / np.where(valid, points[..., 2], 1.0)[..., None] * _FOCAL + _CENTRE
+    low = np.where(valid[..., None], pixels, np.inf).min(axis=1) - _MARGIN_PX
+    high = np.where(valid[..., None], pixels, -np.inf).max(axis=1) + _MARGIN_PX
+    return np.stack([corners[..., 2].min(axis=1), *low.T, *high.T])
 
 
 @dataclass(frozen=True, eq=False)
