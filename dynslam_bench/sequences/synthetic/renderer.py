@@ -170,13 +170,17 @@ class Renderer:
         It is the motion of the surface point seen at each pixel centre, also where it is hidden in the other frame.
         """
         now, after = self.scene.view(index), self.scene.view(other)
-        hit, depth = self._cast(*self._tiles(now))
+        hit, depth = self.cast(now)
         return rolling_flow(now, after, hit, depth) if now.rolling else self._flow(now, after, hit, depth)
 
     def geometry(self, index: int) -> tuple[Array, NDArray[np.uint8]]:
         """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
-        hit, depth = self._cast(*self._tiles(self.scene.view(index)))
+        hit, depth = self.cast(self.scene.view(index))
         return depth, self._ids[hit >> 3]
+
+    def cast(self, view: View) -> tuple[NDArray[np.int32], Array]:
+        """What every pixel of a view sees (8 * primitive + face, -1 for nothing) and its z-depth in metres."""
+        return self._cast(*self._tiles(view))
 
     def _rows(self, work: Callable[[int, int], None]) -> None:
         """Share the bands of an image among the threads; under a rolling shutter they do not depend on their number."""
