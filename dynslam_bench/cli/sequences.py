@@ -111,7 +111,7 @@ def fetch(
     from dynslam_bench.sequences.fetch import fetch as fetch_one
 
     for name in expand(names):
-        new = status(name, data_root=data_root).folder is None
+        new = status(name, data_root=data_root) is None
         with progress(name, unit="bytes") as advance:
             place = fetch_one(
                 name,

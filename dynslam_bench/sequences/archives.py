@@ -10,8 +10,9 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, BinaryIO, cast
+from typing import IO, BinaryIO, cast
 
 from dynslam_bench.core.download import CHUNK, Progress, Report
 from dynslam_bench.core.errors import SequenceError
@@ -62,7 +63,7 @@ def extract(archive: Path, target: Path, progress: Report | None = None) -> dict
             raise SequenceError(f"{archive.name} holds one name twice: {error.filename}, refused") from error
         checksum = hashlib.sha256()
         with file:
-            for block in _blocks(archive, member[1]):
+            for block in iter(partial(_read, archive, member[1]), b""):
                 file.write(block)
                 checksum.update(block)
                 done += len(block)
@@ -71,13 +72,9 @@ def extract(archive: Path, target: Path, progress: Report | None = None) -> dict
             progress(Progress("extract", done, None))
 
 
-def _blocks(archive: Path, stream: IO[bytes]) -> Iterator[bytes]:
-    while True:
-        with _reading(archive):
-            block = stream.read(CHUNK)
-        if not block:
-            return
-        yield block
+def _read(archive: Path, stream: IO[bytes]) -> bytes:
+    with _reading(archive):
+        return stream.read(CHUNK)
 
 
 @contextmanager
@@ -103,14 +100,11 @@ def safe_name(archive: Path, name: str) -> PurePosixPath:
     return PurePosixPath(name)
 
 
-def _check_size(archive: Path, size: int) -> None:
+def _check(archive: Path, size: int, members: int = 0) -> None:
     limit = archive.stat().st_size * MAX_RATIO + MAX_SLACK
     if size > limit:
         raise SequenceError(f"{archive.name} unpacks to more than {limit / 1e9:.1f} GB, refused")
-
-
-def _check_members(archive: Path, count: int) -> None:
-    if count > MAX_MEMBERS:
+    if members > MAX_MEMBERS:
         raise SequenceError(f"{archive.name} holds more than {MAX_MEMBERS} files, refused")
 
 
@@ -118,8 +112,7 @@ def _zip_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
     """Names and streams of all regular files; zipfile never reads more of a file than its header states."""
     with zipfile.ZipFile(archive) as source:
         entries = source.infolist()
-        _check_members(archive, len(entries))
-        _check_size(archive, sum(entry.file_size for entry in entries))
+        _check(archive, sum(entry.file_size for entry in entries), len(entries))
         for entry in entries:
             if (entry.external_attr >> 16) & 0o170000 not in (0, 0o100000, 0o040000):
                 raise SequenceError(f"{archive.name} holds {entry.filename!r}, no regular file, refused")
@@ -133,11 +126,13 @@ def _zip_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
 
 
 def _tar_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
-    with archive.open("rb") as raw, _decompressed(raw) as file:
+    with archive.open("rb") as start:
+        compressed = start.read(2) == b"\x1f\x8b"
+    with gzip.open(archive) if compressed else archive.open("rb") as file:
         counted = _Counted(archive, file)
         with tarfile.open(fileobj=cast("BinaryIO", counted), mode="r|", tarinfo=_Header) as tar:
             for number, entry in enumerate(tar, 1):
-                _check_members(archive, number)
+                _check(archive, 0, number)
                 tar.members = []  # type: ignore[attr-defined]  # it would keep the header of every file
                 if entry.isdir():
                     if PurePosixPath(entry.name).parts:  # "." names the archive itself
@@ -160,7 +155,7 @@ class _Counted:
     def read(self, size: int = -1) -> bytes:
         block = self.stream.read(size)
         self.total += len(block)
-        _check_size(self.archive, self.total)
+        _check(self.archive, self.total)
         return block
 
 
@@ -174,9 +169,3 @@ class _Header(tarfile.TarInfo):
         if header.size < 0 or (not header.isreg() and header.size > MAX_HEADER):
             raise tarfile.ReadError(f"a header claims {header.size} bytes")
         return header
-
-
-def _decompressed(raw: BinaryIO) -> Any:
-    start = raw.read(2)
-    raw.seek(0)
-    return gzip.GzipFile(fileobj=raw) if start == b"\x1f\x8b" else raw

@@ -6,9 +6,10 @@ depth stay as they are to the last bit, and nothing is guessed where several top
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ POSES = (
     "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Odometry",
 )
-NONE = "none"
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,12 @@ def unpack_bag(
         chosen_truth = topics.pose(truth)
         with atomic_folder(target) as work:
             frames = {
-                kind: _write_images(reader, topics.connection(topic), work, name)
+                kind: _write_images(reader, topics.connections[topic], work, name)
                 for kind, topic, name in (("colour", chosen_colour, "rgb"), ("depth", chosen_depth, "depth"))
             }
             write_camera(work / CAMERA_FILE, topics.camera(chosen_colour))
             if chosen_truth:
-                lines = [pose_line(message) for message in _read(reader, topics.connection(chosen_truth))]
+                lines = [pose_line(message) for message in _read(reader, topics.connections[chosen_truth])]
                 (work / "groundtruth.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
             count = len(open_folder(work))
     notes = []
@@ -118,7 +118,7 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
         with _opened(source) as reader:
             topics = _Topics(reader, source)
             chosen = topics.pose(topic, "--topic")
-            lines = [pose_line(message) for message in _read(reader, topics.connection(chosen))] if chosen else []
+            lines = [pose_line(message) for message in _read(reader, topics.connections[chosen])] if chosen else []
     except OSError as error:  # e.g. a file that its metadata name is missing
         raise SequenceError(f"bag {source} cannot be read: {error.strerror or error}") from error
     table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
@@ -136,9 +136,6 @@ class _Topics:
         for connection in reader.connections:
             self.connections.setdefault(connection.topic, []).append(connection)
 
-    def connection(self, topic: str) -> list[Any]:
-        return self.connections[topic]
-
     def of_types(self, types: Sequence[str]) -> list[str]:
         return sorted(topic for topic, connections in self.connections.items() if connections[0].msgtype in types)
 
@@ -150,7 +147,7 @@ class _Topics:
 
     def pose(self, wanted: str | None, option: str = "--truth (or --truth none)") -> str:
         candidates = self.of_types(POSES)
-        if wanted == NONE or (wanted is None and not candidates):
+        if wanted == "none" or (wanted is None and not candidates):
             return ""
         return self._one("poses", candidates, wanted, option)
 
@@ -168,17 +165,13 @@ class _Topics:
         raise SequenceError(f"topic {topic} of {self.source} has no message")
 
     def _one(self, what: str, candidates: list[str], wanted: str | None, option: str) -> str:
-        if wanted is not None and wanted in candidates:
-            return wanted
         listed = ", ".join(candidates)[:300] or "none"
-        if wanted is not None:
+        if wanted is not None and wanted not in candidates:
             raise SequenceError(f"{self.source} has no topic '{wanted}' of {what}", f"there are: {listed}")
-        if len(candidates) != 1:
-            raise SequenceError(
-                f"{self.source} has {len(candidates)} topics of {what}: {listed}",
-                f"choose one with {option}" if candidates else "is it the right bag?",
-            )
-        return candidates[0]
+        if wanted is None and len(candidates) != 1:
+            hint = f"choose one with {option}" if candidates else "is it the right bag?"
+            raise SequenceError(f"{self.source} has {len(candidates)} topics of {what}: {listed}", hint)
+        return wanted or candidates[0]
 
 
 def _write_images(reader: Any, connections: list[Any], work: Path, name: str) -> str:
@@ -186,26 +179,13 @@ def _write_images(reader: Any, connections: list[Any], work: Path, name: str) ->
     (work / name).mkdir()
     rows, frame = [], ""
     for index, message in enumerate(_read(reader, connections)):
-        where = f"image {index} of {connections[0].topic}"
-        if name == "rgb":
-            suffix, data = colour_file(message, where)
-            (work / name / f"{index:06d}{suffix}").write_bytes(data)
-        else:
-            suffix = _write_depth(work / name / f"{index:06d}", depth_array(message, where))
+        where, encode = f"image {index} of {connections[0].topic}", colour_file if name == "rgb" else depth_file
+        suffix, data = encode(message, where)
+        (work / name / f"{index:06d}{suffix}").write_bytes(data)
         rows.append(f"{stamp_text(message)} {name}/{index:06d}{suffix}")
         frame = frame or str(message.header.frame_id)
     (work / f"{name}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
     return frame
-
-
-def _write_depth(stem: Path, depth: Any) -> str:
-    import cv2
-
-    if depth.dtype == np.float32:
-        np.save(stem.with_suffix(".npy"), depth)
-        return ".npy"
-    stem.with_suffix(".png").write_bytes(cv2.imencode(".png", depth)[1].tobytes())
-    return ".png"
 
 
 def _read(reader: Any, connections: list[Any]) -> Iterator[Any]:
@@ -218,9 +198,13 @@ def _opened(source: Path) -> Iterator[Any]:
     """The bag's reader; whatever it raises over a damaged bag becomes one line."""
     if not source.exists():
         raise SequenceError(f"there is no bag {source}")
-    open_reader = _reader()
     try:
-        with open_reader(source) as reader:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise SequenceError("bags are read with rosbags, which is not installed", "pip install rosbags") from error
+    try:
+        with AnyReader([source], default_typestore=get_typestore(Stores.LATEST)) as reader:
             yield reader
     except (DynslamError, OSError):
         raise
@@ -229,26 +213,18 @@ def _opened(source: Path) -> Iterator[Any]:
         raise SequenceError(f"bag {source} cannot be read: {reason}") from error
 
 
-def _reader() -> Callable[[Path], Any]:
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise SequenceError("bags are read with rosbags, which is not installed", "pip install rosbags") from error
-    return lambda path: AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-
-
 # Messages of ROS as images, stamps, poses and cameras; ROS 1 and 2 name a few fields otherwise.
 
-COLOURS: dict[str, int | None] = {
-    "rgb8": cv2.COLOR_RGB2BGR,
-    "bgr8": None,
-    "rgba8": cv2.COLOR_RGBA2BGR,
-    "bgra8": cv2.COLOR_BGRA2BGR,
-    "mono8": None,
-    "8UC3": None,
-    "8UC1": None,
+COLOURS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgr8": (3, None),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "mono8": (1, None),
+    "8UC3": (3, None),
+    "8UC1": (1, None),
 }
+"""Channels of each encoding, and OpenCV's conversion to blue, green, red."""
 DEPTHS: dict[str, np.dtype[Any]] = {
     "16UC1": np.dtype(np.uint16),
     "mono16": np.dtype(np.uint16),
@@ -282,13 +258,13 @@ def colour_file(message: Any, where: str) -> tuple[str, bytes]:
         return (".png" if data.startswith(b"\x89PNG") else ".jpg"), data
     if message.encoding not in COLOURS:
         raise SequenceError(f"{where} is of '{message.encoding}', expected one of {', '.join(COLOURS)}")
-    pixels = _pixels(message, np.dtype(np.uint8), where)
-    code = COLOURS[message.encoding]
+    channels, code = COLOURS[message.encoding]
+    pixels = _pixels(message, np.dtype(np.uint8), channels, where)
     return ".png", cv2.imencode(".png", pixels if code is None else cv2.cvtColor(pixels, code))[1].tobytes()
 
 
-def depth_array(message: Any, where: str) -> NDArray[np.generic]:
-    """The depth image ``[H, W]``: uint16 millimetres or float32 metres.
+def depth_file(message: Any, where: str) -> tuple[str, bytes]:
+    """Suffix and content of a file that holds the depth image: a PNG of millimetres or an array of float32 metres.
 
     Raises:
         SequenceError: It is no such image.
@@ -296,21 +272,21 @@ def depth_array(message: Any, where: str) -> NDArray[np.generic]:
     kind = DEPTHS.get(getattr(message, "encoding", ""))
     if kind is None:
         raise SequenceError(f"{where} holds no depth image of {', '.join(DEPTHS)}", "choose another topic with --depth")
-    return _pixels(message, kind, where)
+    depth, buffer = _pixels(message, kind, 1, where), BytesIO()
+    if kind == np.uint16:
+        return ".png", cv2.imencode(".png", depth)[1].tobytes()
+    np.save(buffer, depth)
+    return ".npy", buffer.getvalue()
 
 
-def _pixels(message: Any, kind: np.dtype[Any], where: str) -> NDArray[Any]:
+def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> NDArray[Any]:
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(bytes(message.data), np.uint8)
-    if min(height, width) < 1 or len(data) != height * step or step < width * kind.itemsize:
-        raise SequenceError(f"{where} is {width}x{height} in {len(data)} bytes, {step} a row")
-    channels = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}.get(message.encoding, 1)
     used = width * channels * kind.itemsize
-    if used > step:
-        raise SequenceError(f"{where} has rows of {step} bytes, too short for {width} pixels of {message.encoding}")
+    if min(height, width) < 1 or len(data) != height * step or step < used:
+        raise SequenceError(f"{where} is {width}x{height} of {message.encoding} in {len(data)} bytes, {step} a row")
     rows = np.ascontiguousarray(data.reshape(height, step)[:, :used])
-    order = kind.newbyteorder(">" if message.is_bigendian else "<")
-    values = rows.view(order).astype(kind)
+    values = rows.view(kind.newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
     return values.reshape(height, width, channels) if channels > 1 else values
 
 

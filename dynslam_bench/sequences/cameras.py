@@ -126,10 +126,7 @@ class CameraFile(Settings):
         Raises:
             SequenceError: It names a camera that is not known.
         """
-        if self.name is not None:
-            return known_camera(self.name)
-        sizes = self.model_dump(exclude={"name", "fps"})
-        return Camera(**sizes)
+        return known_camera(self.name) if self.name is not None else Camera(**self.model_dump(exclude={"name", "fps"}))
 
 
 def known_camera(name: str) -> Camera:
@@ -166,13 +163,10 @@ def write_camera(path: Path, camera: Camera, *, fps: float | None = None) -> Non
         DynslamError: The folder cannot be written.
     """
     lines = [f"width = {int(camera.width)}", f"height = {int(camera.height)}"]
-    for key in ("fx", "fy", "cx", "cy", "depth_factor", "baseline_m", "readout_s"):
-        lines.append(f"{key} = {float(getattr(camera, key))!r}")
-    if camera.depth_delay_s:
-        lines.append(f"depth_delay_s = {float(camera.depth_delay_s)!r}")
+    keys = ("fx", "fy", "cx", "cy", "depth_factor", "baseline_m", "readout_s", "depth_delay_s")
+    lines += [f"{key} = {float(getattr(camera, key))!r}" for key in keys]
     lines.append(f"distortion = [{', '.join(repr(float(value)) for value in camera.distortion)}]")
-    if fps is not None:
-        lines.append(f"fps = {float(fps)!r}")
+    lines += [] if fps is None else [f"fps = {float(fps)!r}"]
     write_atomic(path, "\n".join(lines) + "\n")
 
 

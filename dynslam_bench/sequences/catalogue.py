@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
-import os
+import re
 from collections.abc import Iterator
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
@@ -14,16 +14,14 @@ from typing import Any, Literal, cast
 from pydantic import Field
 
 from dynslam_bench.contracts.sequence import DatasetSpec, Sequence
-from dynslam_bench.core.code_files import leads_back
 from dynslam_bench.core.errors import SequenceError, did_you_mean
-from dynslam_bench.core.fingerprint import is_settled
 from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.cameras import CAMERAS, MARKER_TO_CAMERA, chosen_camera, find_camera
-from dynslam_bench.sequences.readers.layouts import layout_of
+from dynslam_bench.sequences.readers.layouts import find_layout, is_bag, layout_of
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
 from dynslam_bench.sequences.view import SequenceView
@@ -111,8 +109,7 @@ def catalogue() -> dict[str, CatalogueEntry]:
 
 def entry_of(name: str) -> CatalogueEntry | None:
     """The catalogue's entry of an id or published folder name, None if there is none."""
-    entries = catalogue()
-    return entries.get(name) or by_folder().get(name)
+    return catalogue().get(name) or by_folder().get(name)
 
 
 @cache
@@ -128,11 +125,6 @@ def public_datasets() -> dict[str, CatalogueEntry]:
     for entry in catalogue().values():
         first.setdefault(entry.dataset, entry)
     return first
-
-
-_OPENED: dict[str, tuple[list[tuple[str, int, int, int, int]], Sequence]] = {}
-"""Folders that were opened, with the state of their files then: an unchanged one need not be read again."""
-_MOST_OPENED = 64
 
 
 def sequence_ids() -> list[str]:
@@ -175,7 +167,16 @@ def open_sequence(
         from dynslam_bench.sequences.preprocessing import Preprocessed
 
         sequence = cast("Sequence", Preprocessed(sequence, settings))
-    return _part(sequence, frames, stride)
+    start, stop = parse_frames(frames)
+    if stride < 1:
+        raise SequenceError(f"stride is {stride}, expected at least 1")
+    if (start, stop, stride) == (0, None, 1):
+        return sequence
+    view = SequenceView(sequence, start, stop, stride)
+    if not len(view):
+        end = "" if stop is None else stop
+        raise SequenceError(f"frames {start}:{end} hold none of the {len(sequence)} frames of '{sequence.id}'")
+    return cast("Sequence", view)
 
 
 def open_public(sequence_id: str, *, data_root: Path, **how: Any) -> Sequence:
@@ -232,74 +233,32 @@ def open_folder(
     Raises:
         SequenceError: It cannot be opened, or its camera is not known.
     """
+    from dynslam_bench.sequences.readers.recorded import RecordedSequence
+
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
-    chosen = chosen_camera(folder, camera)
-    wanted = repr((folder.absolute(), entry and entry.id, str(camera), chosen, settings))
-    state = _state_of(folder)
-    earlier, sequence = _OPENED.get(wanted, (None, None))
-    if sequence is None or earlier != state:
-        sequence = _open_folder(folder, entry, camera, chosen, settings)
-        while len(_OPENED) >= _MOST_OPENED:
-            _OPENED.pop(next(iter(list(_OPENED)), ""), None)  # another thread may do the same
-        if is_settled(max((max(file[2:4]) for file in state), default=None)):
-            _OPENED[wanted] = state, sequence
-    return sequence
-
-
-def _open_folder(
-    folder: Path,
-    entry: CatalogueEntry | None,
-    camera: str | Path | Camera | None,
-    chosen: tuple[Camera, float | None] | None,
-    settings: PreprocessingSettings,
-) -> Sequence:
-    from dynslam_bench.sequences.readers.layouts import find_layout, layout_of
-    from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
-
     layout = find_layout(folder) if entry is None else layout_of(entry.layout)
-    chosen_fps = None if chosen is None else chosen[1]
-    contents = layout.read(folder, chosen_fps or (None if entry is None else entry.fps))
-    otherwise = None if entry is None else entry.camera
-    intrinsics, fps = chosen or find_camera(folder, stated=contents.camera, otherwise=otherwise)
-    body = MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera)
-    if entry is None:
-        description = Description(f"folder/{folder.resolve().name}", intrinsics, fps or contents.fps, R_body_cam=body)
-    else:
-        about = (entry.license, entry.citation, frozenset(entry.tags), entry.split)
-        description = Description(entry.id, intrinsics, fps or entry.fps, *about, body)
+    chosen = chosen_camera(folder, camera)
+    contents = layout.read(folder, (chosen and chosen[1]) or (entry and entry.fps))
+    intrinsics, fps = chosen or find_camera(folder, stated=contents.camera, otherwise=entry and entry.camera)
+    about: dict[str, Any] = {"id": f"folder/{folder.resolve().name}", "fps": fps or contents.fps}
+    if entry is not None:
+        about = {"id": entry.id, "fps": fps or entry.fps, "license": entry.license, "citation": entry.citation,
+                 "tags": frozenset(entry.tags), "split": entry.split}  # fmt: skip
     return RecordedSequence(
         folder,
         contents,
-        description,
+        intrinsics,
+        **about,
+        R_body_cam=MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera),
         max_time_difference_s=settings.max_time_difference_s,
         any_depth_size=settings.width is not None,
     )
 
 
-def _state_of(folder: Path) -> list[tuple[str, int, int, int, int]]:
-    """Name, size, times of modification and of change, and inode of every file below a folder; empty without one."""
-    state: list[tuple[str, int, int, int, int]] = []
-    waiting = [str(folder)]
-    while waiting:
-        try:
-            with os.scandir(waiting.pop()) as entries:
-                for entry in entries:
-                    if entry.is_dir():
-                        waiting += [] if leads_back(Path(entry.path)) else [entry.path]
-                    else:
-                        stat = entry.stat()
-                        state.append((entry.path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino))
-        except OSError:  # it vanished meanwhile; opening it says what is wrong
-            return []
-    return state
-
-
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
-    from dynslam_bench.sequences.readers.layouts import is_bag
-
     path = Path(name).expanduser()
     entry = None if _is_path(name) else entry_of(name)
     if entry is not None:
@@ -327,19 +286,6 @@ def _is_path(name: str) -> bool:
     return name.startswith((".", "/", "~", "\\"))
 
 
-def _part(sequence: Sequence, frames: tuple[int, int | None] | str | None, stride: int) -> Sequence:
-    start, stop = parse_frames(frames)
-    if stride < 1:
-        raise SequenceError(f"stride is {stride}, expected at least 1")
-    if (start, stop, stride) == (0, None, 1):
-        return sequence
-    view = SequenceView(sequence, start, stop, stride)
-    if not len(view):
-        end = "" if stop is None else stop
-        raise SequenceError(f"frames {start}:{end} hold none of the {len(sequence)} frames of '{sequence.id}'")
-    return cast("Sequence", view)
-
-
 def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int | None]:
     """First frame and one past the last (None: to the end) of ``"A:B"``, ``"A:"``, ``":B"`` or a pair.
 
@@ -348,21 +294,15 @@ def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int 
     """
     if frames is None:
         return 0, None
-    first: int | str
-    last: int | str | None
-    if isinstance(frames, str):
-        first, separator, last = frames.partition(":")
-        if not separator:
-            raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B")
-    else:
+    if not isinstance(frames, str):
         first, last = frames
-    try:
-        start = int(first) if first != "" else 0
-        stop = None if last is None or last == "" else int(last)
-    except ValueError:
-        raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B") from None
-    if start < 0 or (stop is not None and stop <= start):
-        raise SequenceError(f"frames {start}:{'' if stop is None else stop} is no range of frames", "0 <= A < B")
+        frames = f"{first}:{'' if last is None else last}"
+    match = re.fullmatch(r"\s*([0-9]{0,12})\s*:\s*([0-9]{0,12})\s*", frames, re.ASCII)
+    if match is None:
+        raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B")
+    start, stop = int(match[1] or 0), int(match[2]) if match[2] else None
+    if stop is not None and stop <= start:
+        raise SequenceError(f"frames {frames} is no range of frames", "0 <= A < B")
     return start, stop
 
 
@@ -386,9 +326,6 @@ DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
 
 
 # Lists and descriptions for people.
-
-KNOWN = "known: another archive is refused"
-FIRST_USE = "not published: the first fetch takes it, every later one has to bring the same"
 
 
 @dataclass(frozen=True)
@@ -435,17 +372,16 @@ def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
     for dataset in DATASETS.all():
         for name in dataset.spec.sequences:
             entry = catalogue().get(name)
+            row = Summary(name, True, license=dataset.spec.license, dataset=dataset.spec.summary or dataset.spec.id)
             if entry is not None:
                 layout = "verified" if entry.verified else "not verified"
                 row = Summary(
                     name, entry.find(root) is not None, entry.size_text(), entry.tags, entry.split, entry.ground_truth,
                     entry.license, entry.url, entry.title, layout, entry.by_hand, entry.sha256 is not None,
                 )  # fmt: skip
-            else:
-                row = Summary(name, True, license=dataset.spec.license, dataset=dataset.spec.summary or dataset.spec.id)
-                if dataset.spec.id == "synthetic":
-                    parsed = parse_synthetic_id(name)
-                    row = replace(row, size="rendered", tags=parsed.tags, split=parsed.split)
+            elif dataset.spec.id == "synthetic":
+                parsed = parse_synthetic_id(name)
+                row = replace(row, size="rendered", tags=(parsed.variant.tag,), split=parsed.split)
             rows.append(row)
     return rows
 
@@ -467,7 +403,8 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
         facts = {
             "id": entry.id, "alias": entry.folder, "url": entry.url, "page": entry.page, "size": entry.size_text(),
             "size_bytes": entry.size_bytes, "sha256": entry.sha256, "license": entry.license,
-            "checksum": KNOWN if entry.sha256 else FIRST_USE,
+            "checksum": "known: another archive is refused" if entry.sha256 else
+            "not published: the first fetch takes it, every later one has to bring the same",
             "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
             "ground_truth": "public" if entry.ground_truth else "not public",
             "camera": repr(entry.intrinsics() or "as its files or its layout state"),

@@ -7,7 +7,6 @@ rolling shutter RGB-D cameras", ICCV 2015.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.se3 import hat
+from dynslam_bench.sequences.rgbd_motion import follow_corners
 
 Array = NDArray[np.float64]
 
@@ -31,12 +31,6 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
     """
     n, (height, width) = len(images), images[0].shape
     tracks = np.full((0, n, 2), np.nan)
-    window: dict[str, Any] = {
-        "winSize": (21, 21),
-        "maxLevel": 4,
-        "criteria": (3, 30, 0.01),
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-    }
     for i in range(n - 1):
         alive = np.isfinite(tracks[:, i, 0])
         if alive.sum() < POINTS and i < n - 3:
@@ -51,13 +45,7 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
         flow = here - tracks[alive, i - 1] if i else np.full(here.shape, np.nan)
         valid = np.isfinite(flow[:, 0])
         flow[~valid] = np.median(flow[valid], axis=0) if valid.any() else 0.0
-        guess, start = (pixels.astype(np.float32).reshape(-1, 1, 2) for pixels in (here + flow, here))
-        there, status, _ = cv2.calcOpticalFlowPyrLK(images[i], images[i + 1], start, guess, **window)
-        back, again, _ = cv2.calcOpticalFlowPyrLK(images[i + 1], images[i], there, start.copy(), **window)
-        there, back = np.asarray(there)[:, 0], np.asarray(back)[:, 0]
-        good = (
-            (np.asarray(status)[:, 0] > 0) & (np.asarray(again)[:, 0] > 0) & (np.linalg.norm(back - here, axis=1) < 0.5)
-        )
+        there, good = follow_corners(images[i], images[i + 1], here, (here + flow).astype(np.float32), 0.5)
         good &= (there >= 8).all(axis=1) & (there < (width - 8, height - 8)).all(axis=1)
         tracks[np.flatnonzero(alive)[good], i + 1] = there[good]
     return np.asarray(tracks[np.isfinite(tracks[..., 0]).sum(axis=1) >= 4])

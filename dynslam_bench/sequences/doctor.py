@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.rgbd_motion import RgbdPair, rgbd_pairs
-from dynslam_bench.sequences.stream_checks import Finding, Streams, fault, note, stream_findings
+from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences.stream_checks import Finding, Streams, fault, stream_findings
 from dynslam_bench.sequences.truth_checks import RESAVE, truth_findings
 
 MOST_FRAMES = 240
@@ -20,6 +23,9 @@ FEWEST = 10
 """Frames below which only single images are checked."""
 STRETCH = 40
 """Frames that are read one after the other: more than a second, for delays and shifts in time."""
+
+_UNREADABLE = (DynslamError, OSError, ValueError)
+"""What a recording raises that cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +77,9 @@ def diagnose(
         most_frames: Frames that are read at most, in stretches spread over the recording.
         progress: Called with the frames done and the frames to do.
     """
-    from dynslam_bench.sequences.catalogue import open_sequence
-
     try:
         sequence = open_sequence(name, data_root=data_root, camera=camera)
-    except (DynslamError, OSError, ValueError) as error:
+    except _UNREADABLE as error:
         return Diagnosis(str(name), 0, (_unopened(name, data_root, camera, error),))
     return replace(examine(sequence, most_frames=most_frames, progress=progress), id=str(name))
 
@@ -103,7 +107,7 @@ def examine(
         for index in range(start, stop):
             try:
                 frames.append(sequence[index])
-            except (DynslamError, OSError, ValueError) as error:
+            except _UNREADABLE as error:
                 unreadable.append(f"frame {index}: {_message(error)}")
             done += 1
             if progress is not None:
@@ -121,7 +125,7 @@ def examine(
         return Diagnosis(sequence.id, 0, tuple(findings))
     if streams.frames < FEWEST:
         text = f"too few frames ({streams.frames}): motion, delays and truth cannot be compared"
-        findings.append(note("too-short", streams.frames, "frames", text, "check a longer part"))
+        findings.append(Finding("too-short", "note", float(streams.frames), "frames", text, "check a longer part"))
     in_streams = stream_findings(streams, with_depth)
     findings += in_streams
     if streams.frames >= FEWEST and not any(finding.severity == "fault" for finding in in_streams):
@@ -143,15 +147,11 @@ def _unopened(
     name: str | Path, data_root: str | Path | None, camera: str | Path | Camera | None, error: Exception
 ) -> Finding:
     """Why a recording cannot be opened: depth of another size is a fault of its own, the rest is said as it is."""
-    from dynslam_bench.sequences.catalogue import open_sequence
-    from dynslam_bench.sequences.settings import PreprocessingSettings
-
     any_size = PreprocessingSettings(width=64, height=48)
     try:
-        loose = open_sequence(name, data_root=data_root, camera=camera, preprocessing=any_size)
-        base = getattr(loose, "base", loose)
-        frame = base[0]
-    except (DynslamError, OSError, ValueError):
+        loose: Any = open_sequence(name, data_root=data_root, camera=camera, preprocessing=any_size)
+        frame = getattr(loose, "base", loose)[0]
+    except _UNREADABLE:
         text, cure = _message(error), getattr(error, "hint", "")
         if isinstance(error, TrajectoryError):
             return fault("unreadable", None, "", text, cure or RESAVE)

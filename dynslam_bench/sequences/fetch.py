@@ -83,29 +83,13 @@ class Download(NamedTuple):
     sha256: str
 
 
-@dataclass(frozen=True)
-class Status:
-    """A public sequence and whether it is here.
-
-    Attributes:
-        entry: What the catalogue says.
-        folder: Where it lies, or None.
-        place: Where `fetch` puts it.
-    """
-
-    entry: CatalogueEntry
-    folder: Path | None
-    place: Path
-
-
-def status(name: str, *, data_root: str | Path | None = None) -> Status:
-    """What the catalogue says of a sequence, and where it lies.
+def status(name: str, *, data_root: str | Path | None = None) -> Path | None:
+    """Where a public sequence lies, None if it is not on this machine.
 
     Raises:
         SequenceError: Unknown id.
     """
-    entry, root = _known(name), find_data_root(data_root)
-    return Status(entry, entry.find(root), entry.folders(root)[0])
+    return _known(name).find(find_data_root(data_root))
 
 
 def fetch(
@@ -151,7 +135,9 @@ def fetch(
     parts: list[Download] = []
     for address in (url or entry.url, *entry.more_urls):
         expected = entry.sha256 if checksum and not parts else None  # the catalogue knows the first archive's only
-        archive = root / ".downloads" / _archive_name(address, entry)
+        own = address.partition("?")[0].rpartition("/")[2]
+        named = is_inside(own) and not own.startswith(".") and len(own) < 200
+        archive = root / ".downloads" / (own if named else f"{entry.folder}.archive")
         most_bytes = (entry.size_bytes if checksum else None) or MOST_BYTES
         try:
             sha256 = download(
@@ -193,8 +179,14 @@ def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked:
             write_atomic(top / RECEIPT, receipt.to_json())
             write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(files.items())))
             open_folder(top, entry=entry)
-            if top != work:
-                _lift(top, work)
+            inner = top.rename(work / ".top") if top != work else work
+            for path in sorted(inner.iterdir()) if inner != work else ():
+                if (work / path.name).exists():
+                    where = "both inside and beside the sequence's folder"
+                    raise SequenceError(f"the archive holds {path.name} {where}, refused")
+                path.rename(work / path.name)
+            if inner != work:
+                inner.rmdir()
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise SequenceError(f"cannot extract {first.name} into {place.parent}: {error.strerror}") from error
@@ -244,7 +236,7 @@ def verify(
         SequenceError: Unknown id, or the sequence is not here, or it needs a `camera` to be named.
     """
     entry = entry_of(name)
-    folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root).folder
+    folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root)
     if folder is None or not folder.is_dir():
         open_sequence(name, data_root=data_root)  # says what is missing
         raise SequenceError(f"'{name}' is not a recorded sequence", "rendered sequences need no verification")
@@ -283,32 +275,14 @@ def _compare(folder: Path, manifest: Path) -> list[str]:
     return faults
 
 
-def _archive_name(address: str, entry: CatalogueEntry) -> str:
-    """Under which name an archive is kept until it is extracted: its own, where that is one."""
-    name = address.partition("?")[0].rpartition("/")[2]
-    return name if is_inside(name) and not name.startswith(".") and len(name) < 200 else f"{entry.folder}.archive"
-
-
 def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:
     """The folder inside the extracted archive that is the sequence."""
-    candidates = [work / entry.folder, work, *sorted(path for path in work.iterdir() if path.is_dir())]
     layout = layout_of(entry.layout)
-    for candidate in candidates:
+    for candidate in (work / entry.folder, work, *sorted(path for path in work.iterdir() if path.is_dir())):
         if layout.fits(candidate):
             return candidate
-    what = " and ".join(layout.marks)
-    raise SequenceError(f"{archive.name} holds no {what}", f"it is not a sequence in the layout {layout.name}")
-
-
-def _lift(top: Path, work: Path) -> None:
-    """Make the sequence's folder the working folder itself."""
-    top = top.rename(work / ".top")
-    for path in sorted(top.iterdir()):
-        destination = work / path.name
-        if destination.exists():
-            raise SequenceError(f"the archive holds {path.name} both inside and beside the sequence's folder, refused")
-        path.rename(destination)
-    top.rmdir()
+    hint = f"it is not a sequence in the layout {layout.name}"
+    raise SequenceError(f"{archive.name} holds no {' and '.join(layout.marks)}", hint)
 
 
 def _known(name: str) -> CatalogueEntry:

@@ -43,7 +43,6 @@ class RgbdPair:
         pixels_first: Undistorted pixels of all tracked corners in the first frame ``[N, 2]``.
         depth_first: Their z-depth in metres ``[N]``.
         pixels_second: Undistorted pixels of the same corners in the second frame ``[N, 2]``.
-        depth_second: Their z-depth in the second depth image ``[N]``; 0 where it is missing.
         inliers: Which corners agree with the motion ``[N]``.
         T_first_second: Pose of the second camera in the first one's frame ``[4, 4]``, metres; None if too few corners
             agree on any motion.
@@ -56,7 +55,6 @@ class RgbdPair:
     pixels_first: Array
     depth_first: Array
     pixels_second: Array
-    depth_second: Array
     inliers: NDArray[np.bool_]
     T_first_second: Array | None
     displacement_px: float
@@ -75,14 +73,13 @@ def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
         camera: Its intrinsics; the motion holds in their units.
     """
     key: Frame | None = None
-    gray_key = gray_last = np.zeros((0, 0), np.uint8)
+    gray_last = np.zeros((0, 0), np.uint8)
     start: Pixels = np.zeros((0, 2), np.float32)
-    points: Pixels = start
-    last: Frame | None = None
+    points, frame = start, None
     for frame in frames:
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-        if key is not None and last is not None and len(points):
-            tracked, good = _track(gray_last, gray, points)
+        if key is not None and len(points):
+            tracked, good = follow_corners(gray_last, gray, points, points, _BACK_AND_FORTH_PX)
             start, points = start[good], tracked[good]
             moved = float(np.median(np.linalg.norm(points - start, axis=1))) if len(points) else 0.0
             due = frame.index - key.index >= MOST_FRAMES_APART or moved >= FAR_ENOUGH_PX
@@ -91,44 +88,34 @@ def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
             if len(points) < LEAST_INLIERS or due:
                 key = None
         if key is None or not len(points):
-            key, gray_key = frame, gray
-            start = points = _corners(gray_key, frame.depth)
-        last, gray_last = frame, gray
-    if key is not None and last is not None and last.index - key.index > 1 and len(points) >= LEAST_INLIERS:
-        yield measure_pair(key, last, start, points, camera)
+            key = frame
+            start = points = _corners(gray, frame.depth)
+        gray_last = gray
+    if key is not None and frame is not None and frame.index - key.index > 1 and len(points) >= LEAST_INLIERS:
+        yield measure_pair(key, frame, start, points, camera)
 
 
 def measure_pair(first: Frame, second: Frame, start: Pixels, end: Pixels, camera: Camera) -> RgbdPair:
     """The pair of two frames whose corners `start` ``[N, 2]`` were found again at `end` ``[N, 2]``, raw pixels."""
-    depth_first, depth_second = _at(first.depth, start), _at(second.depth, end)
+    x, y = np.round(start).astype(int).T
+    depth = np.asarray(first.depth[y, x], dtype=np.float64)
     a, b = camera.undistort_points(start), camera.undistort_points(end)
-    displacement = float(np.median(np.linalg.norm(b - a, axis=1)))
-    inliers, pose = relative_pose(a, depth_first, b, camera)
-    share = float(np.mean(first.depth[::4, ::4] > 0))
-    return RgbdPair(first.index, second.index, a, depth_first, b, depth_second, inliers, pose, displacement, share)
-
-
-def relative_pose(
-    pixels_first: Array, depth_first: Array, pixels_second: Array, camera: Camera
-) -> tuple[NDArray[np.bool_], Array | None]:
-    """The inliers ``[N]``, and the second camera's pose in the first one's frame; None if too few corners agree."""
-    nothing = np.zeros(len(pixels_first), bool)
-    points = camera.unproject(pixels_first, depth_first)
+    points, inliers, pose = camera.unproject(a, depth), np.zeros(len(a), bool), None
     cv2.setRNGSeed(0)
     success, rotation, translation, index = cv2.solvePnPRansac(
-        points, pixels_second, camera.matrix, None, iterationsCount=200, reprojectionError=INLIER_PX, confidence=0.999
+        points, b, camera.matrix, None, iterationsCount=200, reprojectionError=INLIER_PX, confidence=0.999
     )
-    if not success or index is None or len(index) < max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points)):
-        return nothing, None
-    inliers = nothing.copy()
-    inliers[np.asarray(index).reshape(-1)] = True
-    rotation, translation = cv2.solvePnPRefineLM(
-        points[inliers], pixels_second[inliers], camera.matrix, None, rotation, translation
-    )
-    R, t = cv2.Rodrigues(rotation)[0], np.asarray(translation).reshape(3)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
-    return inliers, pose if np.isfinite(pose).all() else None
+    if success and index is not None and len(index) >= max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points)):
+        inliers[np.asarray(index).reshape(-1)] = True
+        rotation, translation = cv2.solvePnPRefineLM(
+            points[inliers], b[inliers], camera.matrix, None, rotation, translation
+        )
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(rotation)[0].T
+        pose[:3, 3] = -pose[:3, :3] @ np.asarray(translation).reshape(3)
+    displacement, share = float(np.median(np.linalg.norm(b - a, axis=1))), float(np.mean(first.depth[::4, ::4] > 0))
+    pose = pose if pose is not None and np.isfinite(pose).all() else None
+    return RgbdPair(first.index, second.index, a, depth, b, inliers, pose, displacement, share)
 
 
 def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
@@ -140,19 +127,21 @@ def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
     return np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners, np.float32).reshape(-1, 2)
 
 
-def _track(before: NDArray[np.uint8], after: NDArray[np.uint8], points: Pixels) -> tuple[Pixels, NDArray[np.bool_]]:
-    there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.empty_like(points), maxLevel=4)
-    back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, np.empty_like(points), maxLevel=4)
+def follow_corners(
+    before: NDArray[np.uint8], after: NDArray[np.uint8], points: Pixels, guess: Pixels, tolerance_px: float
+) -> tuple[Pixels, NDArray[np.bool_]]:
+    """Where corners ``[N, 2]`` of one image lie in the next one, and which were found, by pyramidal Lucas-Kanade.
+
+    A corner is found if it lies inside the image and, tracked back, ends within `tolerance_px` of where it began.
+    `guess` ``[N, 2]`` is where the search begins.
+    """
+    window: dict[str, int] = {"maxLevel": 4, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, guess.copy(), **window)
+    back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), **window)
     good = (status.reshape(-1) == 1) & (status_back.reshape(-1) == 1)
-    good &= np.linalg.norm(back - points, axis=1) < _BACK_AND_FORTH_PX
-    height, width = after.shape
-    good &= (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
+    good &= np.linalg.norm(back - points, axis=1) < tolerance_px
+    good &= (there >= 0).all(axis=1) & (there <= (after.shape[1] - 1, after.shape[0] - 1)).all(axis=1)
     return np.asarray(there, np.float32), np.asarray(good, np.bool_)
-
-
-def _at(depth: NDArray[np.float32], pixels: Pixels) -> Array:
-    x, y = np.round(pixels).astype(int).T
-    return np.asarray(depth[y, x], dtype=np.float64)
 
 
 # Motions of a ground truth, read in several conventions, compared with the measured ones.
@@ -182,19 +171,14 @@ class Motions:
     translation: Array
     depth_m: float
 
-    def select(self, index: NDArray[np.bool_]) -> Motions:
-        """Some of them."""
-        return Motions(self.start[index], self.end[index], self.rotation[index], self.translation[index], self.depth_m)
-
 
 def motions_of(pairs: PySequence[RgbdPair], stamps: Array) -> Motions:
     """The motions of pairs that have one."""
-    twists = se3.log(np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4))
     poses = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
     first, second = [pair.first for pair in pairs], [pair.second for pair in pairs]
     depths = [float(np.median(pair.depth_first[pair.inliers])) for pair in pairs]
     median = float(np.median(depths)) if depths else 1.0
-    return Motions(stamps[first], stamps[second], twists[:, 3:], poses[:, :3, 3], median)
+    return Motions(stamps[first], stamps[second], se3.log(poses)[:, 3:], poses[:, :3, 3], median)
 
 
 class TruthMotion:
@@ -206,11 +190,9 @@ class TruthMotion:
     """
 
     def __init__(self, truth: Trajectory, reading: str = READINGS[0]) -> None:
-        self.stamps = truth.timestamps
-        self.poses = read_as(truth.T_world_cam, reading)
-        steps = se3.inverse(self.poses[:-1]) @ self.poses[1:]
+        self.stamps, self.poses = truth.timestamps, read_as(truth.T_world_cam, reading)
+        steps, gaps = se3.inverse(self.poses[:-1]) @ self.poses[1:], np.diff(self.stamps)
         self._turns = se3.log(steps)[:, 3:] if len(steps) else np.zeros((0, 3))
-        gaps = np.diff(self.stamps)
         self._widest = max(0.12, 2.5 * float(np.median(gaps))) if len(gaps) else 0.0
 
     def at(self, stamps: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -220,44 +202,37 @@ class TruthMotion:
         index = np.clip(np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2)
         low, high = self.stamps[index], self.stamps[index + 1]
         share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
-        poses = self.poses[index].copy()
-        turn = np.zeros((len(stamps), 6))
+        poses, turn, slack = self.poses[index].copy(), np.zeros((len(stamps), 6)), 0.005
         turn[:, 3:] = share * self._turns[index]
         poses[:, :3, :3] = poses[:, :3, :3] @ se3.exp(turn)[:, :3, :3]
         poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
-        slack = 0.005
         inside = (stamps >= self.stamps[0] - slack) & (stamps <= self.stamps[-1] + slack)
         return poses, inside & (high - low <= self._widest)
 
     def between(self, start: Array, end: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Poses at `start`, relative poses from there to `end`, their rotation vectors, and which of them there are."""
-        first, valid = self.at(start)
-        second, valid_too = self.at(end)
+        (first, valid), (second, valid_too) = self.at(start), self.at(end)
         relative = se3.inverse(first) @ second
         return first, relative, se3.log(relative)[:, 3:], valid & valid_too
 
 
 def read_as(poses: Array, reading: str) -> Array:
     """Poses ``[N, 4, 4]`` of a file that was written in the convention `reading` and read as if in TUM's."""
-    if reading == READINGS[0]:
-        return poses
-    if reading == "inverted":
-        return se3.inverse(poses)
+    if reading.startswith("w first"):
+        position, quaternion = se3.to_quaternion(poses)
+        poses = se3.from_quaternion(position, quaternion[:, [1, 2, 3, 0]])
     if reading == "rotations inverted":
-        turned = poses.copy()
-        turned[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-        return turned
-    position, quaternion = se3.to_quaternion(poses)
-    turned = se3.from_quaternion(position, quaternion[:, [1, 2, 3, 0]])
-    return se3.inverse(turned) if reading == "w first, inverted" else turned
+        poses = poses.copy()
+        poses[:, :3, :3] = np.swapaxes(poses[:, :3, :3].copy(), 1, 2)
+    return se3.inverse(poses) if reading in ("inverted", "w first, inverted") else poses
 
 
-def agreement(measured: Array, true: Array, gain: float) -> float:
-    """How well vectors ``[N, 3]`` agree up to a gain: 1 - the weighted median of their relative differences.
+def agreement(measured: Array, true: Array, bounds: tuple[float, float] = (1e-6, 1e6)) -> float:
+    """How well vectors ``[N, 3]`` agree up to a gain within bounds: 1 - weighted median of their relative differences.
 
     1 is perfect; independent directions give some 0.3; less is the opposite.
     """
-    true = gain * true
+    true = best_gain(measured, true, *bounds) * true
     size = np.linalg.norm(measured, axis=1) + np.linalg.norm(true, axis=1)
     off = np.linalg.norm(measured - true, axis=1) / np.maximum(size, 1e-12)
     order = np.argsort(off)
@@ -267,7 +242,11 @@ def agreement(measured: Array, true: Array, gain: float) -> float:
     return 1.0 - float(off[order][np.searchsorted(total, total[-1] / 2)])
 
 
-def best_gain(measured: Array, true: Array, low: float, high: float) -> float:
+ROTATION_GAIN = (0.4, 2.5)
+"""Bounds of the ratio of measured to true rotations; that of translations is free."""
+
+
+def best_gain(measured: Array, true: Array, low: float = 1e-6, high: float = 1e6) -> float:
     """The ratio of the lengths of vectors, by their weighted sums, within bounds."""
     a, b = np.linalg.norm(measured, axis=1).sum(), np.linalg.norm(true, axis=1).sum()
     return float(np.clip(a / max(b, 1e-12), low, high))
@@ -275,16 +254,14 @@ def best_gain(measured: Array, true: Array, low: float, high: float) -> float:
 
 def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Array:
     """The orthogonal matrix ``[3, 3]`` that turns `measured` ``[N, 3]`` into `true` best, by three robust rounds."""
-    weight = np.ones(len(measured))
-    X = np.eye(3)
-    gain = 1.0 / best_gain(measured, true, 1e-6, 1e6)
+    weight, X, gain = np.ones(len(measured)), np.eye(3), 1.0 / best_gain(measured, true)
     for _ in range(4):
         left, _, right = np.linalg.svd((true * weight[:, None]).T @ measured)
         sign = np.linalg.det(left @ right) if proper else 1.0
         X = left @ np.diag([1.0, 1.0, sign]) @ right
         off = np.linalg.norm(true - gain * measured @ X.T, axis=1)
         weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-12)) ** 2)
-    return np.asarray(X)
+    return X
 
 
 @dataclass(frozen=True)
@@ -294,26 +271,25 @@ class Match:
     Attributes:
         reading: One of `READINGS`.
         shift_s: What is added to the images' stamps to find their poses.
+        share: Part of the motions for which the truth has poses.
         rotation: `agreement` of the rotations.
         translation: `agreement` of the translations.
         weights: What either counts: near 1 where the motion is far above the noise.
         gain: Ratio of the lengths of the measured translations to the true ones.
-        share: Part of the motions for which the truth has poses.
     """
 
     reading: str
     shift_s: float
-    rotation: float
-    translation: float
-    weights: tuple[float, float]
-    gain: float
     share: float
+    rotation: float = 0.0
+    translation: float = 0.0
+    weights: tuple[float, float] = (0.0, 0.0)
+    gain: float = 1.0
 
     @property
     def total(self) -> float:
         """Weighted mean of both agreements."""
-        w = self.weights
-        return (w[0] * self.rotation + w[1] * self.translation) / max(w[0] + w[1], 1e-9)
+        return weighted_mean(self.rotation, self.translation, self.weights)
 
     @property
     def clearest(self) -> float:
@@ -321,23 +297,20 @@ class Match:
         return max(self.total, self.rotation) if self.weights[0] >= 0.5 else self.total
 
 
+def weighted_mean(rotation: float, translation: float, weights: tuple[float, float]) -> float:
+    """Mean of the agreements of rotations and translations."""
+    return (weights[0] * rotation + weights[1] * translation) / max(sum(weights), 1e-9)
+
+
 def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) -> Match:
     """Compare the motions with those of a truth under a shift in time."""
     _, relative, turns, valid = truth.between(motions.start + shift_s, motions.end + shift_s)
     share = float(valid.mean()) if len(valid) else 0.0
     if valid.sum() < 5:
-        return Match(reading, shift_s, 0.0, 0.0, (0.0, 0.0), 1.0, share)
-    v, tau = motions.rotation[valid], motions.translation[valid]
-    rho, turns = relative[valid, :3, 3], turns[valid]
-    snr = float(np.median(np.linalg.norm(v, axis=1))) / ROTATION_NOISE
-    snr_t = float(np.median(np.linalg.norm(tau, axis=1))) / (TRANSLATION_NOISE * motions.depth_m)
-    gain = best_gain(tau, rho, 1e-6, 1e6)
-    return Match(
-        reading,
-        shift_s,
-        agreement(v, turns, best_gain(v, turns, 0.4, 2.5)),
-        agreement(tau, rho, gain),
-        (snr**2 / (4 + snr**2), snr_t**2 / (4 + snr_t**2)),
-        gain,
-        share,
-    )
+        return Match(reading, shift_s, share)
+    rotation, translation, true = motions.rotation[valid], motions.translation[valid], relative[valid, :3, 3]
+    noise = ((rotation, ROTATION_NOISE), (translation, TRANSLATION_NOISE * motions.depth_m))
+    snr, snr_t = (float(np.median(np.linalg.norm(vectors, axis=1))) / sigma for vectors, sigma in noise)
+    weights = snr**2 / (4 + snr**2), snr_t**2 / (4 + snr_t**2)
+    alike = agreement(rotation, turns[valid], ROTATION_GAIN), agreement(translation, true)
+    return Match(reading, shift_s, share, *alike, weights, best_gain(translation, true))

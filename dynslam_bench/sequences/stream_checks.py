@@ -7,8 +7,10 @@ are synchronous.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -43,11 +45,6 @@ def fault(id: str, value: float | None, unit: str, text: str, cure: str) -> Find
     return Finding(id, "fault", None if value is None else float(value), unit, text, cure)
 
 
-def note(id: str, value: float | None, unit: str, text: str, cure: str) -> Finding:
-    """A finding that is good to know."""
-    return Finding(id, "note", None if value is None else float(value), unit, text, cure)
-
-
 Map = NDArray[np.float32]
 
 MAP_WIDTH = 160
@@ -64,88 +61,85 @@ class Streams:
     Attributes:
         depth_factor: Raw units a metre.
         seconds_a_frame: Median interval of the stamps.
-        frames: How many frames were added.
-        dark: How many have a colour image without contrast.
+        dark: How many frames have a colour image without contrast.
         empty: How many have no depth.
         medians: Median depth of each frame that has any, metres.
         colour_run: Most equal colour images in a row.
         depth_run: Most equal depth images in a row.
         rough: Median step between neighbouring raw depths relative to the depth, and the same with swapped bytes.
-        by_flip: Sum of the correlations of the contours over circular shifts ``[H, W]``, for each of `FLIPS`.
-        by_shift: The same as they are, for each delay of the depth ``[2 * MOST_DELAY + 1, H, W]``.
-        by_delay: Correlation of the contours of each colour image with those of depth images up to `MOST_DELAY` frames
-            before and after ``[N, 2 * MOST_DELAY + 1]``; NaN beyond the stretch.
+        contours: Of each stretch the maps of contours of its colour and of its depth images, both ``[N, H, W]``.
         cell_px: Pixels a cell of the maps.
     """
 
     depth_factor: float
     seconds_a_frame: float
-    frames: int = 0
     dark: int = 0
     empty: int = 0
     medians: list[float] = field(default_factory=list)
     colour_run: int = 1
     depth_run: int = 1
     rough: list[tuple[float, float]] = field(default_factory=list)
-    by_flip: dict[str, Map] = field(default_factory=dict)
-    by_shift: Map = field(default_factory=lambda: np.zeros(0, np.float32))
-    shifted: NDArray[np.intp] = field(default_factory=lambda: np.zeros(2 * MOST_DELAY + 1, np.intp))
-    by_delay: list[NDArray[np.float64]] = field(default_factory=list)
+    contours: list[tuple[Map, Map]] = field(default_factory=list)
     cell_px: int = 1
+
+    @property
+    def frames(self) -> int:
+        """How many frames were added."""
+        return sum(len(colour) for colour, _ in self.contours)
 
     def add(self, stretch: list[Frame]) -> None:
         """Add consecutive frames of one size."""
         colour_maps, depth_maps = [], []
-        colour_run = depth_run = 1
+        self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
+        self.colour_run = max(self.colour_run, _longest_run([frame.rgb for frame in stretch]))
+        self.depth_run = max(self.depth_run, _longest_run([frame.depth for frame in stretch]))
         for number, frame in enumerate(stretch):
-            if number:
-                before = stretch[number - 1]
-                colour_run = colour_run + 1 if np.array_equal(frame.rgb, before.rgb) else 1
-                depth_run = depth_run + 1 if np.array_equal(frame.depth, before.depth) else 1
-                self.colour_run, self.depth_run = max(self.colour_run, colour_run), max(self.depth_run, depth_run)
             gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
             valid = frame.depth[::4, ::4]
             valid = valid[valid > 0]
-            self.frames += 1
             self.dark += bool(gray.std() < 1.0)
             self.empty += bool(len(valid) < 100)
             if len(valid) >= 100:
                 self.medians.append(float(np.median(valid)))
                 if number % 5 == 0:
                     self.rough.append(_roughness(frame.depth, self.depth_factor))
-            self.cell_px = max(1, round(gray.shape[1] / MAP_WIDTH))
             colour_maps.append(_standardised(_colour_contours(gray, self.cell_px)))
             depth_maps.append(_standardised(_depth_contours(frame.depth, self.cell_px)))
-        self._correlate(colour_maps, depth_maps)
+        self.contours.append((np.stack(colour_maps), np.stack(depth_maps)))
 
-    def _correlate(self, colour_maps: list[Map], depth_maps: list[Map]) -> None:
-        shape = colour_maps[0].shape
-        colours = [np.fft.rfft2(colour) for colour in colour_maps]
-        depths = [np.conj(np.fft.rfft2(depth)) for depth in depth_maps]
-        sums = np.zeros((2 * MOST_DELAY + 1, *colours[0].shape), np.complex128)
-        for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
-            for index in range(0, len(colours), 2):
-                if 0 <= index + delay < len(depths):
-                    sums[column] += colours[index] * depths[index + delay]
-                    self.shifted[column] += 1
-        surfaces = np.fft.irfft2(sums, s=shape).astype(np.float32)
-        self.by_shift = surfaces if not len(self.by_shift) else self.by_shift + surfaces
-        for name, (rows, columns) in FLIPS.items():
-            flipped = sum(
-                colour * np.conj(np.fft.rfft2(depth[::rows, ::columns]))
-                for colour, depth in zip(colours[::4], depth_maps[::4], strict=True)
-            )
-            surface = np.fft.irfft2(flipped, s=shape).astype(np.float32)
-            self.by_flip[name] = self.by_flip.get(name, np.zeros_like(surface)) + surface
-        smooth = [np.stack([cv2.GaussianBlur(contours, (0, 0), 1.0).ravel() for contours in maps])
-                  for maps in (colour_maps, depth_maps)]  # fmt: skip
-        products = smooth[0] @ smooth[1].T
-        scores = np.full((len(products), 2 * MOST_DELAY + 1), np.nan)
-        for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
-            diagonal = np.diagonal(products, delay)
-            first = max(0, -delay)
-            scores[first : first + len(diagonal), column] = diagonal
-        self.by_delay.extend(scores)
+
+def _longest_run(images: list[NDArray[Any]]) -> int:
+    """Most equal images in a row."""
+    longest = run = 1
+    for before, after in itertools.pairwise(images):
+        run = run + 1 if np.array_equal(before, after) else 1
+        longest = max(longest, run)
+    return longest
+
+
+def _correlation(colour: Map, depth: Map) -> Map:
+    """Sum of the circular correlations ``[H, W]`` of maps of the colour with maps of the depth, both ``[N, H, W]``."""
+    spectrum = (np.fft.rfft2(colour) * np.conj(np.fft.rfft2(depth))).sum(axis=0)
+    return np.fft.irfft2(spectrum, s=colour.shape[1:]).astype(np.float32)
+
+
+def _by_delay(streams: Streams, delays: Sequence[int]) -> tuple[Map, NDArray[np.intp]]:
+    """Correlation of every second colour image with the depth so many frames later.
+
+    Returns:
+        Sums over all pairs ``[D, H, W]``, and how many pairs each sums ``[D]``.
+    """
+    shape = streams.contours[0][0].shape[1:]
+    surfaces, pairs = np.zeros((len(delays), *shape), np.float32), np.zeros(len(delays), np.intp)
+    for colour, depth in streams.contours:
+        colours, depths = np.fft.rfft2(colour), np.conj(np.fft.rfft2(depth))
+        for row, delay in enumerate(delays):
+            index = np.arange(0, len(colour), 2)
+            index = index[(index + delay >= 0) & (index + delay < len(depth))]
+            spectrum = (colours[index] * depths[index + delay]).sum(axis=0)
+            surfaces[row] += np.fft.irfft2(spectrum, s=shape).astype(np.float32)
+            pairs[row] += len(index)
+    return surfaces, pairs
 
 
 def _roughness(depth: Map, factor: float) -> tuple[float, float]:
@@ -153,13 +147,9 @@ def _roughness(depth: Map, factor: float) -> tuple[float, float]:
     both = (raw[:, 1:] > 0) & (raw[:, :-1] > 0)
     if both.sum() < 100:
         return np.nan, np.nan
-    steps = []
-    for values in (raw, raw.byteswap()):
-        wide = values.astype(np.float64)
-        steps.append(
-            float(np.mean(np.minimum(np.abs(np.diff(wide, axis=1))[both] / np.maximum(wide[:, 1:], 1)[both], 1)))
-        )
-    return steps[0], steps[1]
+    wide = np.stack([raw, raw.byteswap()]).astype(np.float64)
+    steps = np.minimum(np.abs(np.diff(wide, axis=2)) / np.maximum(wide[:, :, 1:], 1), 1)[:, both].mean(axis=1)
+    return float(steps[0]), float(steps[1])
 
 
 def _colour_contours(gray: NDArray[np.uint8], cell: int) -> Map:
@@ -172,10 +162,8 @@ def _depth_contours(depth: Map, cell: int) -> Map:
     """The step in depth around each cell, as a logarithm; missing depth is no contour."""
     rows, columns = depth.shape[0] // cell, depth.shape[1] // cell
     blocks = depth[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
-    far = cv2.dilate(blocks.max(axis=(1, 3)), np.ones((3, 3), np.uint8))
-    near = cv2.erode(
-        np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3)).astype(np.float32), np.ones((3, 3), np.uint8)
-    )
+    around, least = np.ones((3, 3), np.uint8), np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3))
+    far, near = cv2.dilate(blocks.max(axis=(1, 3)), around), cv2.erode(least.astype(np.float32), around)
     valid = (far > 0) & np.isfinite(near)
     steps = np.log(np.where(valid, far / np.where(valid, near, 1), 1))
     return np.where(valid, np.minimum(steps, 0.3), 0).astype(np.float32)
@@ -205,13 +193,12 @@ def stream_findings(streams: Streams, with_depth: bool = True) -> list[Finding]:
         streams: Statistics of the frames that were read.
         with_depth: Whether the sequence announces depth images.
     """
-    text = "the sequence has no depth images: only the colour images were checked"
-    no_depth = [] if with_depth else [note("no-depth", None, "", text, "add depth images to check more")]
     for check in (_empty, _frozen, _swapped, _units, _flipped, _asynchronous, _shifted) if with_depth else (_empty,):
         finding = check(streams)
-        if finding is not None:
-            return [finding] if with_depth or finding.id == "colour-blank" else no_depth
-    return no_depth
+        if finding is not None and (with_depth or finding.id == "colour-blank"):
+            return [finding]
+    text = "the sequence has no depth images: only the colour images were checked"
+    return [] if with_depth else [Finding("no-depth", "note", None, "", text, "add depth images to check more")]
 
 
 def _empty(streams: Streams) -> Finding | None:
@@ -257,7 +244,10 @@ def _units(streams: Streams) -> Finding | None:
 
 
 def _flipped(streams: Streams) -> Finding | None:
-    peaks = {name: _peak(surface, 8)[0] for name, surface in streams.by_flip.items()}
+    peaks = {}
+    for name, (rows, columns) in FLIPS.items():
+        parts = [_correlation(colour[::4], depth[::4, ::rows, ::columns]) for colour, depth in streams.contours]
+        peaks[name] = _peak(np.sum(parts, axis=0), 8)[0]
     best = max(peaks, key=lambda name: peaks[name])
     if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
         return None
@@ -269,12 +259,11 @@ def _flipped(streams: Streams) -> Finding | None:
 
 
 def _asynchronous(streams: Streams) -> Finding | None:
-    rows = np.array(streams.by_delay)
+    rows = np.concatenate([_agreements(colour, depth) for colour, depth in streams.contours])
     pairs = np.isfinite(rows).sum(axis=0)
     usable = pairs >= max(10, 0.3 * len(rows))
-    peaks = np.array(
-        [_peak(surface, 30)[0] if good else 0.0 for surface, good in zip(streams.by_shift, usable, strict=True)]
-    )
+    surfaces, _ = _by_delay(streams, range(-MOST_DELAY, MOST_DELAY + 1))
+    peaks = np.array([_peak(surface, 30)[0] if good else 0.0 for surface, good in zip(surfaces, usable, strict=True)])
     mean = np.where(usable, np.nansum(rows, axis=0) / np.maximum(pairs, 1), -np.inf)
     column = int(np.argmax(mean))
     delay = float(column - MOST_DELAY)
@@ -299,11 +288,25 @@ def _asynchronous(streams: Streams) -> Finding | None:
     return fault("depth-delay", seconds, "s", text, cure)
 
 
-def _shifted(streams: Streams) -> Finding | None:
-    middle = (
-        streams.by_shift[MOST_DELAY - 1 : MOST_DELAY + 2]
-        / np.maximum(streams.shifted[MOST_DELAY - 1 : MOST_DELAY + 2], 1)[:, None, None]
+def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
+    """Correlation of the contours of each colour image with those of depth images before and after it.
+
+    ``[N, 2 * MOST_DELAY + 1]``; NaN beyond the stretch.
+    """
+    colour, depth = (
+        np.stack([cv2.GaussianBlur(contours, (0, 0), 1.0).ravel() for contours in maps])
+        for maps in (colour_maps, depth_maps)
     )
+    products, scores = colour @ depth.T, np.full((len(colour), 2 * MOST_DELAY + 1), np.nan)
+    for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
+        diagonal, first = np.diagonal(products, delay), max(0, -delay)
+        scores[first : first + len(diagonal), column] = diagonal
+    return scores
+
+
+def _shifted(streams: Streams) -> Finding | None:
+    sums, pairs = _by_delay(streams, (-1, 0, 1))
+    middle = sums / np.maximum(pairs, 1)[:, None, None]
     peaks = [(*_peak(surface, 30), surface) for surface in middle]
     clear, (row, column), surface = max(peaks, key=lambda peak: float(peak[2][peak[1]]))
     shape = middle.shape[1:]

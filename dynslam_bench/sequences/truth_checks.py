@@ -12,6 +12,7 @@ from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import nearest_gap
@@ -19,18 +20,19 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.rgbd_motion import (
     READINGS,
+    ROTATION_GAIN,
     ROTATION_NOISE,
     Match,
     Motions,
     RgbdPair,
     TruthMotion,
     agreement,
-    best_gain,
     match,
     motions_of,
     rotation_between,
+    weighted_mean,
 )
-from dynslam_bench.sequences.stream_checks import Finding, fault, note
+from dynslam_bench.sequences.stream_checks import Finding, fault
 
 Array = NDArray[np.float64]
 total = attrgetter("total")
@@ -82,7 +84,7 @@ def truth_findings(
     """
     if truth is None:
         text = "there is no ground truth: units of the depth, intrinsics and time were not compared with any"
-        return [note("no-truth", None, "", text, "add groundtruth.txt to check more")]
+        return [Finding("no-truth", "note", None, "", text, "add groundtruth.txt to check more")]
     begin, end = truth.timestamps[[0, -1]]
     apart = max(begin - stamps[-1], stamps[0] - end)
     if apart > 0:
@@ -99,29 +101,28 @@ def truth_findings(
     usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
     displacement = float(np.median([pair.displacement_px for pair in usable])) if usable else np.inf
     if displacement < REST_PX and len(usable) >= 3:
-        return [_at_rest(stamps, truth, camera, usable, displacement)]
+        return [_at_rest(TruthMotion(truth), camera, motions_of(usable, stamps), displacement)]
     if len(usable) < LEAST_PAIRS:
         text = (
             f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: "
             "truth and camera were not compared"
         )
-        return [note("motion-unmeasured", len(usable), "pairs", text, "check a part with more texture")]
+        return [
+            Finding("motion-unmeasured", "note", float(len(usable)), "pairs", text, "check a part with more texture")
+        ]
     return _compared(stamps, truth, camera, [pair for pair in usable if pair.displacement_px >= REST_PX], len(pairs))
 
 
-def _at_rest(
-    stamps: Array, truth: Trajectory, camera: Camera, pairs: PySequence[RgbdPair], displacement: float
-) -> Finding:
+def _at_rest(truth: TruthMotion, camera: Camera, motions: Motions, displacement: float) -> Finding:
     """Images that do not move beside a truth that does, or does not either."""
-    motions = motions_of(pairs, stamps)
-    _, relative, turns, valid = TruthMotion(truth).between(motions.start, motions.end)
+    _, relative, turns, valid = truth.between(motions.start, motions.end)
     moves = np.linalg.norm(turns, axis=1) + np.linalg.norm(relative[:, :3, 3], axis=1) / motions.depth_m
     expected = camera.fx * float(np.median(moves[valid])) if valid.any() else 0.0
     if expected > 10 * REST_PX:
         text = f"the truth moves the image by {expected:.0f} pixels between frames that move by {displacement:.1f}"
         return fault("truth-other-sequence", expected, "px", text, "take the truth of this recording")
     text = f"the camera rests (the image moves by {displacement:.1f} pixels): truth and intrinsics cannot be compared"
-    return note("no-motion", displacement, "px", text, "check a part in which the camera moves")
+    return Finding("no-motion", "note", displacement, "px", text, "check a part in which the camera moves")
 
 
 def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair], tried: int) -> list[Finding]:
@@ -129,12 +130,12 @@ def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[Rgbd
     readings = {reading: TruthMotion(truth, reading) for reading in READINGS}
     steps = round(LARGEST_SHIFT_S / _STEP_S)
     shifts = _STEP_S * np.arange(-steps, steps + 1)  # exact multiples: the same limits early and late
-    matches = [match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts]
-    matches = [candidate for candidate in matches if candidate.share >= 0.5]
+    every = [match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts]
+    matches = [candidate for candidate in every if candidate.share >= 0.5]
     near = [one for one in matches if one.reading == READINGS[0] and abs(one.shift_s) < LEAST_TIME_S]
     if not near or sum(near[0].weights) < 0.4:
         text = f"only {len(pairs)} pairs of frames with a small motion share time with the truth: it cannot be compared"
-        return [note("motion-unmeasured", float(len(pairs)), "pairs", text, "check a longer part")]
+        return [Finding("motion-unmeasured", "note", float(len(pairs)), "pairs", text, "check a longer part")]
     stated, best = max(near, key=total), max(matches, key=total)
     unshifted = min(near, key=lambda one: abs(one.shift_s))
     if unshifted.total > stated.total - 0.02:
@@ -178,9 +179,9 @@ def _otherwise(
             _, _, turns, valid = readings[reading].between(motions.start + shift, motions.end + shift)
             if valid.mean() < 0.5:
                 continue
-            v, true = motions.rotation[valid], turns[valid]
-            X = rotation_between(v, true)
-            alike = agreement(v @ X.T, true, best_gain(v, true, 0.4, 2.5))
+            measured, true = motions.rotation[valid], turns[valid]
+            X = rotation_between(measured, true)
+            alike = agreement(measured @ X.T, true, ROTATION_GAIN)
             closest = max(closest, alike)
             if alike >= GOOD and reading == READINGS[0]:
                 return [_axes(X, alike, stated)]
@@ -196,23 +197,26 @@ def _otherwise(
         "it may belong to another recording"
     )
     cure = "make sure that groundtruth.txt is this recording's, or check a part with a clearer motion"
-    return [note("truth-unclear", stated.total, "", text, cure)]
+    return [Finding("truth-unclear", "note", stated.total, "", text, cure)]
 
 
 def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) -> Finding | None:
     """Other axes, where these explain rotations and translations better than another reading of the file."""
     _, relative, turns, valid = truth.between(motions.start, motions.end)
-    v, tau, rho, turns = motions.rotation[valid], motions.translation[valid], relative[valid, :3, 3], turns[valid]
-    X = rotation_between(v, turns)
-    rotation = agreement(v @ X.T, turns, best_gain(v, turns, 0.4, 2.5))
-    translation = agreement(tau @ X.T, rho, best_gain(tau, rho, 1e-6, 1e6))
-    w = stated.weights
-    total = (w[0] * rotation + w[1] * translation) / max(sum(w), 1e-9)
+    X = rotation_between(motions.rotation[valid], turns[valid])
+    rotation = agreement(motions.rotation[valid] @ X.T, turns[valid], ROTATION_GAIN)
+    translation = agreement(motions.translation[valid] @ X.T, relative[valid, :3, 3])
+    total = weighted_mean(rotation, translation, stated.weights)
     return _axes(X, rotation, stated) if total > best.total + 0.03 else None
 
 
+def _degrees(X: Array) -> float:
+    """The angle of an orthogonal matrix."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(X) - 1) / 2, -1, 1))))
+
+
 def _axes(X: Array, alike: float, stated: Match) -> Finding:
-    angle = float(np.degrees(np.arccos(np.clip((np.trace(X) - 1) / 2, -1, 1))))
+    angle = _degrees(X)
     text = (
         f"the truth's axes are turned by {angle:.0f} degrees against the camera's: so they explain "
         f"{100 * alike:.0f} % of the images' rotation, as stored {100 * stated.rotation:.0f} %"
@@ -237,48 +241,43 @@ def _measured(
     agreeing = valid & (np.linalg.norm(motions.rotation - turns, axis=1) < 0.5 * size)
     if agreeing.sum() < LEAST_PAIRS:
         return []
-    kept, first, relative = motions.select(agreeing), first[agreeing], relative[agreeing]
-    clear = stated.weights[1] >= 0.4
+    relative, clear = relative[agreeing], stated.weights[1] >= 0.4
     if stated.gain < 0.05:
         return [_scale(1 / stated.gain, camera, motions)]
-    chosen = [pair for pair, use in zip(pairs, agreeing, strict=True) if use]
-    fitted = _fitted(chosen, relative, camera)
+    fitted = _fitted([pair for pair, use in zip(pairs, agreeing, strict=True) if use], relative, camera)
     if not fitted and clear and stated.translation >= 0.7 and abs(np.log(stated.gain)) > np.log(1.5):
         return [_scale(1 / stated.gain, camera, motions)]
     if not fitted and clear and stated.translation < UNLIKE:
-        turned = _positions(kept, first, relative, stated)
-        return [] if turned is None else [turned]
+        return _positions(motions.translation[agreeing], first[agreeing, :3, :3], relative[:, :3, 3], stated)
     return fitted
 
 
 def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
     """The true translations are `factor` times the measured ones."""
-    power = 3 if factor > 300 else 2
-    unit = {3: "millimetres", 2: "centimetres"}[power] if factor > 30 else ""
     text = f"the truth's translations are {factor:.4g} times the measured ones (median depth {motions.depth_m:.2f} m)"
-    if unit and 0.15 < motions.depth_m < 20:
-        cure = f"divide the positions of groundtruth.txt by {10**power}"
+    if factor > 30 and 0.15 < motions.depth_m < 20:
+        unit, divisor = ("millimetres", 1000) if factor > 300 else ("centimetres", 100)
+        cure = f"divide the positions of groundtruth.txt by {divisor}"
         return fault("truth-scale", factor, "", f"{text}: they are in {unit}", cure)
     cure = f"set depth_factor = {camera.depth_factor / factor:.4g} in camera.toml (it is {camera.depth_factor:g})"
     return fault("depth-factor", factor, "", text, f"{cure}, unless the truth is not in metres")
 
 
-def _positions(motions: Motions, first: Array, relative: Array, stated: Match) -> Finding | None:
-    """Positions in other axes than the orientations, or mirrored."""
-    steps = np.einsum("nij,nj->ni", first[:, :3, :3], relative[:, :3, 3])
-    own = np.einsum("nij,nj->ni", first[:, :3, :3], motions.translation)
-    for measured, true, where in ((own, steps, "world"), (motions.translation, relative[:, :3, 3], "camera")):
+def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Match) -> list[Finding]:
+    """Positions in other axes than the orientations, or mirrored, of translations in the camera's axes ``[N, 3]``."""
+    in_world = [np.einsum("nij,nj->ni", R_world_first, each) for each in (steps, true_steps)]
+    for measured, true, where in ((*in_world, "world"), (steps, true_steps, "camera")):
         W = rotation_between(measured, true, proper=False)
-        alike = agreement(measured @ W.T, true, best_gain(measured, true, 1e-6, 1e6))
-        angle = float(np.degrees(np.arccos(np.clip((np.trace(W) - 1) / 2, -1, 1))))
+        alike = agreement(measured @ W.T, true)
+        angle = _degrees(W)
         if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
             how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
             text = (
                 f"the truth's positions are {how} in the {where}'s axes against its orientations: so they explain "
                 f"{100 * alike:.0f} % of the images' translation, as stored {100 * stated.translation:.0f} %"
             )
-            return fault("truth-axes", angle, "degrees", text, "use one right-handed frame for both")
-    return None
+            return [fault("truth-axes", angle, "degrees", text, "use one right-handed frame for both")]
+    return []
 
 
 def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> list[Finding]:
@@ -367,42 +366,27 @@ _CORNERS_A_PAIR = 25
 _OUTLIER_PX = 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Corners:
-    """Corners of all pairs, the pair of each, and the truth's motions back to the second frames."""
+def _reprojection_errors(
+    x: Array, camera: Camera, pair: NDArray[np.intp], first: Array, depth: Array, second: Array, back: Array
+) -> Array:
+    """Reprojection errors ``[N, 2]`` in pixels under the values ``[10]``.
 
-    camera: Camera
-    pair: NDArray[np.intp]
-    first: Array
-    depth: Array
-    second: Array
-    back: Array
-
-    def errors(self, x: Array) -> Array:
-        """Reprojection errors ``[N, 2]`` in pixels under the values ``[10]``."""
-        focal = np.exp(x[0]) * np.array([self.camera.fx, self.camera.fy])
-        centre = np.array([self.camera.cx, self.camera.cy]) + x[1:3]
-        rays = np.concatenate([(self.first - centre) / focal, np.ones((len(self.first), 1))], axis=1)
-        mount = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
-        mount[:3, 3] = x[7:10]
-        moves = se3.inverse(mount) @ self.back @ mount
-        points = np.exp(x[3]) * self.depth[:, None] * rays
-        moved = np.einsum("nij,nj->ni", moves[self.pair, :3, :3], points) + moves[self.pair, :3, 3]
-        return np.asarray(moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre - self.second)
-
-    def deviations(self, x: Array, index: NDArray[np.intp], pairs: int) -> Array:
-        """Standard deviations of the fitted values, each pair being one observation (a sandwich estimate)."""
-        left = self.errors(x)
-        weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))
-        slopes = np.stack([(self.errors(x + s) - self.errors(x - s)) / (2 * s.sum()) for s in np.diag(_STEPS)], axis=-1)
-        prior = np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
-        curvature = np.einsum("npi,n,npj->ij", slopes, weight, slopes) + prior
-        pulls = np.zeros((pairs, len(x)))
-        np.add.at(pulls, self.pair, np.einsum("npi,n,np->ni", slopes, weight, left))
-        chosen = np.ix_(index, index)
-        inverse = np.linalg.inv(curvature[chosen])
-        spread = inverse @ (pulls.T @ pulls + prior)[chosen] @ inverse
-        return np.asarray(np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(pairs / max(pairs - len(index), 1)))
+    Args:
+        x: The values, in the order of `_PARAMETERS`.
+        camera: The stated camera.
+        pair: The pair of each corner ``[N]``.
+        first: Its pixels in the first frame ``[N, 2]``.
+        depth: Its depth there ``[N]``.
+        second: Its pixels in the second frame ``[N, 2]``.
+        back: The truth's motions back to the second frames, of all pairs ``[M, 4, 4]``.
+    """
+    focal, centre = np.exp(x[0]) * np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]) + x[1:3]
+    rays = np.concatenate([(first - centre) / focal, np.ones((len(first), 1))], axis=1)
+    mount = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
+    mount[:3, 3] = x[7:10]
+    moves = (se3.inverse(mount) @ back @ mount)[pair]
+    moved = np.einsum("nij,nj->ni", moves[:, :3, :3], np.exp(x[3]) * depth[:, None] * rays) + moves[:, :3, 3]
+    return np.asarray(moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre - second)
 
 
 def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, free: PySequence[str]) -> Fit:
@@ -417,25 +401,25 @@ def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, fre
         camera: The stated camera.
         free: Names of what is fitted, of `Fit.value`; the rest stays as stated.
     """
-    from scipy.optimize import least_squares
-
     chosen = [np.flatnonzero(pair.inliers) for pair in pairs]
     chosen = [index[:: max(1, len(index) // _CORNERS_A_PAIR)][:_CORNERS_A_PAIR] for index in chosen]
     first, depth, second = (
         np.concatenate([getattr(pair, name)[index] for pair, index in zip(pairs, chosen, strict=True)])
         for name in ("pixels_first", "depth_first", "pixels_second")
     )
-    number = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen])
-    corners = _Corners(camera, number, first, depth, second, se3.inverse(relative))
-    index = np.array([i for name in free for i in range(10)[_PARAMETERS[name]]], np.intp)
+    number, back = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen]), se3.inverse(relative)
+    index = np.concatenate([np.arange(10)[_PARAMETERS[name]] for name in free]).astype(np.intp) if free else []
 
     def filled(part: Array) -> Array:
         x = np.zeros(10)
         x[index] = part
         return x
 
+    def errors(x: Array) -> Array:
+        return _reprojection_errors(x, camera, number, first, depth, second, back)
+
     def robust(part: Array) -> Array:
-        raw = corners.errors(filled(part)) / _OUTLIER_PX
+        raw = errors(filled(part)) / _OUTLIER_PX
         square = (raw**2).sum(axis=1, keepdims=True)
         shrunk = raw * np.sqrt(2 * (np.sqrt(1 + square) - 1) / np.maximum(square, 1e-12))
         return np.concatenate([shrunk.ravel(), filled(part) / _PRIOR])
@@ -443,10 +427,19 @@ def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, fre
     part = np.zeros(len(index))
     if len(index):
         part = np.asarray(least_squares(robust, part, x_scale=_SCALES[index]).x, np.float64)
-    x, deviation = filled(part), filled(corners.deviations(filled(part), index, len(pairs)))
+    x, left = filled(part), errors(filled(part))
+    # Standard deviations by a sandwich estimate, each pair of frames being one observation.
+    weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))
+    slopes = np.stack([(errors(x + s) - errors(x - s)) / (2 * s.sum()) for s in np.diag(_STEPS)], axis=-1)
+    prior, pulls = np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2, np.zeros((len(pairs), 10))
+    np.add.at(pulls, number, np.einsum("npi,n,np->ni", slopes, weight, left))
+    free_part = np.ix_(index, index)
+    inverse = np.linalg.inv((np.einsum("npi,n,npj->ij", slopes, weight, slopes) + prior)[free_part])
+    spread = inverse @ (pulls.T @ pulls + prior)[free_part] @ inverse
+    deviation = np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(len(pairs) / max(len(pairs) - len(index), 1))
     return Fit(
         {name: x[where] for name, where in _PARAMETERS.items()},
-        {name: deviation[where] for name, where in _PARAMETERS.items()},
-        float(np.median(np.linalg.norm(corners.errors(x), axis=1))),
+        {name: filled(deviation)[where] for name, where in _PARAMETERS.items()},
+        float(np.median(np.linalg.norm(left, axis=1))),
         float((robust(part) ** 2).sum() / len(first)),
     )

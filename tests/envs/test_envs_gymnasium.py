@@ -16,9 +16,9 @@ from gymnasium.utils.env_checker import check_env
 import dynslam_bench.envs
 from dynslam_bench.envs import GENERIC_ID, SlamEnv, env_id, register_envs
 from dynslam_bench.sequences.catalogue import sequence_ids
-from dynslam_bench.sequences.synthetic.ids import FAMILIES
+from dynslam_bench.sequences.synthetic.ids import SYNTHETIC_IDS
 
-SYNTHETIC = [family.ids()[0] for family in FAMILIES.values()]
+SYNTHETIC = SYNTHETIC_IDS[::4]
 CONTROL = ["noise.level_m", "noise.clip", "noise.passes", "noise.enabled"]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import logging
-import math
 import multiprocessing
 import os
 import sys
@@ -18,11 +17,11 @@ from .campaign import Result, attack
 from .test_fuzz import TARGETS
 
 
-def _job(number: int, seconds: float, inputs: float, seed: int, findings: Path) -> Result:
+def _job(number: int, seconds: float, seed: int, findings: Path) -> Result:
     """One reader, in a process of the pool: a crash of native code is a finding."""
     logging.disable(logging.CRITICAL)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libpng and libjpeg comment on every file
-    result = attack(TARGETS[number], seconds=seconds, inputs=inputs, seed=seed)
+    result = attack(TARGETS[number], seconds=seconds, seed=seed)
     for data in result.findings.values():
         name = f"{TARGETS[number].name.replace(' ', '-')}-{hashlib.sha256(data or b'').hexdigest()[:8]}"
         (findings / name).write_bytes(data or b"")
@@ -33,7 +32,6 @@ def main() -> int:
     """Attack and print a line a reader; 1 if anything escaped."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="processor time of all readers together")
-    parser.add_argument("--inputs", type=float, default=math.inf, help="of each reader; the time may end it before")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=int(time.time()), help="of the damage; another one every time")
     parser.add_argument("--reader", action="append", help="only this reader; repeatable")
@@ -48,7 +46,7 @@ def main() -> int:
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(options.jobs, context) as pool:
         jobs = {
-            pool.submit(_job, number, seconds, options.inputs, options.seed, options.findings): TARGETS[number].name
+            pool.submit(_job, number, seconds, options.seed, options.findings): TARGETS[number].name
             for number in chosen
         }
         for job in as_completed(jobs):
@@ -58,10 +56,9 @@ def main() -> int:
                 result = Result(findings={f"its process ended: {error}": None})
             inputs += result.inputs
             escaped |= bool(result.findings)
-            said = "; ".join(result.findings)
-            sys.stdout.write(f"{jobs[job]:32s} {result.inputs:9d} inputs, {result.refused:9d} refused  {said}\n")
-            sys.stdout.flush()
-    sys.stdout.write(f"{inputs} inputs, {len(chosen)} readers, seed {options.seed}\n")
+            findings = "; ".join(result.findings)
+            print(f"{jobs[job]:32s} {result.inputs:9d} inputs, {result.refused:9d} refused  {findings}", flush=True)
+    print(f"{inputs} inputs, {len(chosen)} readers, seed {options.seed}")
     return int(escaped)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.readers.layouts import layout_of
-from dynslam_bench.sequences.readers.recorded import Description, RecordedSequence
+from dynslam_bench.sequences.readers.recorded import RecordedSequence
 
 from .target import Target, at
 
@@ -45,7 +45,7 @@ def _attacked(name: str, damaged: tuple[str, ...]) -> Target:
         at(folder, damaged[first % GONE % len(damaged)], None if data is None or first >= GONE else data[1:])
         contents = layout_of(name).read(folder)
         camera = Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0)
-        sequence = RecordedSequence(folder, contents, Description("fuzz", camera), any_depth_size=True)
+        sequence = RecordedSequence(folder, contents, camera, id="fuzz", any_depth_size=True)
         for index in range(min(len(sequence), 3)):
             depth = sequence[index].depth
             assert np.isfinite(depth).all() and (depth >= 0).all()

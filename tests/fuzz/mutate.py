@@ -88,7 +88,8 @@ _TOKEN = re.compile(rb"[-+]?[0-9][0-9.eE+-]*|[A-Za-z_]+")
 def mutate(data: bytes, others: list[bytes], random: Random) -> bytes:
     """One to four damages to some bytes; `others` are spliced in."""
     for _ in range(random.choice((1, 1, 1, 2, 3, 4))):
-        data = random.choice(_DAMAGES)(data, others, random)
+        damage = random.choice((_replace_part, _replace_part, _replace_part, _replace_token, _move_line))
+        data = damage(data, others, random)
     return data[: 1 << 22]
 
 
@@ -174,47 +175,15 @@ def _changed(value: Any, random: Random) -> Any:
     return random.choice(VALUES)
 
 
-def _flip(data: bytes, _: list[bytes], random: Random) -> bytes:
-    if not data:
-        return data
-    at = random.randrange(len(data))
-    return data[:at] + bytes([data[at] ^ (1 << random.randrange(8))]) + data[at + 1 :]
-
-
-def _set_number(data: bytes, _: list[bytes], random: Random) -> bytes:
-    """Two, four or eight bytes become a number that is often too much."""
-    size = random.choice((2, 4, 8))
-    if len(data) < size:
-        return data
-    at = random.randrange(len(data) - size + 1)
-    number = random.choice(
-        (0, 1, (1 << (8 * size - 1)) - 1, (1 << (8 * size)) - 1, random.getrandbits(8 * size), 65535)
-    )
-    return data[:at] + (number % (1 << (8 * size))).to_bytes(size, random.choice(("big", "little"))) + data[at + size :]
-
-
-def _cut(data: bytes, _: list[bytes], random: Random) -> bytes:
-    return data[: random.randrange(len(data) + 1)]
-
-
-def _remove(data: bytes, _: list[bytes], random: Random) -> bytes:
-    at = random.randrange(len(data) + 1)
-    return data[:at] + data[at + random.choice((1, 2, 4, 16, 100)) :]
-
-
-def _double(data: bytes, _: list[bytes], random: Random) -> bytes:
-    at = random.randrange(len(data) + 1)
-    return data[:at] + data[at : at + random.choice((1, 8, 64, 512))] * random.choice((2, 2, 50)) + data[at:]
-
-
-def _splice(data: bytes, others: list[bytes], random: Random) -> bytes:
-    other = random.choice(others or [data])
-    return data[: random.randrange(len(data) + 1)] + other[random.randrange(len(other) + 1) :]
-
-
-def _insert_word(data: bytes, _: list[bytes], random: Random) -> bytes:
-    at = random.randrange(len(data) + 1)
-    return data[:at] + random.choice(WORDS) + data[at:]
+def _replace_part(data: bytes, others: list[bytes], random: Random) -> bytes:
+    """Bytes removed, doubled, overwritten by numbers that are often too much, or replaced by a word or another file."""
+    start = random.randrange(len(data) + 1)
+    length = random.choice((0, 0, 1, 1, 2, 4, 8, 64, 512, len(data)))
+    part, other = data[start : start + length], random.choice(others or [data])
+    flipped = bytes(byte ^ (1 << random.randrange(8)) for byte in part[:1]) + part[1:]
+    replacements = (b"", flipped, random.randbytes(len(part)), b"\xff" * len(part), bytes(len(part)), part * 2,
+                    part * 50, random.choice(WORDS), other[random.randrange(len(other) + 1) :])  # fmt: skip
+    return data[:start] + random.choice(replacements) + data[start + length :]
 
 
 def _replace_token(data: bytes, _: list[bytes], random: Random) -> bytes:
@@ -230,7 +199,3 @@ def _move_line(data: bytes, _: list[bytes], random: Random) -> bytes:
     line = lines.pop(random.randrange(len(lines)))
     lines.insert(random.randrange(len(lines) + 1), line)
     return b"\n".join(lines)
-
-
-_DAMAGES = (_flip, _flip, _set_number, _set_number, _cut, _remove, _double, _splice, _insert_word, _replace_token,
-            _replace_token, _move_line)  # fmt: skip

@@ -39,7 +39,7 @@ def fingerprint(id: str, index: int) -> str:
 
 @pytest.mark.parametrize(("id", "index", "renderer", "family", "expected"), KEPT)
 def test_frames_keep_their_bytes(id: str, index: int, renderer: int, family: int, expected: str) -> None:
-    assert (RENDERER_VERSION, parse_synthetic_id(id).version) == (renderer, family), "new bytes: renew the hash"
+    assert (RENDERER_VERSION, parse_synthetic_id(id).variant.version) == (renderer, family), "new bytes: renew the hash"
     assert fingerprint(id, index) == expected
 
 

@@ -6,8 +6,8 @@ import pytest
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.synthetic import CAMERA, REPLICA_IDS, SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
-from dynslam_bench.sequences.synthetic.ids import FAMILIES
-from dynslam_bench.sequences.synthetic.renderer import Renderer, View
+from dynslam_bench.sequences.synthetic.parts import BOX
+from dynslam_bench.sequences.synthetic.scene import View
 
 V, U = np.mgrid[0:480, 0:640].astype(float)
 EVENTFUL = {  # a frame in which the named instance moves and is seen
@@ -34,16 +34,16 @@ def test_every_sequence_opens_and_says_what_it_is(name: str) -> None:
     sequence = open_synthetic(f"{name}?scene={137 if name.endswith('s') else 41}", None)
     assert isinstance(sequence, Sequence)
     parsed = parse_synthetic_id(sequence.id)
-    assert parse_synthetic_id(str(parsed)) == parsed and parsed.version >= (name not in REPLICA_IDS)
-    assert len(sequence) == FAMILIES[parsed.family].length(parsed.variant)
+    assert parse_synthetic_id(str(parsed)) == parsed and parsed.variant.version >= (name not in REPLICA_IDS)
+    assert len(sequence) == parsed.variant.frames
     times = np.linspace(0, len(sequence) / 30, 40)
-    assert all(se3.is_pose(pose, 1e-9) for pose in sequence.scene.poses(times))
+    assert all(se3.is_pose(pose, 1e-9) for pose in sequence.ground_truth.T_world_cam[::50])
     world = sequence.scene.world
     assert set(np.unique(sequence.scene.instance)) - {0} == set(world.class_names)
     assert max(world.class_names, default=0) < 256 and all(world.class_names.values())
     placed = [np.array([np.hstack([part.ravel() for part in body.path(t)]) for t in times]) for body in world.bodies]
     still = not world.actors and all(np.array_equal(there, there[:1].repeat(len(there), 0)) for there in placed)
-    assert (parsed.tags == ("static",)) == still, "static is what nothing moves in"
+    assert (parsed.variant.tag == "static") == still, "static is what nothing moves in"
 
 
 @pytest.mark.parametrize("name", EVENTFUL)
@@ -76,9 +76,9 @@ def test_pixels_of_a_body_lie_on_it(name: str) -> None:
     rotation, origin = body.path(index / 30)
     local = (points @ pose[:3, :3].T + pose[:3, 3] - origin) @ rotation
     inside = np.zeros(len(local), bool)
-    for turn, at, shape, scale, kind in zip(*(getattr(body.parts, k) for k in ("rotation", "origin", "shape", "scale", "kind")), strict=True):  # fmt: skip  # noqa: E501
-        own = (local - at) @ turn / scale
-        reach = shape if kind == 0 else np.array([*[max(shape[1:])] * 2, shape[0] + max(shape[1:])])
+    for part in body.parts:
+        own, widest = (local - part.origin) @ part.rotation / part.scale, max(part.shape[1:])
+        reach = part.shape if part.kind == BOX else np.array([widest, widest, part.shape[0] + widest])
         inside |= (np.abs(own) <= reach + 1e-6).all(axis=1)
     assert inside.mean() > 0.999
 
@@ -96,8 +96,8 @@ def test_people_step_in_time_with_the_camera() -> None:
     sequence = opened("synchronous")
     camera = sequence.ground_truth.positions[::10, 0]
     assert np.ptp(camera) > 0.8
-    for actor in sequence.scene.world.actors:
-        assert np.ptp([actor.posture(i / 3).x - x for i, x in enumerate(camera)]) < 0.03
+    for _, posture in sequence.scene.world.actors:
+        assert np.ptp([posture(i / 3).x - x for i, x in enumerate(camera)]) < 0.03
     assert np.mean([np.mean(sequence.masks[i].instances > 0) for i in (20, 60, 100)]) > 0.3
 
 
@@ -107,8 +107,7 @@ def test_light_texture_and_depth_are_little_where_they_should_be() -> None:
     assert dark.rgb.mean() < 0.25 * lit.rgb.mean()
     assert (far.depth > 0).mean() < 0.45 < (lit.depth > 0).mean()
     assert (outdoor.depth > 0).mean() < 0.8 * (lit.depth > 0).mean()
-    names = {name for row in parse_synthetic_id("synthetic/blank_empty").world().static.texture for name in row}
-    assert names == {"plain"}
+    assert opened("blank_empty").scene.texture_names == ["plain"]
 
 
 class TestRollingShutter:
@@ -120,12 +119,10 @@ class TestRollingShutter:
         truth = sequence.ground_truth.T_world_cam[index]
         assert np.abs(0.5 * (poses[239] + poses[240]) - truth).max() < 1e-6, "the frame's pose is the middle's"
         assert se3.rotation_angle(se3.inverse(poses[:1]) @ poses[-1:])[0] > 0.01
-        depth, scene = sequence.exact_depth(index), sequence.scene
-        renderer: Renderer = sequence.renderer
+        depth, now = sequence.exact_depth(index), sequence.scene.view(index)
         for row in (0, 121, 300, 479):
-            still = scene.snapshot_from(poses[row], index / 30)
-            view = View(still, poses[row][None], scene.scale)
-            alone = renderer._geometry(*renderer._tiles(view))[1]
+            view = View(poses[row], poses[row][None], now.rotation, now.origin)
+            alone = sequence.renderer.cast(view)[1]
             assert np.abs(alone[row] - depth[row]).max() < 1e-9
 
     def test_flow_ends_where_the_other_frames_rows_see_the_point(self) -> None:
@@ -151,7 +148,7 @@ def test_splits_share_no_place_of_any_thing() -> None:
     def places(scene: int) -> set[tuple[float, ...]]:
         found = set()
         for variant in ("box_obstructing", "trolley", "kidnapped"):
-            (body,) = parse_synthetic_id(f"synthetic/objects_{variant}?scene={scene}").world().bodies
+            (body,) = parse_synthetic_id(f"synthetic/objects_{variant}").variant.build(scene).bodies
             found |= {(variant, key.x, key.y, key.z, key.yaw) for key in body.path.args[0][2:4]}
         return found
 

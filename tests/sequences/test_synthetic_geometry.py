@@ -6,7 +6,6 @@ import pytest
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.synthetic import CAMERA, REPLICA_IDS, RenderSettings, open_synthetic
-from dynslam_bench.sequences.synthetic.renderer import view_of
 from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
 
 CLEAN = RenderSettings(
@@ -69,16 +68,14 @@ def test_colours_follow_the_flow() -> None:
 
 def test_hits_lie_on_their_surfaces(walking) -> None:
     """Every hit point satisfies the implicit equation of its primitive (an independent formula)."""
-    renderer, scene = walking.renderer, walking.scene
-    view = view_of(scene, 90)
-    snap = view.middle
-    hit, depth = renderer._geometry(*renderer._tiles(view))
+    scene, view = walking.scene, walking.scene.view(90)
+    hit, depth = walking.renderer.cast(view)
     points = CAMERA.unproject(np.stack([U, V], -1), depth)[::3, ::3].reshape(-1, 3)
     keys = hit[::3, ::3].ravel()
     assert (keys >= 0).all()
     prims, faces = keys >> 3, keys & 7
-    maps = snap.local[prims].reshape(-1, 3, 4)
-    local = np.einsum("nij,nj->ni", maps[:, :, :3], points) + maps[:, :, 3]
+    world = points @ view.pose[:3, :3].T + view.pose[:3, 3]
+    local = np.einsum("nji,nj->ni", view.rotation[prims], world - view.origin[prims]) / scene.scale[prims]
     shape, kind = scene.shape[prims], scene.kind[prims]
     box = kind != 1
     axis = faces[box] >> 1

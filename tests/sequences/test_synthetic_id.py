@@ -18,7 +18,7 @@ def test_the_eight_replicas_exist() -> None:
 @pytest.mark.parametrize("form", ["?scene=107&frames=33", "?frames=33&scene=107", "@107?frames=33"])
 def test_scene_and_length_are_read(form: str) -> None:
     parsed = parse_synthetic_id(f"synthetic/sitting_rpy{form}")
-    assert parsed == SyntheticId("sitting", "rpy", 107, 33)
+    assert parsed == SyntheticId("sitting_rpy", 107, 33)
     assert parsed.split == "held-out"
     assert str(parsed) == "synthetic/sitting_rpy?scene=107&frames=33"
 
@@ -26,11 +26,11 @@ def test_scene_and_length_are_read(form: str) -> None:
 @pytest.mark.parametrize("query", ["frames=33&noise=5", "noise=5&frames=33", "noise=005&frames=033"])
 def test_a_noise_seed_is_read_in_any_order(query: str) -> None:
     parsed = parse_synthetic_id(f"synthetic/sitting_rpy?scene=107&{query}")
-    assert parsed == SyntheticId("sitting", "rpy", 107, 33, noise=5)
+    assert parsed == SyntheticId("sitting_rpy", 107, 33, noise=5)
     assert str(parsed) == "synthetic/sitting_rpy?scene=107&frames=33&noise=5"
     assert parse_synthetic_id(str(parsed)) == parsed
     assert parsed.whole == "synthetic/sitting_rpy?scene=107&noise=5"
-    assert parse_synthetic_id("synthetic/sitting_rpy?noise=5") == SyntheticId("sitting", "rpy", noise=5)
+    assert parse_synthetic_id("synthetic/sitting_rpy?noise=5") == SyntheticId("sitting_rpy", noise=5)
     assert parse_synthetic_id("synthetic/sitting_rpy").noise is None, "the scene's own noise"
 
 

@@ -46,8 +46,8 @@ def test_furniture_is_moved_out_of_sight_and_nowhere_else() -> None:
 
 def test_repeated_walls_share_their_textures_and_others_do_not() -> None:
     def names(variant: str) -> set[str]:
-        world = parse_synthetic_id(f"synthetic/loop_{variant}?scene=3").world()
-        return {name for row in world.static.texture for name in row if name.startswith("poster")}
+        static = parse_synthetic_id(f"synthetic/loop_{variant}").variant.build(3).static
+        return {name for part in static for name in part.texture if name.startswith("poster")}
 
     assert len(names("corridor")) > 40
     assert len(names("corridor_repeated")) < 12

@@ -29,7 +29,7 @@ def test_reads_what_was_written(tmp_path):
     assert np.array_equal(sequence.ground_truth.timestamps, sequence.timestamps)
     assert sequence.fps == 30 and sequence.masks is None
     assert sequence.dropped.describe().startswith("4 frames of 4 colour and 4 depth images (|dt| < 0.02 s)")
-    assert not sequence.dropped.any
+    assert sequence.dropped.absent == sequence.dropped.colour_unpaired == 0
 
 
 def test_fps_follows_from_the_stamps_where_nothing_states_it(tmp_path):

@@ -120,20 +120,20 @@ def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> Im
     """
     named = [(stamp, name) for stamp, name in rows if name]
     finite = [(stamp, name) for stamp, name in named if stamp is not None]
+    stamps = [stamp for stamp, _ in finite]
     unique = dict(finite)  # the last of several equal stamps wins, as in TUM's associate.py
     if not unique:
         raise SequenceError(
             f"{described} lists no image ({len(rows)} lines, {len(named) - len(finite)} without a stamp)"
         )
-    order = sorted(unique)
-    stamps = np.array(order, dtype=np.int64)
-    refuse_close(stamps, described, SequenceError, lambda stamp: _line_of(Path(described), stamp))
+    order = np.array(sorted(unique), dtype=np.int64)
+    refuse_close(order, described, SequenceError)
     return ImageList(
-        stamps,
-        tuple(unique[stamp] for stamp in order),
+        order,
+        tuple(unique[stamp] for stamp in order.tolist()),
         bad_stamps=len(named) - len(finite),
         duplicate_stamps=len(finite) - len(unique),
-        unsorted=_count_unsorted([stamp for stamp, _ in finite]),
+        unsorted=sum(later < earlier for earlier, later in pairwise(stamps)),
         unnamed=len(rows) - len(named),
     )
 
@@ -159,21 +159,6 @@ def _number(text: str, where: object) -> int | None:
         return parse_ns(text) if math.isfinite(float(text)) else None
     except ValueError:
         raise SequenceError(f"{where}: '{text[:40]}' is not a timestamp in seconds") from None
-
-
-def _line_of(path: Path, ns: int) -> int | None:
-    """The last line of a list that begins with a stamp; None where `path` is no file."""
-    line_number = None
-    for number, line in enumerate(read_lines(path, kind=SequenceError) if path.is_file() else (), start=1):
-        parts = line.replace(",", " ").split()
-        if parts and not parts[0].startswith("#") and _number(parts[0], path) == ns:
-            line_number = number
-    return line_number
-
-
-def _count_unsorted(stamps: list[int | None]) -> int:
-    finite = [stamp for stamp in stamps if stamp is not None]
-    return sum(later < earlier for earlier, later in pairwise(finite))
 
 
 # The result of every reader, from which `RecordedSequence` is made.
@@ -247,48 +232,29 @@ class Dropped:
     frames_without_ground_truth: int = 0
     largest_hole_s: float = 0.0
 
-    @property
-    def any(self) -> bool:
-        """Whether anything at all was dropped or put in order."""
-        counts = (
-            self.colour_unpaired,
-            self.bad_stamps,
-            self.duplicate_stamps,
-            self.unsorted,
-            self.unnamed,
-            self.absent,
-        )
-        return any(counts) or bool(self.ground_truth_dropped)
-
     def describe(self) -> str:
         """One line: the frames, and all counts that are not zero."""
+        counts = {
+            "colour images without depth": self.colour_unpaired,
+            "depth images unused": self.depth_unpaired,
+            "stamps not finite": self.bad_stamps,
+            "duplicate stamps": self.duplicate_stamps,
+            "stamps out of order": self.unsorted,
+            "lines without a file name": self.unnamed,
+            "listed files that do not exist": self.absent,
+            "ground-truth poses": self.ground_truth_poses,
+            f"frames without ground truth within 0.02 s (largest hole {self.largest_hole_s:.2f} s)": (
+                self.frames_without_ground_truth
+            ),
+        }
         parts = [
             f"{self.pairs} frames of {self.colour_listed} colour and {self.depth_listed} depth images "
-            f"(|dt| < {self.max_time_difference_s:g} s)"
+            f"(|dt| < {self.max_time_difference_s:g} s)",
+            *(f"{count} {what}" for what, count in counts.items() if count),
+            "" if self.ground_truth_poses else "no ground truth",
+            self.ground_truth_dropped,
         ]
-        for count, what in (
-            (self.colour_unpaired, "colour images without depth"),
-            (self.depth_unpaired, "depth images unused"),
-            (self.bad_stamps, "stamps not finite"),
-            (self.duplicate_stamps, "duplicate stamps"),
-            (self.unsorted, "stamps out of order"),
-            (self.unnamed, "lines without a file name"),
-            (self.absent, "listed files that do not exist"),
-        ):
-            if count:
-                parts.append(f"{count} {what}")
-        if self.ground_truth_poses:
-            parts.append(f"{self.ground_truth_poses} ground-truth poses")
-            if self.frames_without_ground_truth:
-                parts.append(
-                    f"{self.frames_without_ground_truth} frames without ground truth within 0.02 s "
-                    f"(largest hole {self.largest_hole_s:.2f} s)"
-                )
-        else:
-            parts.append("no ground truth")
-        if self.ground_truth_dropped:
-            parts.append(self.ground_truth_dropped)
-        return "; ".join(parts)
+        return "; ".join(part for part in parts if part)
 
 
 # Images of folders without lists: found by their names, sized by their headers.
@@ -315,8 +281,7 @@ def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageLis
     if len(files) != len(stamps):
         raise SequenceError(f"{where} holds {len(files)} images but {len(stamps)} stamps")
     order = np.argsort(stamps, kind="stable")
-    ordered = stamps[order]
-    equal = np.flatnonzero(np.diff(ordered) == 0)
+    ordered, equal = stamps[order], np.flatnonzero(np.diff(stamps[order]) == 0)
     if len(equal):
         raise SequenceError(
             f"{where} holds {len(equal)} stamps twice, the first is {format_ns(int(ordered[equal[0]]))} s"

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, MaskSource
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.fingerprint import contents_digest
-from dynslam_bench.core.images import MOST_BYTES, read_image
-from dynslam_bench.core.reading import read_bytes
+from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.sanitise import inside
 from dynslam_bench.geometry.association import associate, nearest_gap
@@ -31,32 +28,6 @@ MISSING_TOLERATED = 0.02
 """Part of a list's images that may be missing: Bonn's lists name a few images that its archives lack."""
 
 
-@dataclass(frozen=True)
-class Description:
-    """What is known of a sequence beside its files.
-
-    Attributes:
-        id: For example ``tum/fr3/walking_xyz``.
-        camera: Intrinsics of the colour images.
-        fps: Nominal frame rate in Hz; None to take it from the stamps.
-        license: Licence of the data.
-        citation: What to cite.
-        tags: For example ``high-dynamic``.
-        split: ``tune``, ``held-out`` or empty.
-        R_body_cam: Rotation from the camera's axes to those of the body that the ground truth tracks, rows of a 3x3
-            matrix; None where the ground truth is the camera's.
-    """
-
-    id: str
-    camera: Camera
-    fps: float | None = None
-    license: str = "unknown"
-    citation: str = ""
-    tags: frozenset[str] = frozenset()
-    split: str = ""
-    R_body_cam: tuple[tuple[float, float, float], ...] | None = None
-
-
 class RecordedSequence:
     """A folder with colour images, depth images and (maybe) a ground truth; frames are decoded when asked for.
 
@@ -66,14 +37,20 @@ class RecordedSequence:
     Args:
         folder: The sequence's folder.
         contents: What its reader found in it.
-        description: Camera, id, licence and so on.
+        camera: Intrinsics of the colour images.
+        id: For example ``tum/fr3/walking_xyz``.
+        fps: Nominal frame rate in Hz; None to take it from the stamps.
+        license: Licence of the data.
+        citation: What to cite.
+        tags: For example ``high-dynamic``.
+        split: ``tune``, ``held-out`` or empty.
+        R_body_cam: Rotation from the camera's axes to those of the body that the ground truth tracks, rows of a 3x3
+            matrix; None where the ground truth is the camera's.
         max_time_difference_s: Colour and depth further apart are not paired (strictly less is).
         any_depth_size: True if the caller resizes, so that depth images may differ in size from colour images.
 
     Attributes:
         folder: The sequence's folder.
-        id: For example ``tum/fr3/walking_xyz``.
-        camera: Intrinsics of the colour images.
         timestamps: Stamps of the colour images in seconds ``[N]``, strictly increasing.
         timestamps_ns: The same in nanoseconds, int64 ``[N]``.
         depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's `depth_delay_s` added.
@@ -90,25 +67,29 @@ class RecordedSequence:
         self,
         folder: Path,
         contents: Contents,
-        description: Description,
+        camera: Camera,
         *,
+        id: str,
+        fps: float | None = None,
+        license: str = "unknown",
+        citation: str = "",
+        tags: frozenset[str] = frozenset(),
+        split: str = "",
+        R_body_cam: tuple[tuple[float, float, float], ...] | None = None,
         max_time_difference_s: float = 0.02,
         any_depth_size: bool = False,
     ) -> None:
-        self.folder = folder
-        self.id, self.camera = description.id, description.camera
-        self.license, self.citation = description.license, description.citation
-        self.tags, self.split = description.tags, description.split
+        self.folder, self.id, self.camera = folder, id, camera
+        self.license, self.citation, self.tags, self.split = license, citation, tags, split
         self.masks: MaskSource | None = None
         self._any_depth_size = any_depth_size
         self._missing_depth, self._furthest_m = contents.missing_depth, contents.furthest_m
-        delay_s = description.camera.depth_delay_s
-        delayed = contents.depth.stamps_ns + round(1e9 * delay_s)
+        delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
         colour, depth = contents.colour, replace(contents.depth, stamps_ns=delayed)
         for file in (*colour.files, *depth.files):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
         listed = len(colour) + len(depth)
-        paired = contents.paired and not delay_s
+        paired = contents.paired and not camera.depth_delay_s
         tolerated = 0.0 if paired else MISSING_TOLERATED
         colour, depth = _existing(folder, colour, "colour", tolerated), _existing(folder, depth, "depth", tolerated)
         absent = listed - len(colour) - len(depth)
@@ -125,13 +106,13 @@ class RecordedSequence:
         self.timestamps = colour.stamps[index[0]]
         self.timestamps_ns.flags.writeable = self.timestamps.flags.writeable = False
         _check_unit(folder, self.timestamps)
-        self.fps = description.fps or (float(1 / np.median(np.diff(self.timestamps))) if len(index[0]) > 1 else 30.0)
+        self.fps = fps or (float(1 / np.median(np.diff(self.timestamps))) if len(index[0]) > 1 else 30.0)
         self.depth_timestamps = depth.stamps[index[1]]
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
         self.ground_truth = contents.truth
-        if contents.truth is not None and description.R_body_cam is not None:
-            poses = in_camera_axes(contents.truth.T_world_cam, description.R_body_cam)
+        if contents.truth is not None and R_body_cam is not None:
+            poses = in_camera_axes(contents.truth.T_world_cam, R_body_cam)
             self.ground_truth = contents.truth.with_poses(poses)
         self.dropped = self._count(colour, depth, absent, max_time_difference_s, contents.truth_dropped)
         self[0]
@@ -225,25 +206,16 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
 
 def _existing(folder: Path, images: ImageList, kind: str, tolerated: float = MISSING_TOLERATED) -> ImageList:
     """The images whose files are there; a few may be missing, as in some published sequences, and none empty."""
-    sizes = [_file_size(folder / file) for file in images.files]
-    there = [i for i, size in enumerate(sizes) if size is not None]
-    for state, allowed in (("missing", tolerated), ("empty (0 bytes)", 0.0)):
-        at_fault = [
-            file for file, size in zip(images.files, sizes, strict=True) if size == (None if state == "missing" else 0)
-        ]
+    sizes = [path.stat().st_size if path.is_file() else None for path in (folder / file for file in images.files)]
+    for state, size_then, allowed in (("missing", None, tolerated), ("empty (0 bytes)", 0, 0.0)):
+        at_fault = [file for file, size in zip(images.files, sizes, strict=True) if size == size_then]
         if len(at_fault) > allowed * len(images):
             raise SequenceError(
                 f"{len(at_fault)} of {len(images)} {kind} images of {folder} are {state}, the first is {at_fault[0]}",
                 "fetch the sequence again, or remove their lines from the list",
             )
+    there = [i for i, size in enumerate(sizes) if size is not None]
     return replace(images, stamps_ns=images.stamps_ns[there], files=tuple(images.files[i] for i in there))
-
-
-def _file_size(path: Path) -> int | None:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return None
 
 
 # Decoding of colour and depth images.
@@ -301,7 +273,15 @@ def read_depth(
     if path.suffix == ".npy":
         depth = read_metres(path, size=size, mismatch=mismatch)
     else:
-        raw = _read_raw(path, depth_factor, size, mismatch)
+        hint = "set the preprocessing's width and height to resize both"
+        raw = read_image(path, size=size, mismatch=mismatch, hint=hint, kind=SequenceError)
+        if raw.dtype != np.uint16 or raw.ndim != 2:
+            channels = 1 if raw.ndim == 2 else raw.shape[2]
+            raise SequenceError(
+                f"depth image {path} has {channels} channel(s) of {raw.dtype.itemsize * 8} bits (values {raw.min()} to "
+                f"{raw.max()}), expected 1 of 16 bits",
+                f"store depth x {depth_factor:g} as 16-bit PNG; an 8-bit image has lost its range",
+            )
         depth = raw.astype(np.float32) / np.float32(depth_factor)
         if missing is not None:
             depth[raw == missing] = 0
@@ -310,20 +290,7 @@ def read_depth(
     return depth
 
 
-def _read_raw(path: Path, depth_factor: float, size: tuple[int, int] | None, mismatch: str) -> NDArray[np.uint16]:
-    hint = "set the preprocessing's width and height to resize both"
-    image = read_image(path, size=size, mismatch=mismatch, hint=hint, kind=SequenceError)
-    if image.dtype != np.uint16 or image.ndim != 2:
-        channels = 1 if image.ndim == 2 else image.shape[2]
-        raise SequenceError(
-            f"depth image {path} has {channels} channel(s) of {image.dtype.itemsize * 8} bits (values {image.min()} to "
-            f"{image.max()}), expected 1 of 16 bits",
-            f"store depth x {depth_factor:g} as 16-bit PNG; an 8-bit image has lost its range",
-        )
-    return image.astype(np.uint16, copy=False)
-
-
-# Depth as arrays of metres in NumPy's own format; the size is checked before memory is taken.
+# Depth as arrays of metres in NumPy's own format; they are mapped, so that one that lies about its size costs nothing.
 
 
 def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.float32]:
@@ -337,22 +304,17 @@ def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
     Raises:
         SequenceError: The file is missing, damaged, of another size, or holds something else.
     """
-    data = read_bytes(path, limit=MOST_BYTES, kind=SequenceError)
-    stream = BytesIO(data)
     try:
-        version = npy.read_magic(stream)
-        header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, in_columns, kind = header(stream)
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+        shape, kind = values.shape, values.dtype
+    except OSError as error:
+        raise SequenceError(f"cannot read {path}: {error.strerror or error}") from error
     except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
-        raise SequenceError(f"depth array {path} cannot be read ({len(data)} bytes)", "it is no .npy file") from error
-    rest = len(data) - stream.tell()
-    if len(shape) != 2 or kind.kind != "f" or rest != int(kind.itemsize) * int(shape[0]) * int(shape[1]) or not rest:
-        raise SequenceError(
-            f"depth array {path} claims {kind} of shape {str(shape)[:60]} over {rest} bytes, expected rows of metres"
-        )
+        raise SequenceError(f"depth array {path} cannot be read", "it is no .npy file") from error
+    if len(shape) != 2 or kind.kind != "f":
+        raise SequenceError(f"depth array {path} is {kind} of shape {str(shape)[:60]}, expected rows of metres")
     if size is not None and shape != size[::-1]:
         raise SequenceError(f"depth array {path} is {shape[1]}x{shape[0]}, {mismatch}")
-    values = np.frombuffer(data, kind, offset=stream.tell()).reshape(shape, order="F" if in_columns else "C")
     with np.errstate(invalid="ignore", over="ignore"):
         depth = np.ascontiguousarray(values, dtype=np.float32)
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

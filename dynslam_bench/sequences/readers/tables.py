@@ -190,16 +190,12 @@ def floats(rows: list[list[str]], path: Path) -> NDArray[np.float64]:
     Raises:
         SequenceError: One is no finite number.
     """
-    flat = _numbers([text for row in rows for text in row], path, "a number")
-    return flat.reshape(len(rows), -1)
-
-
-def _numbers(texts: list[str], path: Path, meaning: str) -> NDArray[np.float64]:
+    texts = [text for row in rows for text in row]
     try:
         values = np.array([float(text) for text in texts])
     except ValueError:
         bad = next(text for text in texts if not is_number(text))
-        raise SequenceError(f"{path}: '{bad[:40]}' is not {meaning}") from None
+        raise SequenceError(f"{path}: '{bad[:40]}' is not a number") from None
     if not np.isfinite(values).all():
         raise SequenceError(f"{path} holds values that are not finite")
-    return values
+    return values.reshape(len(rows), -1)

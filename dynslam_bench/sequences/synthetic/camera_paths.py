@@ -37,15 +37,11 @@ def camera_poses(motion: str, people: str, scene: int, times: Array) -> Array:
     phase = rng.permutation(3)
     signs = np.where(rng.random(3) < 0.5, -1.0, 1.0)
     if motion == "xyz":
-        period = 4.6 / tempo
         for slot, axis in enumerate(phase):
-            amplitude = (0.25, 0.2, 0.25)[axis]
-            offset[:, axis] = signs[axis] * amplitude * _turns(t, period, 3, slot)
+            offset[:, axis] = signs[axis] * (0.25, 0.2, 0.25)[axis] * _turns(t, 4.6 / tempo, slot)
     elif motion == "rpy":
-        period = 3.6 / tempo
-        amplitudes = np.radians([14.0, 19.0, 20.0])
         for slot, axis in enumerate(phase):
-            angles[:, axis] = signs[axis] * amplitudes[axis] * _turns(t, period, 3, slot)
+            angles[:, axis] = signs[axis] * np.radians([14.0, 19.0, 20.0])[axis] * _turns(t, 3.6 / tempo, slot)
     elif motion == "halfsphere":
         around = 2 * math.pi * t / (6.1 / tempo)
         lift = 0.5 - 0.5 * cos(2 * math.pi * t / (16.9 / tempo) + 0.4)
@@ -59,9 +55,13 @@ def camera_poses(motion: str, people: str, scene: int, times: Array) -> Array:
     offset += hand(rng, t, 0.004, 3)
     angles += hand(rng, t, math.radians(0.5), 3)
     base = camera_axes(TILT_RAD)
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = product(base, rotations(angles))
-    poses[:, :3, 3] = product(offset, base.T) + np.array([0.0, 0.0, EYE_HEIGHT_M])
+    return poses_of(product(base, rotations(angles)), product(offset, base.T) + np.array([0.0, 0.0, EYE_HEIGHT_M]))
+
+
+def poses_of(rotation: Array, position: Array) -> Array:
+    """Poses ``[N, 4, 4]`` of rotations ``[N, 3, 3]`` and positions ``[N, 3]``."""
+    poses = np.tile(np.eye(4), (len(rotation), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotation, position
     return poses
 
 
@@ -71,9 +71,9 @@ def camera_axes(tilt: float) -> Array:
     return np.asarray(product(rest, rotations(np.array([[-tilt, 0.0, 0.0]]))[0]))
 
 
-def _turns(t: Array, period: float, slots: int, slot: int) -> Array:
-    """One sine of `period` during this slot of every `slots`, zero in the others, with no jump in position or speed."""
-    local = (t / period) % slots - slot
+def _turns(t: Array, period: float, slot: int) -> Array:
+    """One sine of `period` in this one of three slots, zero in the others, with no jump in position or speed."""
+    local = (t / period) % 3 - slot
     inside = (local >= 0) & (local < 1)
     x = np.clip(local, 0, 1)
     # The phase runs through x - sin(4 pi x) / (4 pi) * 0.5: slower at the start and the end of the slot.
@@ -95,8 +95,7 @@ def hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Arr
 def rotations(vectors: Array) -> Array:
     """Rotation matrices ``[N, 3, 3]`` of rotation vectors ``[N, 3]`` (Rodrigues)."""
     theta = norm(vectors)
-    safe = np.where(theta < 1e-12, 1.0, theta)
-    k = vectors / safe[:, None]
+    k = vectors / np.where(theta < 1e-12, 1.0, theta)[:, None]
     zero = np.zeros(len(k))
     hat = np.stack([zero, -k[:, 2], k[:, 1], k[:, 2], zero, -k[:, 0], -k[:, 1], k[:, 0], zero], 1).reshape(-1, 3, 3)
     s, c = sin(theta)[:, None, None], (1 - cos(theta))[:, None, None]
@@ -167,19 +166,15 @@ def walking_camera(walk: Walk, scene: int, name: str, aside_deg: float, times: A
     t = np.asarray(times, dtype=np.float64)
     step_s = walk.lap_s / len(walk.control)
     ahead = walk.at(t + 2.3 * step_s) - walk.at(t - 0.8 * step_s)
-    forward = arctan2(ahead[:, 1], ahead[:, 0])
     stray = 0.12 * _slow(rng, t, 2)
     steps = 0.012 * sin(2 * math.pi * 1.7 * t)[:, None] * np.array([0.0, 0.0, 1.0])
-    heading = forward + math.radians(aside_deg) + math.radians(12.0) * _slow(rng, t, 1)[:, 0]
+    heading = arctan2(ahead[:, 1], ahead[:, 0]) + math.radians(aside_deg)
+    heading = heading + math.radians(12.0) * _slow(rng, t, 1)[:, 0]
     turned = np.zeros((len(t), 3))
     turned[:, 2] = heading - math.pi / 2  # about the world's z axis; the camera at rest looks along +y
-    angles = hand(rng, t, math.radians(0.7), 3)
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = product(rotations(turned), camera_axes(TILT_RAD), rotations(angles))
-    poses[:, :2, 3] = walk.at(t) + stray
-    poses[:, 2, 3] = EYE_HEIGHT_M
-    poses[:, :3, 3] += steps + hand(rng, t, 0.006, 3)
-    return poses
+    rotation = product(rotations(turned), camera_axes(TILT_RAD), rotations(hand(rng, t, math.radians(0.7), 3)))
+    place = np.column_stack([walk.at(t) + stray, np.full(len(t), EYE_HEIGHT_M)])
+    return poses_of(rotation, place + (steps + hand(rng, t, 0.006, 3)))
 
 
 def _slow(rng: np.random.Generator, t: Array, axes: int) -> Array:

@@ -137,8 +137,7 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
         for ty in range(boxes[p, 1], boxes[p, 3] + 1):
             for tx in range(boxes[p, 0], boxes[p, 2] + 1):
                 start[ty * tiles_x + tx + 1] += 1
-    for i in range(tiles_x * tiles_y):
-        start[i + 1] += start[i]
+    start = np.cumsum(start).astype(np.int32)
     fill = start[:-1].copy()
     members = np.empty(start[-1], np.int32)
     for n in range(order.shape[0]):
@@ -151,8 +150,8 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
     return start, members
 
 
-# The two kernels below repeat the loop over a tile's primitives: numba counts references of every array that is passed
-# to a function that it does not inline, which costs more than the tracing.
+# The two kernels below repeat the loop over a tile's primitives. As a function of its own, inlined or not, it makes the
+# first one take 35 ms a frame in place of 15: numba counts references of every array that is passed to it.
 
 
 @dividing_kernel
@@ -162,13 +161,13 @@ def cast_geometry(
 ) -> None:  # fmt: skip
     """Primitive (``hit`` int32, 8 * index + face, -1 for none) and z-depth (float64) at the pixel centres of rows.
 
-    What the neighbouring pixel of the tile saw is tried first, which bounds the search.
+    ``local`` [R, P, 12] maps the camera to the primitives' frames: one for all rows, or one for each row of the image.
+    What the neighbouring pixel of the tile saw is tried first.
     """
     fx, fy, cx, cy = intrinsics
     width = hit.shape[1]
     for row in range(row0, row1):
-        y = (row - cy) / fy
-        last = -1
+        maps, y, last = local[row % len(local)], (row - cy) / fy, -1
         for column in range(width):
             tile = (row // TILE) * tiles_x + column // TILE
             first, end = start[tile], start[tile + 1]
@@ -184,10 +183,10 @@ def cast_geometry(
                         break
                     if q == last:
                         continue
-                dx = local[q, 0] * x + local[q, 1] * y + local[q, 2]
-                dy = local[q, 4] * x + local[q, 5] * y + local[q, 6]
-                dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
-                ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
+                dx = maps[q, 0] * x + maps[q, 1] * y + maps[q, 2]
+                dy = maps[q, 4] * x + maps[q, 5] * y + maps[q, 6]
+                dz = maps[q, 8] * x + maps[q, 9] * y + maps[q, 10]
+                ox, oy, oz = maps[q, 3], maps[q, 7], maps[q, 11]
                 a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
                 t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
                 if face_hit >= 0:
@@ -215,6 +214,7 @@ def shade_pixels(
     share = 1.0 / samples
     one, two = np.uint64(1), np.uint64(2)  # unsigned: an index that may be negative costs a test
     for row in range(row0, row1):
+        maps = local[row % len(local)]
         for column in range(width):
             key = hit[row, column]
             edge = (
@@ -245,10 +245,10 @@ def shade_pixels(
                                 break
                             if q == centre:
                                 continue
-                        dx = local[q, 0] * x + local[q, 1] * y + local[q, 2]
-                        dy = local[q, 4] * x + local[q, 5] * y + local[q, 6]
-                        dz = local[q, 8] * x + local[q, 9] * y + local[q, 10]
-                        ox, oy, oz = local[q, 3], local[q, 7], local[q, 11]
+                        dx = maps[q, 0] * x + maps[q, 1] * y + maps[q, 2]
+                        dy = maps[q, 4] * x + maps[q, 5] * y + maps[q, 6]
+                        dz = maps[q, 8] * x + maps[q, 9] * y + maps[q, 10]
+                        ox, oy, oz = maps[q, 3], maps[q, 7], maps[q, 11]
                         a, b, c = shape[q, 0], shape[q, 1], shape[q, 2]
                         t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
                         if face_hit >= 0:
@@ -265,9 +265,9 @@ def shade_pixels(
                 if surface >= 0:
                     su, sv = uv[p, face, 0], uv[p, face, 1]
                     u, v = uv[p, face, 2], uv[p, face, 3]
-                    lx = local[p, 3] + t * (local[p, 0] * x + local[p, 1] * y + local[p, 2])
-                    ly = local[p, 7] + t * (local[p, 4] * x + local[p, 5] * y + local[p, 6])
-                    lz = local[p, 11] + t * (local[p, 8] * x + local[p, 9] * y + local[p, 10])
+                    lx = maps[p, 3] + t * (maps[p, 0] * x + maps[p, 1] * y + maps[p, 2])
+                    ly = maps[p, 7] + t * (maps[p, 4] * x + maps[p, 5] * y + maps[p, 6])
+                    lz = maps[p, 11] + t * (maps[p, 8] * x + maps[p, 9] * y + maps[p, 10])
                     norm = math.sqrt(x * x + y * y + 1.0)
                     if kind[p] == ROUND_CONE:
                         h, r1, r2 = shape[p, 0], shape[p, 1], shape[p, 2]
@@ -281,9 +281,9 @@ def shade_pixels(
                         u += atan2(lx, ly) * _PER_TURN * su
                         v -= lz * sv
                         # Normal into the camera frame: transpose of the (camera to local) linear part.
-                        nu = local[p, 0] * lx + local[p, 4] * ly + local[p, 8] * nz
-                        nv = local[p, 1] * lx + local[p, 5] * ly + local[p, 9] * nz
-                        nw = local[p, 2] * lx + local[p, 6] * ly + local[p, 10] * nz
+                        nu = maps[p, 0] * lx + maps[p, 4] * ly + maps[p, 8] * nz
+                        nv = maps[p, 1] * lx + maps[p, 5] * ly + maps[p, 9] * nz
+                        nw = maps[p, 2] * lx + maps[p, 6] * ly + maps[p, 10] * nz
                         inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
                         cos = abs(nu * x + nv * y + nw) * inv / norm
                         light = lights[0, 3]

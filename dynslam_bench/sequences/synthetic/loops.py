@@ -21,18 +21,18 @@ from dynslam_bench.sequences.synthetic.camera_paths import (
     Walk,
     camera_axes,
     hand,
+    poses_of,
     rotations,
     walk_along,
     walking_camera,
 )
 from dynslam_bench.sequences.synthetic.parts import BOX, Parts, turn
 from dynslam_bench.sequences.synthetic.people import Posture, draw_person
-from dynslam_bench.sequences.synthetic.replicas import Family, build_replica, window_of
+from dynslam_bench.sequences.synthetic.replicas import build_replica
 from dynslam_bench.sequences.synthetic.rooms import (
     Point,
     add_floor,
     add_wall,
-    build_room,
     cartons,
     corridor_bay,
     notices,
@@ -41,11 +41,11 @@ from dynslam_bench.sequences.synthetic.rooms import (
     pick,
     plan_room,
 )
-from dynslam_bench.sequences.synthetic.scene import Actor, Array, Body, Optics, World
+from dynslam_bench.sequences.synthetic.scene import Array, Body, Optics, Placement, Variant, World
 
-WALKS = ("room", "corridor", "rooms")
-VARIANTS = tuple(walk + change for change in ("", "_moved", "_repeated") for walk in WALKS)
+_SHAPES = ("room", "corridor", "rooms")
 _ASIDE = {"room": -32.0, "corridor": -14.0, "rooms": 0.0}
+_FRAMES = {"room": 2400, "corridor": 3900, "rooms": 6600}
 
 
 @dataclass
@@ -61,45 +61,39 @@ class _Building:
     def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, alike: int = 0) -> None:
         """Furnish a stretch of wall; where walls are repeated, all that are `alike` are the same."""
         number = alike if self.repeated else self.bays
-        self.parts.extend(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")
+        self.parts.add_copies(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")
         self.bays += 1
 
     def piece(self, kind: str, yaw: float, at: Point) -> None:
-        """Put a piece that may be moved on the floor."""
-        number = 0 if self.repeated else len(self.loose)
-        make = office_chair if kind == "chair" else cartons
-        plain, named = make(self.scene, number, len(self.loose) + 1), Parts()
-        named.extend(plain, suffix=f"/{number}")
-        self.loose.append((kind, named, yaw, at))
+        """Put a piece that may be moved on the floor: a ``chair`` or a ``box``."""
+        number, id, piece = 0 if self.repeated else len(self.loose), len(self.loose) + 1, Parts()
+        chair = kind == "chair"
+        plain = office_chair(plan_room(self.scene, number), id) if chair else cartons(self.scene, number, id)
+        piece.add_copies(plain, 0.0, (0.0, 0.0, 0.0), f"/{number}")
+        self.loose.append((kind, piece, yaw, at))
 
 
 def build_loop(variant: str, scene: int) -> World:
     """The building, its loose pieces, and a camera that is carried around in it."""
     shape, _, change = variant.partition("_")
     building = _Building(scene, change == "repeated")
-    walk = _SHAPES[shape](building)
-    moves = _moves(building, walk, change == "moved")
-    camera = partial(walking_camera, walk, scene, shape, _ASIDE[shape])
+    walk = {"room": _room, "corridor": _corridor, "rooms": _rooms}[shape](building)
     bodies = tuple(
-        Body(k + 1, "chair" if kind == "chair" else "box", parts, move)
-        for k, ((kind, parts, _, _), move) in enumerate(zip(building.loose, moves, strict=True))
+        Body(k + 1, kind, parts, _moves(building, walk, change == "moved", k))
+        for k, (kind, parts, _, _) in enumerate(building.loose)
     )
-    return World(building.parts, camera, (0.0, 3.0, 2.15), bodies)
+    return World(building.parts, partial(walking_camera, walk, scene, shape, _ASIDE[shape]), (0.0, 3.0, 2.15), bodies)
 
 
-def _moves(building: _Building, walk: Walk, moved: bool) -> list[Callable[[float], tuple[Array, Array]]]:
-    """The place of each loose piece, by lap."""
-    paths: list[Callable[[float], tuple[Array, Array]]] = []
-    for number, (_, _, yaw, at) in enumerate(building.loose):
-        rng = stream(building.scene, "synthetic", "moved", number)
-        places = [(turn(yaw), np.array([*at, 0.0]))]
-        for _ in range(2):
-            angle = np.radians(pick(rng, building.scene, 0.0, 360.0))
-            away = pick(rng, building.scene, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
-            places.append((turn(yaw + pick(rng, building.scene, 40.0, 320.0)), np.array([*at, 0.0]) + away))
-        near = walk.time_nearest(at)
-        paths.append(partial(_stand, places if moved else places[:1], near, walk.lap_s))
-    return paths
+def _moves(building: _Building, walk: Walk, moved: bool, number: int) -> Placement:
+    """The place of a loose piece, by lap."""
+    rng, (_, _, yaw, at) = stream(building.scene, "synthetic", "moved", number), building.loose[number]
+    places = [(turn(yaw), np.array([*at, 0.0]))]
+    for _ in range(2 if moved else 0):
+        angle = np.radians(pick(rng, building.scene, 0.0, 360.0))
+        away = pick(rng, building.scene, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
+        places.append((turn(yaw + pick(rng, building.scene, 40.0, 320.0)), np.array([*at, 0.0]) + away))
+    return partial(_stand, places, walk.time_nearest(at), walk.lap_s)
 
 
 def _stand(places: list[tuple[Array, Array]], near_s: float, lap_s: float, time: float) -> tuple[Array, Array]:
@@ -119,17 +113,11 @@ def _room(b: _Building) -> Walk:
     for yaw, side in ((-90, x), (90, -x)):
         b.bay(office_bay, yaw, (side - np.sign(side) * 0.05, 0.0))
         b.piece("box", yaw, (side - np.sign(side) * 1.3, 0.9))
-    _partition(b, 1.2, 0.35)
+    names, block = (*(f"poster:{face % 4}" for face in range(4)), "plain", "plain"), Parts()
+    block.add(BOX, np.eye(3), np.array([0.0, 0.0, 1.0]), (1.2, 0.35, 1.0), texture=names, fit=(0, 1, 2, 3))
+    b.parts.add_copies(block, 0.0, (0.0, 0.0, 0.0), "/partition")
     b.piece("box", 20.0, (0.3, 0.75))
     return walk_along([(-x + 2.2, -y + 2.1), (x - 2.2, -y + 2.1), (x - 2.2, y - 2.1), (-x + 2.2, y - 2.1)], 0.45)
-
-
-def _partition(b: _Building, half_x: float, half_y: float) -> None:
-    """A free-standing block with posters on all sides."""
-    names = (*(f"poster:{face % 4}" for face in range(4)), "plain", "plain")
-    block = Parts()
-    block.add(BOX, np.eye(3), np.array([0.0, 0.0, 1.0]), (half_x, half_y, 1.0), texture=names, fit=(0, 1, 2, 3))
-    b.parts.extend(block, suffix="/partition")
 
 
 def _around(x: float, y: float) -> list[tuple[Point, Point]]:
@@ -207,31 +195,29 @@ def _furnish(b: _Building, x: float, side: int, wide: float, front: float, back:
     b.piece("box", yaw, (x - 0.1 * wide, side * 3.9))
 
 
-_SHAPES: dict[str, Callable[[_Building], Walk]] = {"room": _room, "corridor": _corridor, "rooms": _rooms}
-_FRAMES = {"room": 2400, "corridor": 3900, "rooms": 6600}
-
-LOOP = Family(
-    "loop",
-    VARIANTS,
-    build_loop,
-    {name: ("low-dynamic",) if name.endswith("_moved") else ("static",) for name in VARIANTS},
-    {name: _FRAMES[name.partition("_")[0]] for name in VARIANTS},
-    {name: 2 if name.startswith("rooms") else 1 for name in VARIANTS},
-)
+LOOPS = {
+    f"loop_{shape}{change}": Variant(
+        partial(build_loop, shape + change),
+        "low-dynamic" if change == "_moved" else "static",
+        _FRAMES[shape],
+        version=2 if shape == "rooms" else 1,
+    )
+    for change in ("", "_moved", "_repeated")
+    for shape in _SHAPES
+}
 
 
 # The camera follows a person around a room, as in Bonn's person tracking.
 
 
-def build_tracking(variant: str, scene: int) -> World:
+def build_tracking(scene: int) -> World:
     """The hall of the loops, walked by a person and, two metres behind, the camera."""
     hall, rng = build_loop("room", scene), stream(scene, "synthetic", "tracking")
     walk: Walk = hall.camera.args[0]  # type: ignore[attr-defined]  # a partial of `walking_camera`
     lead_s = pick(rng, scene, 1.7, 2.0) / 0.45
-    person = draw_person(scene, 0)
-    actor = Actor(replace(person, instance=len(hall.bodies) + 1), partial(_walking, walk, lead_s))
+    person = replace(draw_person(scene, 0), instance=len(hall.bodies) + 1)
     camera = partial(walking_camera, walk, scene, "tracking", 6.0)
-    return World(hall.static, camera, hall.window, hall.bodies, (actor,))
+    return replace(hall, camera=camera, actors=((person, partial(_walking, walk, lead_s)),))
 
 
 def _walking(walk: Walk, lead_s: float, time: float) -> Posture:
@@ -242,7 +228,7 @@ def _walking(walk: Walk, lead_s: float, time: float) -> Posture:
     return Posture(float(place[0]), float(place[1]), facing, stride, 0.6, 0.0, 0.0, time)
 
 
-TRACKING = Family("tracking", ("",), build_tracking, ("high-dynamic",), 1200)
+TRACKING = {"tracking": Variant(build_tracking, "high-dynamic", 1200)}
 
 
 # The tempo of TUM's fr1: turns of 1-3 rad/s, motion blur, a rolling shutter and automatic exposure.
@@ -261,20 +247,17 @@ SWINGS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 
 def build_fast(variant: str, scene: int) -> World:
     """The office, without people or with the walking ones, or the hall of the loops."""
-    camera = partial(fast_camera, variant, scene)
-    if variant == "walking":
-        office = build_replica("walking", "xyz", scene)
-        return World(office.static, camera, office.window, office.bodies, office.actors, OPTICS)
     if variant == "spin":
-        hall = build_loop("room", scene)
-        return World(hall.static, camera, hall.window, hall.bodies, optics=OPTICS)
-    plan = plan_room(scene)
-    return World(build_room(scene, plan), camera, window_of(plan), optics=OPTICS)
+        world = build_loop("room", scene)
+    else:
+        world = build_replica("walking", "xyz", scene)
+        world = world if variant == "walking" else replace(world, bodies=(), actors=())
+    return replace(world, camera=partial(fast_camera, variant, scene), optics=OPTICS)
 
 
 def fast_camera(variant: str, scene: int, times: Array) -> Array:
     """Poses ``[N, 4, 4]``: sines of several frequencies along and about all axes; `spin` also turns round and round."""
-    rng, t = stream(scene, "synthetic", "camera", "fast", variant), np.asarray(times, dtype=np.float64)
+    rng, t = stream(scene, "synthetic", "camera", "fast", variant), times
     shifts, turns = SWINGS[variant]
     offset, angles = hand(rng, t, 0.006, 3), hand(rng, t, math.radians(0.8), 3)
     for amplitudes, values in ((shifts, offset), (turns, angles)):
@@ -286,13 +269,11 @@ def fast_camera(variant: str, scene: int, times: Array) -> Array:
     if variant == "spin":
         yaw[:, 2] = pick(rng, scene, 1.3, 1.6) * t
         place = np.array([2.7, 0.2, EYE_HEIGHT_M])
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
     base = product(rotations(yaw), camera_axes(TILT_RAD))
-    poses[:, :3, :3] = product(base, rotations(angles))
-    poses[:, :3, 3] = place + product(base, offset[..., None])[..., 0]
-    return poses
+    return poses_of(product(base, rotations(angles)), place + product(base, offset[..., None])[..., 0])
 
 
-FAST = Family(
-    "fast", tuple(SWINGS), build_fast, {name: ("high-dynamic" if name == "walking" else "static",) for name in SWINGS}
-)
+FAST = {
+    f"fast_{name}": Variant(partial(build_fast, name), "high-dynamic" if name == "walking" else "static")
+    for name in SWINGS
+}

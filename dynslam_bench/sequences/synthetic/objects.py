@@ -15,25 +15,24 @@ import numpy as np
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import cos
 from dynslam_bench.sequences.synthetic.camera_paths import camera_poses
-from dynslam_bench.sequences.synthetic.parts import BOX, At, Parts, on_track
-from dynslam_bench.sequences.synthetic.people import Key, draw_person, posture
-from dynslam_bench.sequences.synthetic.replicas import Family, window_of
+from dynslam_bench.sequences.synthetic.parts import BOX, At, Key, Parts, on_track
+from dynslam_bench.sequences.synthetic.people import Draw, draw_person, posture
+from dynslam_bench.sequences.synthetic.replicas import window_of
 from dynslam_bench.sequences.synthetic.rooms import (
     Plan,
-    add_chair,
     add_wall,
     balloon,
     build_room,
     door_leaf,
+    office_chair,
     pick,
     plan_room,
     printed_box,
     trolley,
 )
-from dynslam_bench.sequences.synthetic.scene import Actor, Body, World
+from dynslam_bench.sequences.synthetic.scene import Body, Variant, World
 
 PERIOD_S = 20.0
-Draw = Callable[[float, float], float]
 Cast = tuple[tuple[Body, ...], tuple[Key, ...]]
 """Bodies and, where a person carries them, the carrier's timeline."""
 
@@ -46,7 +45,7 @@ def build_objects(variant: str, scene: int) -> World:
         _add_partition(room, plan)
     bodies, keys = _SCRIPTS[variant](partial(pick, rng, scene), scene, plan)
     person = replace(draw_person(scene, 0), instance=9)
-    actors = (Actor(person, partial(posture, keys, PERIOD_S)),) if keys else ()
+    actors = ((person, partial(posture, keys, PERIOD_S)),) if keys else ()
     return World(room, partial(camera_poses, "xyz", "objects", scene), window_of(plan), bodies, actors)
 
 
@@ -142,10 +141,8 @@ def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
 def _chair(j: Draw, scene: int, plan: Plan) -> Cast:
     """A chair with a carton on it is turned and rolled; no person is in view."""
     x, y, turned = j(-0.2, 0.2), j(1.15, 1.25), j(150, 210)
-    parts = Parts()
-    add_chair(parts, 1, plan.tints["chair"], plan.tints["metal"])
-    carton = printed_box(1, (0.2, 0.17, 0.2))
-    parts.extend(carton, 15.0, (0.0, -0.02, 0.69))
+    parts = office_chair(plan, 1)
+    parts.add_copies(printed_box(1, (0.2, 0.17, 0.2)), 15.0, (0.0, -0.02, 0.69))
     keys = [At(0, x, y), At(1.5, x, y), At(5, x + 0.1, y, 0, turned), At(7, x, y, 0, turned), At(9.5, x - 0.5, y + 0.2)]
     keys += [At(11, x - 0.5, y + 0.2), At(14, x + 0.45, y + 0.1, 0, -turned), At(16, x + 0.45, y + 0.1, 0, -turned)]
     keys += [At(19, x, y), At(20, x, y)]
@@ -182,4 +179,4 @@ _SCRIPTS: dict[str, Callable[[Draw, int, Plan], Cast]] = {
     "removed": _removed, "kidnapped": _kidnapped, "trolley": _trolley, "chair": _chair, "door": _door,
 }  # fmt: skip
 
-OBJECTS = Family("objects", tuple(_SCRIPTS), build_objects, ("high-dynamic",))
+OBJECTS = {f"objects_{name}": Variant(partial(build_objects, name), "high-dynamic") for name in _SCRIPTS}

@@ -1,39 +1,44 @@
-"""Primitives of a scene: unit shapes in a local frame, how to collect them, and paths of rigid bodies."""
+"""Primitives of a scene: unit shapes in a local frame, how to collect them, and timelines of things that move."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.sequences.synthetic.arithmetic import cos, product, sin
+from dynslam_bench.sequences.synthetic.arithmetic import cos, norm, product, sin
 
 Array = NDArray[np.float64]
 
 BOX, ROUND_CONE, QUAD = 0, 1, 2
 
 
-@dataclass
-class Parts:
-    """Growing lists of primitives; row i of every list belongs to primitive i.
+@dataclass(frozen=True, eq=False)
+class Primitive:
+    """One shape. A local point p lies in the world at ``rotation @ (scale * p) + origin``; see `Parts.add`.
 
-    A local point p lies in the world at ``rotation @ (scale * p) + origin``.
+    Attributes:
+        texture: Six names, one a face.
+        uv: ``[6, 4]``: repeats and shift of the texture along both axes of each face.
     """
 
-    kind: list[int] = field(default_factory=list)
-    rotation: list[Array] = field(default_factory=list)
-    origin: list[Array] = field(default_factory=list)
-    scale: list[Array] = field(default_factory=list)
-    shape: list[Array] = field(default_factory=list)
-    instance: list[int] = field(default_factory=list)
-    texture: list[tuple[str, ...]] = field(default_factory=list)
-    uv: list[Array] = field(default_factory=list)
-    tint: list[Array] = field(default_factory=list)
+    kind: int
+    rotation: Array
+    origin: Array
+    scale: Array
+    shape: Array
+    instance: int
+    texture: tuple[str, ...]
+    uv: Array
+    tint: Array
 
-    def __len__(self) -> int:
-        return len(self.kind)
+
+class Parts(list[Primitive]):
+    """A growing list of primitives."""
 
     def add(self, kind: int, rotation: Array, origin: Array, shape: tuple[float, float, float], *, instance: int = 0,
             texture: str | tuple[str, ...] = "plain", repeat: tuple[float, float] = (1.0, 1.0),
@@ -56,41 +61,27 @@ class Parts:
             fit: Faces on which the texture is stretched to fit once.
         """
         names = (texture,) * 6 if isinstance(texture, str) else texture
-        uv = np.tile(np.array([*repeat, *shift], dtype=np.float64), (6, 1))
+        uv = np.array([(*repeat, *shift)] * 6, dtype=np.float64)
         for face in fit:
             du, dv = ((1, 2), (0, 2), (0, 1))[face // 2]
             uv[face] = (0.5 / shape[du], 0.5 / shape[dv], 0.5, 0.5)
-        self.kind.append(kind)
-        self.rotation.append(np.asarray(rotation, dtype=np.float64))
-        self.origin.append(np.asarray(origin, dtype=np.float64))
-        self.scale.append(np.asarray(scale, dtype=np.float64))
-        self.shape.append(np.asarray(shape, dtype=np.float64))
-        self.instance.append(instance)
-        self.texture.append(names)
-        self.uv.append(uv)
-        self.tint.append(np.asarray(tint, dtype=np.float64))
+        place, size, extent, color = (np.asarray(row, dtype=np.float64) for row in (origin, scale, shape, tint))
+        self.append(Primitive(kind, rotation, place, size, extent, instance, names, uv, color))
 
-    def extend(
-        self, other: Parts, yaw: float = 0.0, shift: tuple[float, float, float] | None = None, suffix: str = ""
-    ) -> None:
-        """Add copies of all primitives of `other`.
+    def add_copies(self, parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: str = "") -> None:
+        """Add copies of primitives.
 
         Args:
-            other: Whose primitives.
+            parts: The primitives.
             yaw: Turned by this many degrees about the world's z axis, then ...
-            shift: ... moved by this much, metres; None leaves them where they are.
+            shift: ... moved by this much, metres.
             suffix: Put behind the names of patterned textures, so that they are drawn again.
         """
-        for name in ("kind", "scale", "shape", "instance", "uv", "tint"):
-            getattr(self, name).extend(getattr(other, name))
-        self.texture += [tuple(kind + suffix if ":" in kind else kind for kind in row) for row in other.texture]
-        if shift is None:
-            self.rotation += other.rotation
-            self.origin += other.origin
-        else:
-            body = turn(yaw)
-            self.rotation += [product(body, rotation) for rotation in other.rotation]
-            self.origin += [product(body, origin) + shift for origin in other.origin]
+        body = turn(yaw)
+        for part in parts:
+            names = tuple(name + suffix if ":" in name else name for name in part.texture)
+            origin = product(body, part.origin) + shift
+            self.append(replace(part, rotation=product(body, part.rotation), origin=origin, texture=names))
 
 
 def turn(degrees: float) -> Array:
@@ -108,21 +99,14 @@ def wall(x_axis: tuple[float, float, float], y_axis: tuple[float, float, float])
 
 def along(start: Array, end: Array, side: Array) -> tuple[Array, float]:
     """Frame whose z axis runs from start to end, its x axis towards `side`; and the length."""
-    z = end - start
-    length = float(np.sqrt(product(z, z)))
-    z = z / length
-    x = side - (product(side, z)) * z
-    x = x / np.sqrt(product(x, x))
-    return np.stack([x, _cross(z, x), z], axis=1), length
+    length = float(norm(end - start))
+    z = (end - start) / length
+    x = side - product(side, z) * z
+    x = x / norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1), length
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """The cross product of two vectors, ``[3]``, numpy's to the bit, without its overhead."""
-    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
-    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
-
-
-# Paths of rigid things: places at a few times, eased in between.
+# Timelines: places at a few times, eased in between.
 
 
 @dataclass(frozen=True)
@@ -136,6 +120,39 @@ class At:
     yaw: float = 0.0
 
 
+@dataclass(frozen=True)
+class Key:
+    """Where and how a person is at one time, and where a chair is; degrees, 0 looks along +y, by the smaller angle."""
+
+    t: float
+    x: float
+    y: float
+    facing: float
+    sit: float = 0.0
+    gesture: float = 0.0
+
+
+KeyT = TypeVar("KeyT", At, Key)
+
+
+def between(keys: Sequence[KeyT], time: float) -> tuple[KeyT, KeyT, float]:
+    """The keys before and after a time, and how far it lies between them, 0 to 1; after the last key that one twice."""
+    for before, after in itertools.pairwise(keys):
+        if time < after.t:
+            return before, after, max(time - before.t, 0.0) / (after.t - before.t)
+    return keys[-1], keys[-1], 0.0
+
+
+def ease(share: float) -> float:
+    """A share of the way as a share of the time: slow at both ends."""
+    return share * share * (3 - 2 * share)
+
+
+def angle_between(start: float, end: float, share: float) -> float:
+    """From one direction to another through the smaller angle, degrees."""
+    return start + share * ((end - start + 180.0) % 360.0 - 180.0)
+
+
 def on_track(keys: tuple[At, ...], period: float | None, time: float) -> tuple[Array, Array]:
     """Rotation 3x3 and origin of a thing at a time.
 
@@ -144,12 +161,7 @@ def on_track(keys: tuple[At, ...], period: float | None, time: float) -> tuple[A
         period: After this it begins again, seconds; None lets it stay at the last place.
         time: Seconds from the start.
     """
-    local = time if period is None else time % period
-    for a, b in itertools.pairwise(keys):
-        if local < b.t:
-            s = max(local - a.t, 0.0) / (b.t - a.t)
-            e = s * s * (3 - 2 * s)
-            place = np.array([a.x + e * (b.x - a.x), a.y + e * (b.y - a.y), a.z + e * (b.z - a.z)])
-            return turn(a.yaw + e * (b.yaw - a.yaw)), place
-    k = keys[-1]
-    return turn(k.yaw), np.array([k.x, k.y, k.z])
+    a, b, share = between(keys, time if period is None else time % period)
+    e = ease(share)
+    place = np.array([a.x + e * (b.x - a.x), a.y + e * (b.y - a.y), a.z + e * (b.z - a.z)])
+    return turn(a.yaw + e * (b.yaw - a.yaw)), place

@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,67 +22,38 @@ from dynslam_bench.core.settings import Settings
 from dynslam_bench.sequences.synthetic import kernels, sensors
 from dynslam_bench.sequences.synthetic.arithmetic import cos, exp, norm, power, product, sin
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
-from dynslam_bench.sequences.synthetic.kernels import NEAR_M
+from dynslam_bench.sequences.synthetic.kernels import NEAR_M, TILE
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE
-from dynslam_bench.sequences.synthetic.scene import Scene, Snapshot
+from dynslam_bench.sequences.synthetic.scene import Scene, View
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RenderSettings
-from dynslam_bench.sequences.synthetic.textures import TextureAtlas
+from dynslam_bench.sequences.synthetic.textures import Atlas
 
 Array = NDArray[np.float64]
+SIZE = CAMERA.height, CAMERA.width
+_INTRINSICS = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
+_FOCAL, _CENTRE = _INTRINSICS[:2], _INTRINSICS[2:]
 _ROUNDS = 5
 """Rounds of the search for the row that sees a point; each shrinks the error by the rows' motion a row, 0.1 or less."""
+_MARGIN_PX = 2.0
+_BAND = 48
+_JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+_MEAN_GREY = 105.0
+"""What automatic exposure aims at."""
+_NOISE_VERSION = 5
+"""Seeds the noise of the sensors. It stays while versions of the renderer differ in last bits only."""
+_SLACK_M = 0.01
+"""How much nearer than in the rows that were looked at a thing may be in another one."""
+_LAMPS = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]])
+"""Direction to each lamp in the world (not normalised) and its strength; row 0 is the ambient light."""
+
+Tiles = tuple[int, NDArray[np.int32], NDArray[np.int32], Array]
+"""Tiles in a row, start of each tile's list, the lists, and the least depth of every primitive."""
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """The scene as the rows of one frame see it.
-
-    Attributes:
-        middle: The scene when the middle of the image is exposed.
-        poses: ``[R, 4, 4]`` camera poses of all rows; R is 1 or the height of the image.
-        scale: ``[P, 3]`` scale of each primitive's local axes.
-    """
-
-    middle: Snapshot
-    poses: Array
-    scale: Array
-
-    @property
-    def rolling(self) -> bool:
-        """Whether every row has its own pose."""
-        return len(self.poses) > 1
-
-    def local(self, visible: NDArray[np.int32]) -> Array:
-        """Maps ``[R, P, 12]`` from the camera to the primitives, as in `Snapshot`.
-
-        Under a rolling shutter those of the primitives `visible` alone are filled in.
-        """
-        if not self.rolling:
-            return self.middle.local[None]
-        inverse = np.swapaxes(self.middle.rotation[visible], 1, 2) / self.scale[visible, :, None]
-        poses = np.repeat(self.poses[:, None, :3], len(visible), axis=1)
-        poses[..., 3] -= self.middle.origin[visible]
-        local = np.empty((len(self.poses), len(self.scale), 12))
-        local[:, visible] = (product(inverse, poses)).reshape(len(poses), -1, 12)
-        return local
-
-    def at_row(self, row: int) -> Snapshot:
-        """The scene from the pose of a row."""
-        return self.middle if not self.rolling else replace(self.middle, T_world_cam=self.poses[row])
-
-
-def row_times(index: int, readout_s: float) -> Array:
-    """When each row of frame `index` is exposed, seconds from the start; the image's middle at the frame's stamp."""
-    rows = (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
-    return index / FPS + rows * readout_s
-
-
-def view_of(scene: Scene, index: int) -> View:
-    """How frame `index` sees the scene."""
-    middle, readout = scene.snapshot(index / FPS), scene.world.optics.readout_s
-    if readout == 0:
-        return View(middle, middle.T_world_cam[None], scene.scale)
-    return View(middle, scene.poses(row_times(index, readout)), scene.scale)
+def motion_of_primitives(now: View, other: View) -> tuple[Array, Array]:
+    """Rotations ``[P, 3, 3]`` and shifts ``[P, 3]`` in the world that carry primitives from one frame to another."""
+    rotation = product(other.rotation, np.swapaxes(now.rotation, 1, 2))
+    return rotation, other.origin - product(rotation, now.origin[:, :, None])[:, :, 0]
 
 
 def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -> NDArray[np.float32]:
@@ -93,85 +64,50 @@ def rolling_flow(now: View, other: View, hit: NDArray[np.int32], depth: Array) -
     """
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1)
-    turns, places = now.poses[:, :3, :3], now.poses[:, :3, 3]
-    world = product(rays * depth[..., None], np.swapaxes(turns, 1, 2)) + places[:, None]
-    turn = product(other.middle.rotation, np.swapaxes(now.middle.rotation, 1, 2))
-    shift = other.middle.origin - product(turn, now.middle.origin[:, :, None])[:, :, 0]
+    world = product(rays * depth[..., None], np.swapaxes(now.rows[:, :3, :3], 1, 2)) + now.rows[:, None, :3, 3]
+    rotation, shift = motion_of_primitives(now, other)
     primitive = np.maximum(hit >> 3, 0)
-    world = product(turn[primitive], world[..., None])[..., 0] + shift[primitive]
-    row, last = v.copy(), CAMERA.height - 1
+    world = product(rotation[primitive], world[..., None])[..., 0] + shift[primitive]
+    row = v.copy()
     for _ in range(_ROUNDS):
-        first = np.clip(np.floor(row), 0, last - 1).astype(np.int64)
+        first = np.clip(np.floor(row), 0, CAMERA.height - 2).astype(np.int64)
         share = np.clip(row - first, 0.0, 1.0)[..., None]
-        ends = []
-        for near in (first, first + 1):
-            away = world - other.poses[near, :3, 3]
-            ends.append(product(away[..., None, :], other.poses[near, :3, :3])[..., 0, :])
-        points = (1 - share) * ends[0] + share * ends[1]
+        before, after = (
+            product((world - other.rows[near, :3, 3])[..., None, :], other.rows[near, :3, :3])[..., 0, :]
+            for near in (first, first + 1)
+        )
+        points = (1 - share) * before + share * after
         w = np.where(points[..., 2] > 0.05, points[..., 2], np.nan)
-        x, row_now = points[..., 0] / w * CAMERA.fx + CAMERA.cx, points[..., 1] / w * CAMERA.fy + CAMERA.cy
-        row = np.where(np.isfinite(row_now), row_now, row)
-    flow = np.stack([x - u, row_now - v], axis=-1)
+        x, y = points[..., 0] / w * CAMERA.fx + CAMERA.cx, points[..., 1] / w * CAMERA.fy + CAMERA.cy
+        row = np.where(np.isfinite(y), y, row)
+    flow = np.stack([x - u, y - v], axis=-1)
     flow[hit < 0] = np.nan
     return flow.astype(np.float32)
 
 
-# Where in the image a primitive can be seen: the rectangle around the part of its box that lies before the camera.
-
-_MARGIN_PX = 2.0
-_EDGES = np.array([(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i >> axis & 1])
+_EDGES = np.array([(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i >> axis & 1]).T
 """The twelve edges of a box, as pairs of corners; bit k of a corner's number is its side along axis k."""
 
 
-def bounds_of(points: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Bounds of boxes.
+def bounds_of(corners: Array) -> Array:
+    """Where in the image boxes can be seen: around the parts of them that lie before the camera.
 
     Args:
-        points: Corners ``[P, 8, 3]`` in the camera frame, metres.
+        corners: ``[P, 8, 3]`` in the camera frame, metres.
 
     Returns:
-        Least depth of all corners, and least u, least v, greatest u, greatest v (pixels, with a margin); an empty
-        rectangle (least above greatest) where a box lies behind the camera.
+        ``[5, P]``: least depth of all corners, and least u, least v, greatest u, greatest v (pixels, with a margin);
+        least above greatest where a box lies behind the camera.
     """
-    depth = points[:, :, 2]
-    rectangle = _project(points, depth > NEAR_M)
-    crossing = np.flatnonzero((depth.min(axis=1) <= NEAR_M) & (depth.max(axis=1) > NEAR_M))
-    if len(crossing):
-        a, b = points[crossing][:, _EDGES[:, 0]], points[crossing][:, _EDGES[:, 1]]
-        cut = (a[..., 2] > NEAR_M) != (b[..., 2] > NEAR_M)
-        share = (NEAR_M - a[..., 2]) / np.where(cut, b[..., 2] - a[..., 2], 1.0)
-        ends = a + share[..., None] * (b - a)
-        at_cut = _project(ends, cut)
-        rectangle[:2, crossing] = np.minimum(rectangle[:2, crossing], at_cut[:2])
-        rectangle[2:, crossing] = np.maximum(rectangle[2:, crossing], at_cut[2:])
-    low_u, low_v, high_u, high_v = rectangle
-    return depth.min(axis=1), low_u - _MARGIN_PX, low_v - _MARGIN_PX, high_u + _MARGIN_PX, high_v + _MARGIN_PX
-
-
-def _project(points: Array, valid: NDArray[np.bool_]) -> Array:
-    """Rectangle ``[4, P]`` (least u, v, greatest u, v) around the valid ones of points ``[P, K, 3]``."""
-    z = np.where(valid, points[..., 2], 1.0)
-    u = points[..., 0] / z * CAMERA.fx + CAMERA.cx
-    v = points[..., 1] / z * CAMERA.fy + CAMERA.cy
-    low = [np.where(valid, x, np.inf).min(axis=1) for x in (u, v)]
-    high = [np.where(valid, x, -np.inf).max(axis=1) for x in (u, v)]
-    return np.stack(low + high)
-
-
-_BAND = 48
-_JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
-
-_MEAN_GREY = 105.0
-"""What automatic exposure aims at."""
-_NOISE_VERSION = 5
-"""Seeds the noise of the sensors. It stays while versions of the renderer differ in last bits only."""
-_SLACK_M = 0.01
-"""How much nearer than in the rows that were looked at a thing may be in another one."""
-Tiles = tuple[int, NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]
-"""Tiles in a row, start of each tile's list, the lists, and the least depth of every primitive."""
-
-_LAMPS = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]])
-"""Direction to each lamp in the world (not normalised) and its strength; row 0 is the ambient light."""
+    start, end = corners[:, _EDGES[0]], corners[:, _EDGES[1]]
+    cut = (start[..., 2] > NEAR_M) != (end[..., 2] > NEAR_M)
+    share = (NEAR_M - start[..., 2]) / np.where(cut, end[..., 2] - start[..., 2], 1.0)
+    points = np.concatenate([corners, start + share[..., None] * (end - start)], axis=1)
+    valid = np.concatenate([corners[..., 2] > NEAR_M, cut], axis=1)
+    pixels = points[..., :2] / np.where(valid, points[..., 2], 1.0)[..., None] * _FOCAL + _CENTRE
+    low = np.where(valid[..., None], pixels, np.inf).min(axis=1) - _MARGIN_PX
+    high = np.where(valid[..., None], pixels, -np.inf).max(axis=1) + _MARGIN_PX
+    return np.stack([corners[..., 2].min(axis=1), *low.T, *high.T])
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,319 +130,245 @@ class Renderer:
 
     Args:
         sequence: Which sequence.
+        scene: Its scene.
         settings: Renderer settings.
-        threads: Threads that share the rows of a frame; None for the cores there are, at most four.
+        threads: Threads that share the rows of a frame.
     """
 
-    def __init__(self, sequence: SyntheticId, settings: RenderSettings, threads: int | None = None) -> None:
-        self.settings = settings
-        self.scene = Scene(sequence.world(), sequence.scene, settings)
-        self._view = lru_cache(maxsize=8)(partial(view_of, self.scene))
-        """How a frame sees the scene; neighbouring frames ask for the same views."""
-        self.depth_sensor = _adapted(settings.depth, self.scene.world.optics.depth)
-        self.color_sensor = _adapted(settings.color, self.scene.world.optics.color)
-        self.threads = threads or default_threads()
-        self._pool: ThreadPoolExecutor | None = None
-        self._pool_process = 0
+    def __init__(self, sequence: SyntheticId, scene: Scene, settings: RenderSettings, threads: int) -> None:
+        self.settings, self.scene, self.threads = settings, scene, threads
+        self.depth_sensor = _adapted(settings.depth, scene.world.optics.depth)
+        self.color_sensor = _adapted(settings.color, scene.world.optics.color)
         text = f"{_NOISE_VERSION}/{sequence.name}@{sequence.scene}"
         text += "" if sequence.noise is None else f"/noise={sequence.noise}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
-        self._intrinsics = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+        self._ids = np.append(scene.instance, 0).astype(np.uint8)
 
     @cached_property
-    def atlas(self) -> TextureAtlas:
+    def atlas(self) -> Atlas:
         """The textures; drawn when the first frame is coloured."""
         return self.scene.atlas()
 
-    def prepare(self) -> None:
-        """Draw the textures now: once, before several threads render."""
-        self._density  # noqa: B018
-
     def render(self, index: int) -> Rendered:
         """Render frame `index`."""
-        settings = self.settings
-        now = self._view(index)
+        now, time = self.scene.view(index), index / FPS
         tiles, local = self._tiles(now)
-        hit, depth = self._geometry(tiles, local)
-        color, cosine = self._shade(now, tiles, local, hit, depth, index / FPS)
+        hit, depth = self._cast(tiles, local)
+        color, cosine = self._shade(now, tiles, local, hit, depth, time)
         raw = self._measure(index, depth, cosine, color)
-        if settings.shadow:
-            self._shadow(now.middle, index / FPS, depth, color)
-        if settings.glare:
-            color += self._glare(now.middle, index / FPS)
+        if self.settings.shadow:
+            self._shadow(now.pose, time, depth, color)
+        if self.settings.glare:
+            color += self._glare(now.pose, time)
         if self.color_sensor.shutter > 0:
-            color = self._blur(now, index, hit, depth, color)
-        rgb = self._expose(index, color)
-        ids = np.append(self.scene.instance, 0).astype(np.uint8)
-        return Rendered(rgb, raw, ids[hit >> 3])
+            color = self._blur(now, self.scene.view(index + 1), hit, depth, color)
+        return Rendered(self._expose(index, color), raw, self._ids[hit >> 3])
 
     def flow(self, index: int, other: int) -> NDArray[np.float32]:
         """Exact flow float32 ``[H, W, 2]`` in pixels from frame `index` to frame `other`; NaN where there is none.
 
         It is the motion of the surface point seen at each pixel centre, also where it is hidden in the other frame.
         """
-        now, after = self._view(index), self._view(other)
-        hit, depth = self._geometry(*self._tiles(now))
-        if now.rolling:
-            return rolling_flow(now, after, hit, depth)
-        flow = np.empty((*hit.shape, 2), np.float32)
-        motion = self._motion(now.middle, after.middle)
-        self._rows(lambda a, b: kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow))
-        return flow
+        now, after = self.scene.view(index), self.scene.view(other)
+        hit, depth = self.cast(now)
+        return rolling_flow(now, after, hit, depth) if now.rolling else self._flow(now, after, hit, depth)
 
-    def geometry(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    def geometry(self, index: int) -> tuple[Array, NDArray[np.uint8]]:
         """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
-        now = self._view(index)
-        hit, depth = self._geometry(*self._tiles(now))
-        return depth, np.append(self.scene.instance, 0).astype(np.uint8)[hit >> 3]
+        hit, depth = self.cast(self.scene.view(index))
+        return depth, self._ids[hit >> 3]
 
-    def _shade(
-        self,
-        now: View,
-        tiles: Tiles,
-        local: NDArray[np.float64],
-        hit: NDArray[np.int32],
-        depth: NDArray[np.float64],
-        time: float,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Colour ``[H, W, 3]`` and cosine of incidence ``[H, W]``; a rolling shutter's normals are those of a band."""
-        scene, atlas = self.scene, self.atlas
-        color = np.empty((CAMERA.height, CAMERA.width, 3), np.float32)
-        cosine = np.empty((CAMERA.height, CAMERA.width), np.float32)
-        jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
+    def cast(self, view: View) -> tuple[NDArray[np.int32], Array]:
+        """What every pixel of a view sees (8 * primitive + face, -1 for nothing) and its z-depth in metres."""
+        return self._cast(*self._tiles(view))
 
-        def work(a: int, b: int) -> None:
-            snapshot = now.at_row((a + b) // 2)
-            lights = self._lights(snapshot, time)
-            facets = self._facets(snapshot, lights)
-            for first, end, maps in _rows_of(local, a, b):
-                kernels.shade_pixels(
-                    first, end, self._intrinsics, *tiles, scene.kind, maps, scene.shape, scene.texture, scene.uv,
-                    scene.tint, facets, atlas.texels, atlas.level_offset, atlas.log2_size, lights, hit, depth, jitter,
-                    color, cosine,
-                )  # fmt: skip
-
-        self._rows(work, bands=now.rolling)
-        return color, cosine
-
-    def _blur(
-        self, now: View, index: int, hit: NDArray[np.int32], depth: NDArray[np.float64], sharp: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Motion blur; under a rolling shutter along the motion of each band's middle row."""
-        flow, blurred = np.empty((*hit.shape, 2), np.float32), np.empty_like(sharp)
-        after = self._view(index + 1)
-
-        def work(a: int, b: int) -> None:
-            row = (a + b) // 2
-            motion = self._motion(now.at_row(row), after.at_row(row))
-            kernels.flow_field(a, b, self._intrinsics, hit, depth, motion, flow)
-
-        self._rows(work, bands=now.rolling)
-        shutter, exact, shares = (
-            self.color_sensor.shutter,
-            sharp.astype(np.float64).ravel(),
-            kernels.tap_shares(),
-        )
-        self._rows(lambda a, b: kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
-        return blurred
-
-    def _rows(self, work: Callable[[int, int], None], *, bands: bool = False) -> None:
-        """Share the rows among the threads; `bands` asks for the same bands whatever the number of threads."""
-        parts = [(a, min(a + _BAND, CAMERA.height)) for a in range(0, CAMERA.height, _BAND)]
+    def _rows(self, work: Callable[[int, int], None]) -> None:
+        """Share the bands of an image among the threads; under a rolling shutter they do not depend on their number."""
+        whole = self.threads == 1 and not self.scene.world.optics.readout_s
+        height = CAMERA.height if whole else _BAND
+        bands = [(first, first + height) for first in range(0, CAMERA.height, height)]
         if self.threads == 1:
-            for a, b in parts if bands else [(0, CAMERA.height)]:
-                work(a, b)
+            for first, end in bands:
+                work(first, end)
             return
-        if self._pool is None or self._pool_process != os.getpid():  # threads do not survive a fork
-            self._pool, self._pool_process = ThreadPoolExecutor(self.threads), os.getpid()
-        for done in [self._pool.submit(work, a, b) for a, b in parts]:
-            done.result()
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(work, *zip(*bands, strict=True)))
 
-    def _tiles(self, view: View) -> tuple[Tiles, NDArray[np.float64]]:
+    def _tiles(self, view: View) -> tuple[Tiles, Array]:
         """Bin the primitives into tiles by the bounds of their boxes, as seen by several rows of a rolling shutter.
 
         Returns:
-            The tiles, and the maps from the camera to what lies in them (`View.local`).
+            The tiles, and maps ``[R, P, 12]`` from the camera at each row of the view to the local frames of what lies
+            in the tiles (row-major 3x4).
         """
-        scene, snap = self.scene, view.middle
-        world = (
-            product(scene.corners * scene.scale[:, None, :], np.swapaxes(snap.rotation, 1, 2)) + snap.origin[:, None, :]
-        )
-        chosen = np.linspace(0, len(view.poses) - 1, 9 if view.rolling else 1).astype(int)
-        bounds = [bounds_of(product(world - pose[:3, 3], pose[:3, :3])) for pose in view.poses[chosen]]
-        nearest, low_u, low_v = (np.min([bound[k] for bound in bounds], axis=0) for k in range(3))
-        high_u, high_v = (np.max([bound[k] for bound in bounds], axis=0) for k in (3, 4))
-        if view.rolling:
-            nearest = nearest - _SLACK_M
-        tiles_x, tiles_y = -(-CAMERA.width // kernels.TILE), -(-CAMERA.height // kernels.TILE)
-        visible = (high_u >= 0) & (low_u < CAMERA.width) & (high_v >= 0) & (low_v < CAMERA.height)
-        boxes = np.stack(
-            [
-                np.clip(low_u, 0, CAMERA.width - 1),
-                np.clip(low_v, 0, CAMERA.height - 1),
-                np.clip(high_u, 0, CAMERA.width - 1),
-                np.clip(high_v, 0, CAMERA.height - 1),
-            ],
-            axis=1,
-        )
-        boxes = (boxes // kernels.TILE).astype(np.int32)
+        scene, corners = self.scene, self.scene.corners * self.scene.scale[:, None, :]
+        world = product(corners, np.swapaxes(view.rotation, 1, 2)) + view.origin[:, None, :]
+        chosen = np.linspace(0, len(view.rows) - 1, 9 if view.rolling else 1).astype(int)
+        bounds = [bounds_of(product(world - pose[:3, 3], pose[:3, :3])) for pose in view.rows[chosen]]
+        nearest, *low = np.min(bounds, axis=0)[:3]
+        high = np.max(bounds, axis=0)[3:]
+        nearest = nearest - (_SLACK_M if view.rolling else 0.0)
+        last = np.array([[CAMERA.width - 1], [CAMERA.height - 1]])
+        visible = ((high >= 0) & (low <= last)).all(axis=0)
         order = np.argsort(nearest, kind="stable")
         order = order[visible[order]].astype(np.int32)
-        start, members = kernels.bin_tiles(order, boxes, tiles_x, tiles_y)
-        tiles = tiles_x, np.asarray(start, np.int32), np.asarray(members, np.int32), nearest
-        return tiles, view.local(order)
+        boxes = np.concatenate([np.clip(low, 0, last), np.clip(high, 0, last)]).T // TILE
+        tiles_x, tiles_y = -(-CAMERA.width // TILE), -(-CAMERA.height // TILE)
+        tiles = (tiles_x, *kernels.bin_tiles(order, boxes.astype(np.int32), tiles_x, tiles_y), nearest)
+        inverse = np.swapaxes(view.rotation[order], 1, 2) / scene.scale[order, :, None]
+        poses = np.repeat(view.rows[:, None, :3], len(order), axis=1)
+        poses[..., 3] -= view.origin[order]
+        local = np.empty((len(poses), len(scene.kind), 12))
+        local[:, order] = product(inverse, poses).reshape(len(poses), -1, 12)
+        return tiles, local
 
-    def _geometry(self, tiles: Tiles, local: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    def _cast(self, tiles: Tiles, local: Array) -> tuple[NDArray[np.int32], Array]:
         """What every pixel sees (`cast_geometry`) and its z-depth in metres."""
-        hit = np.empty((CAMERA.height, CAMERA.width), np.int32)
-        depth = np.empty((CAMERA.height, CAMERA.width))
-
-        def work(a: int, b: int) -> None:
-            for first, end, maps in _rows_of(local, a, b):
-                kernels.cast_geometry(
-                    first, end, self._intrinsics, *tiles, self.scene.kind, maps, self.scene.shape, hit, depth
-                )
-
-        self._rows(work)
+        hit, depth, scene = np.empty(SIZE, np.int32), np.empty(SIZE), self.scene
+        self._rows(
+            lambda a, b: kernels.cast_geometry(a, b, _INTRINSICS, *tiles, scene.kind, local, scene.shape, hit, depth)
+        )
         return hit, depth
 
-    def _motion(self, now: Snapshot, other: Snapshot) -> NDArray[np.float64]:
-        """Maps ``[P, 12]`` from points in this camera's frame, fixed to a primitive, to the other camera's frame."""
-        turn = product(other.rotation, np.swapaxes(now.rotation, 1, 2))
-        shift = other.origin - product(turn, now.origin[:, :, None])[:, :, 0]
-        to_other = other.T_world_cam[:3, :3].T
-        result = np.empty((len(shift), 3, 4))
-        result[:, :, :3] = product(to_other, turn, now.T_world_cam[:3, :3])
-        moved = product(turn, now.T_world_cam[:3, 3]) + shift - other.T_world_cam[:3, 3]
-        result[:, :, 3] = product(moved, to_other.T)
-        return np.ascontiguousarray(result.reshape(-1, 12))
+    def _shade(
+        self, now: View, tiles: Tiles, local: Array, hit: NDArray[np.int32], depth: Array, time: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Colour ``[H, W, 3]`` and cosine of incidence ``[H, W]``; a rolling shutter's normals are those of a band."""
+        scene, atlas, density = self.scene, self.atlas, self._density
+        color, cosine = np.empty((*SIZE, 3), np.float32), np.empty(SIZE, np.float32)
+        jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
 
-    def _lights(self, snap: Snapshot, time: float) -> NDArray[np.float64]:
+        def work(a: int, b: int) -> None:
+            pose = now.pose_of((a + b) // 2)
+            lights = self._lights(pose, time)
+            facets = self._facets(now, pose, lights, density)
+            kernels.shade_pixels(
+                a, b, _INTRINSICS, *tiles, scene.kind, local, scene.shape, scene.texture, scene.uv, scene.tint, facets,
+                *atlas, lights, hit, depth, jitter, color, cosine,
+            )  # fmt: skip
+
+        self._rows(work)
+        return color, cosine
+
+    def _flow(self, now: View, other: View, hit: NDArray[np.int32], depth: Array) -> NDArray[np.float32]:
+        """Exact flow under a global shutter; under a rolling one along the motion of each band's middle row."""
+        flow = np.empty((*SIZE, 2), np.float32)
+        rotation, shift = motion_of_primitives(now, other)
+
+        def work(a: int, b: int) -> None:
+            pose, after = now.pose_of((a + b) // 2), other.pose_of((a + b) // 2)
+            motion = np.empty((len(shift), 3, 4))  # from points in this camera's frame to the other camera's frame
+            motion[:, :, :3] = product(after[:3, :3].T, rotation, pose[:3, :3])
+            motion[:, :, 3] = product(product(rotation, pose[:3, 3]) + shift - after[:3, 3], after[:3, :3])
+            kernels.flow_field(a, b, _INTRINSICS, hit, depth, motion.reshape(-1, 12), flow)
+
+        self._rows(work)
+        return flow
+
+    def _blur(
+        self, now: View, after: View, hit: NDArray[np.int32], depth: Array, sharp: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Motion blur while the shutter is open."""
+        flow, blurred, exact = (
+            self._flow(now, after, hit, depth),
+            np.empty_like(sharp),
+            sharp.astype(np.float64).ravel(),
+        )
+        shares, shutter = kernels.tap_shares(), self.color_sensor.shutter
+        self._rows(lambda a, b: kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
+        return blurred
+
+    def _lights(self, pose: Array, time: float) -> Array:
         """Directions to the lights in the camera frame, and strengths; row 0 is the ambient light."""
         rows = _LAMPS.copy()
         rows[:, :3] /= norm(rows[:, :3])[:, None]
         if self.settings.lighting_change:
             rows[:, 3] *= 0.78 + 0.22 * cos(2 * math.pi * time / 7.0)
-            if sin(2 * math.pi * time / 4.7) > 0.3:
-                rows[2, 3] += 0.25
-        rows[:, :3] = product(rows[:, :3], snap.T_world_cam[:3, :3])
-        return np.ascontiguousarray(rows)
+            rows[2, 3] += 0.25 if sin(2 * math.pi * time / 4.7) > 0.3 else 0.0
+        rows[:, :3] = product(rows[:, :3], pose[:3, :3])
+        return rows
 
-    def _facets(self, snap: Snapshot, lights: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _facets(self, view: View, pose: Array, lights: Array, density: Array) -> Array:
         """What is the same all over a face ``[P, 6, 5]``: normal in the camera frame, light, texels a pixel at 1 m."""
-        scene = self.scene
-        axes = product(snap.T_world_cam[:3, :3].T, snap.rotation).transpose(0, 2, 1)
+        quads = self.scene.kind == QUAD
+        axes = product(pose[:3, :3].T, view.rotation).transpose(0, 2, 1)
         facets = np.empty((len(axes), 6, 5))
         facets[:, 0::2, :3], facets[:, 1::2, :3] = -axes, axes
-        facets[scene.kind == QUAD, 4:, :3] = axes[scene.kind == QUAD, 2:]
-        to_camera = snap.T_world_cam[:3, 3] - snap.origin
-        behind = (product(to_camera[:, None, :], snap.rotation) < 0)[:, 0, 2] & (scene.kind == QUAD)
+        facets[quads, 4:, :3] = axes[quads, 2:]
+        to_camera = pose[:3, 3] - view.origin
+        behind = (product(to_camera[:, None, :], view.rotation) < 0)[:, 0, 2] & quads
         facets[behind, 4:, :3] *= -1
-        facets[:, :, 3] = lights[0, 3] + product(
-            np.maximum(product(facets[:, :, :3], lights[1:, :3].T), 0), lights[1:, 3]
-        )
-        facets[:, :, 4] = self._density
+        facing = np.maximum(product(facets[:, :, :3], lights[1:, :3].T), 0)
+        facets[:, :, 3], facets[:, :, 4] = lights[0, 3] + product(facing, lights[1:, 3]), density
         return facets
 
     @cached_property
-    def _density(self) -> NDArray[np.float64]:
+    def _density(self) -> Array:
         """Texels a pixel at 1 m on each face ``[P, 6]`` seen at right angles."""
-        scene = self.scene
-        repeats = np.abs(scene.uv[:, :, :2])
-        cones = scene.kind == ROUND_CONE
-        girth = math.pi * np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3)
-        repeats[cones, :, 0] /= girth[:, None]
+        scene, log2_size = self.scene, self.atlas[2]
+        repeats, cones = np.abs(scene.uv[:, :, :2]), scene.kind == ROUND_CONE
+        repeats[cones, :, 0] /= (math.pi * np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3))[:, None]
         repeats[cones] /= scene.scale[cones].mean(axis=1)[:, None, None]
-        return np.asarray(repeats.max(axis=2) * (1 << self.atlas.log2_size[scene.texture]) / CAMERA.fx)
+        return np.asarray(repeats.max(axis=2) * (1 << log2_size[scene.texture]) / CAMERA.fx)
 
-    def _shadow(self, snap: Snapshot, time: float, depth: NDArray[np.float64], color: NDArray[np.float32]) -> None:
-        """Soft shadows of things outside the picture, sweeping over the room."""
-        light = _LAMPS[1, :3] / _LAMPS[1, 2]
-        sweep = 1.6 * sin(2 * math.pi * time / 6.3)
-        spots = np.array(
-            [
-                [sweep + light[0] * 1.2, 0.7 + 0.3 * sin(1.1 * time), 1.0, 0.5],
-                [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4],
-            ]
-        )
-        pose = snap.T_world_cam
-        self._rows(lambda a, b: sensors.dim(a, b, self._intrinsics, pose, depth, light, 2.2, spots, color))
+    def _shadow(self, pose: Array, time: float, depth: Array, color: NDArray[np.float32]) -> None:
+        """Soft shadows of things outside the picture, sweeping over the scene."""
+        light, sweep = _LAMPS[1, :3] / _LAMPS[1, 2], 1.6 * sin(2 * math.pi * time / 6.3)
+        first = [sweep + light[0] * 1.2, 0.7 + 0.3 * sin(1.1 * time), 1.0, 0.5]
+        spots = np.array([first, [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4]])
+        self._rows(lambda a, b: sensors.dim(a, b, _INTRINSICS, pose, depth, light, 2.2, spots, color))
 
-    def _glare(self, snap: Snapshot, time: float) -> NDArray[np.float32]:
-        """A bright veil ``[H, W, 1]`` around a window beside the room's back wall, brightening and fading."""
-        window = np.array(self.scene.world.window)
-        x, y, z = product(window - snap.T_world_cam[:3, 3], snap.T_world_cam[:3, :3])
+    def _glare(self, pose: Array, time: float) -> NDArray[np.float32]:
+        """A bright veil ``[H, W, 1]`` around a window beside the back wall, brightening and fading."""
+        x, y, z = product(np.array(self.scene.world.window) - pose[:3, 3], pose[:3, :3])
         if z <= 0.1:
-            return np.zeros((CAMERA.height, CAMERA.width, 1), np.float32)
+            return np.zeros((*SIZE, 1), np.float32)
         u, v = x / z * CAMERA.fx + CAMERA.cx, y / z * CAMERA.fy + CAMERA.cy
         strength = 110 * (0.6 + 0.4 * sin(2 * math.pi * time / 5.3))
         across = exp(-(((np.arange(CAMERA.width) - u) / 210.0) ** 2))
         down = exp(-(((np.arange(CAMERA.height) - v) / 180.0) ** 2))
         return np.asarray((strength * down[:, None] * across[None, :])[..., None], np.float32)
 
+    def _noise_seed(self, number: int) -> np.uint64:
+        return np.uint64((self._seed + 0x9E3779B97F4A7C15 * number) & 0xFFFFFFFFFFFFFFFF)
+
     def _measure(
-        self, index: int, depth: NDArray[np.float64], cosine: NDArray[np.float32], color: NDArray[np.float32]
+        self, index: int, depth: Array, cosine: NDArray[np.float32], color: NDArray[np.float32]
     ) -> NDArray[np.uint16]:
-        sensor = self.depth_sensor
+        """The depth as the sensor measures it."""
+        sensor, raw, seed = self.depth_sensor, np.empty(SIZE, np.uint16), self._noise_seed(2 * index)
         if not sensor.noise:
             return np.clip(np.floor(depth * CAMERA.depth_factor + 0.5), 0, 65535).astype(np.uint16)
-        raw = np.empty(depth.shape, np.uint16)
-        seed = np.uint64((self._seed + 0x9E3779B97F4A7C15 * (2 * index)) & 0xFFFFFFFFFFFFFFFF)
+        values = sensor.disparity_noise_px, sensor.near_m, sensor.far_m, sensor.edge_px, sensor.dark
         self._rows(
             lambda a, b: sensors.measure_depth(
-                a,
-                b,
-                seed,
-                CAMERA.fx,
-                CAMERA.baseline_m,
-                depth,
-                cosine,
-                color,
-                sensor.disparity_noise_px,
-                sensor.near_m,
-                sensor.far_m,
-                sensor.edge_px,
-                sensor.dark,
-                CAMERA.depth_factor,
-                raw,
+                a, b, seed, CAMERA.fx, CAMERA.baseline_m, depth, cosine, color, *values, CAMERA.depth_factor, raw
             )
         )
         return raw
 
     def _expose(self, index: int, color: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Exposure of a rolling readout (drift and mains flicker), noise and rounding."""
-        sensor, optics = self.color_sensor, self.scene.world.optics
-        rows = np.arange(CAMERA.height)
-        time = index / FPS + rows / CAMERA.height / FPS * 0.9
-        gain = 1 + sensor.exposure_drift * (
-            0.7 * sin(2 * math.pi * time / 6.1) + 0.3 * sin(2 * math.pi * time / 1.9 + 1.0)
-        )
+        sensor, optics, rgb = self.color_sensor, self.scene.world.optics, np.empty(color.shape, np.uint8)
+        time = index / FPS + np.arange(CAMERA.height) / CAMERA.height / FPS * 0.9
+        drift = 0.7 * sin(2 * math.pi * time / 6.1) + 0.3 * sin(2 * math.pi * time / 1.9 + 1.0)
+        gain = 1 + sensor.exposure_drift * drift
         gain *= 1 + sensor.flicker * sin(2 * math.pi * 100.0 * time * 1.0013)
         if optics.gain != 1 or optics.auto_exposure:
             mean = max(float(color.mean(dtype=np.float64)) * optics.gain, 1.0)
             gain *= optics.gain * power(_MEAN_GREY / mean, optics.auto_exposure)
-        rgb = np.empty(color.shape, np.uint8)
-        seed = np.uint64((self._seed + 0x9E3779B97F4A7C15 * (2 * index + 1)) & 0xFFFFFFFFFFFFFFFF)
+        seed = self._noise_seed(2 * index + 1)
         read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
         self._rows(lambda a, b: sensors.expose(a, b, seed, color, gain, read, shot, rgb))
         return rgb
 
 
-def _rows_of(local: NDArray[np.float64], first: int, end: int) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
-    """Runs of rows that share a pose: first row, one past the last, the maps into the primitives' frames."""
-    if len(local) == 1:
-        yield first, end, local[0]
-        return
-    for row in range(first, end):
-        yield row, row + 1, local[row]
-
-
 SensorSettings = TypeVar("SensorSettings", bound=Settings)
 
 
-def _adapted(sensor: SensorSettings, family: Mapping[str, Any]) -> SensorSettings:
-    """The sensor's settings with those of the family where the user left the default."""
-    return sensor.model_copy(update={k: v for k, v in family.items() if k not in sensor.model_fields_set})
+def _adapted(sensor: SensorSettings, world: Mapping[str, Any]) -> SensorSettings:
+    """The sensor's settings with those of the world where the user left the default."""
+    return sensor.model_copy(update={k: v for k, v in world.items() if k not in sensor.model_fields_set})
 
 
 def default_threads() -> int:

@@ -1,4 +1,4 @@
-"""Families of rendered sequences in the office.
+"""Rendered sequences in the office.
 
 Replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, and conditions that sensors
 dislike.
@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
@@ -24,74 +23,22 @@ from dynslam_bench.sequences.synthetic.camera_paths import (
     camera_axes,
     camera_poses,
     hand,
+    poses_of,
     rotations,
 )
-from dynslam_bench.sequences.synthetic.parts import Parts, turn
-from dynslam_bench.sequences.synthetic.people import (
-    ChairKey,
-    Key,
-    Posture,
-    chair_place,
-    draw_person,
-    posture,
-    write_script,
-)
+from dynslam_bench.sequences.synthetic.parts import Key, Parts, angle_between, between, ease, turn
+from dynslam_bench.sequences.synthetic.people import Posture, draw_person, posture, write_script
 from dynslam_bench.sequences.synthetic.rooms import (
     Plan,
-    add_chair,
     add_floor,
     add_wall,
     build_room,
     office_bay,
+    office_chair,
     pick,
     plan_room,
 )
-from dynslam_bench.sequences.synthetic.scene import Actor, Array, Body, Optics, World
-from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES
-
-Value = TypeVar("Value", int, tuple[str, ...])
-
-
-@dataclass(frozen=True)
-class Family:
-    """Rendered sequences of one kind, ``synthetic/<name>_<variant>``.
-
-    Attributes:
-        name: First part of the ids.
-        variants: Second parts; empty for the name alone.
-        build: Variant and scene number to the world that is filmed.
-        tags: As in the catalogue: ``static``, ``low-dynamic``, ``high-dynamic``; of each variant, or of all.
-        frames: Default length of each variant, or of all.
-        versions: Raised whenever any pixel, pose or mask changes; of each variant, or of all.
-    """
-
-    name: str
-    variants: tuple[str, ...]
-    build: Callable[[str, int], World]
-    tags: tuple[str, ...] | dict[str, tuple[str, ...]]
-    frames: int | dict[str, int] = DEFAULT_FRAMES
-    versions: int | dict[str, int] = 1
-
-    def length(self, variant: str) -> int:
-        """Default number of frames of a variant."""
-        return _of(self.frames, variant)
-
-    def version(self, variant: str) -> int:
-        """Version of a variant."""
-        return _of(self.versions, variant)
-
-    def tags_of(self, variant: str) -> tuple[str, ...]:
-        """How much moves in a variant."""
-        return _of(self.tags, variant)
-
-    def ids(self) -> list[str]:
-        """All ids, for example ``synthetic/walking_xyz``."""
-        return [f"synthetic/{self.name}" + (f"_{variant}" if variant else "") for variant in self.variants]
-
-
-def _of(values: Value | dict[str, Value], variant: str) -> Value:
-    return values[variant] if isinstance(values, dict) else values
-
+from dynslam_bench.sequences.synthetic.scene import Actor, Array, Body, Optics, Variant, World
 
 # Replicas of TUM's fr3 dynamic sequences: two people who walk or sit in an office, four camera motions.
 
@@ -104,20 +51,13 @@ def build_replica(people: str, motion: str, scene: int) -> World:
         camera=partial(camera_poses, motion, people, scene),
         window=window_of(plan),
         bodies=tuple(
-            Body(3 + k, "chair", chair(plan, 3 + k, 1.0 if k == 0 else 0.8), partial(_roll, keys, script.period))
+            Body(3 + k, "chair", office_chair(plan, 3 + k, (1.0, 0.8)[k]), partial(_roll, keys, script.period))
             for k, keys in enumerate(script.chairs)
         ),
         actors=tuple(
-            Actor(draw_person(scene, k), partial(posture, keys, script.period)) for k, keys in enumerate(script.people)
+            (draw_person(scene, k), partial(posture, keys, script.period)) for k, keys in enumerate(script.people)
         ),
     )
-
-
-def chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
-    """An office chair in the plan's colours, facing -y about its own origin."""
-    parts = Parts()
-    add_chair(parts, instance, plan.tints["chair"] * shade, plan.tints["metal"])
-    return parts
 
 
 def window_of(plan: Plan) -> tuple[float, float, float]:
@@ -125,13 +65,18 @@ def window_of(plan: Plan) -> tuple[float, float, float]:
     return plan.left_x * 0.55, plan.back_y, 2.15
 
 
-def _roll(keys: tuple[ChairKey, ...], period: float, time: float) -> tuple[Array, Array]:
-    x, y, facing = chair_place(keys, period, time)
-    return turn(facing + 180.0), np.array([x, y, 0.0])
+def _roll(keys: tuple[Key, ...], period: float, time: float) -> tuple[Array, Array]:
+    a, b, share = between(keys, time % period)
+    e = ease(share)
+    place = np.array([a.x + e * (b.x - a.x), a.y + e * (b.y - a.y), 0.0])
+    return turn(angle_between(a.facing, b.facing, e) + 180.0), place
 
 
-WALKING = Family("walking", MOTIONS, partial(build_replica, "walking"), ("high-dynamic",), versions=0)
-SITTING = Family("sitting", MOTIONS, partial(build_replica, "sitting"), ("low-dynamic",), versions=0)
+REPLICAS = {
+    f"{people}_{motion}": Variant(partial(build_replica, people, motion), tag, version=0)
+    for people, tag in (("walking", "high-dynamic"), ("sitting", "low-dynamic"))
+    for motion in MOTIONS
+}
 
 
 # Four people who walk past each other all the time and hide most of the view.
@@ -150,10 +95,9 @@ def build_crowd(motion: str, scene: int) -> World:
 
 def _walker(scene: int, number: int, lane: float) -> Actor:
     """To and fro on a lane, with a stop in the middle where the person turns to the camera and talks."""
-    rng = stream(scene, "synthetic", "crowd", number)
+    rng, side = stream(scene, "synthetic", "crowd", number), 1.0 if number % 2 else -1.0
     reach, pause = pick(rng, scene, 1.0, 1.45), pick(rng, scene, 0.8, 2.0)
     stop, cross = pick(rng, scene, -0.5, 0.5), pick(rng, scene, 2.6, 3.4)
-    side = 1.0 if number % 2 else -1.0
     stations = [(0.0, -side * reach, side, 0.0), (cross * 0.5, side * stop, side, 0.0), (pause, side * stop, 0, 1.0)]
     stations += [(cross * 0.5, side * reach, side, 0.0), (0.7, side * reach, -side, 0.0)]
     stations += [(cross, -side * reach, -side, 0.0), (0.6, -side * reach, side, 0.0)]
@@ -165,10 +109,10 @@ def _walker(scene: int, number: int, lane: float) -> Actor:
     period = keys[-1].t
     start = pick(rng, scene, 0.0, period)
     person = replace(draw_person(scene, number), instance=number + 1)
-    return Actor(person, lambda time: replace(posture(keys, period, time + start), clock=time))
+    return person, lambda time: replace(posture(keys, period, time + start), clock=time)
 
 
-CROWD = Family("crowd", ("xyz", "static"), build_crowd, ("high-dynamic",))
+CROWDS = {f"crowd_{motion}": Variant(partial(build_crowd, motion), "high-dynamic") for motion in ("xyz", "static")}
 
 
 # Two people who step from side to side in time with the camera: in its image they stand still.
@@ -184,16 +128,16 @@ class Step:
 
     def at(self, times: Array) -> Array:
         """Offset along x at times (seconds)."""
-        swing = sin(2 * math.pi * (np.asarray(times) / self.period + self.phase))
+        swing = sin(2 * math.pi * (times / self.period + self.phase))
         return np.asarray(self.reach * swing * (1.5 - 0.5 * swing * swing))
 
 
-def build_synchronous(variant: str, scene: int) -> World:
+def build_synchronous(scene: int) -> World:
     """The office, two people side by side, and a camera that moves with them."""
     plan, rng = plan_room(scene), stream(scene, "synthetic", "synchronous")
     step = Step(pick(rng, scene, 0.5, 0.6), pick(rng, scene, 4.4, 5.2), pick(rng, scene, 0.0, 1.0))
     places = ((-pick(rng, scene, 0.3, 0.36), pick(rng, scene, 1.2, 1.3)), (pick(rng, scene, 0.28, 0.34), 1.35))
-    actors = tuple(Actor(draw_person(scene, k), partial(_stepping, step, place)) for k, place in enumerate(places))
+    actors = tuple((draw_person(scene, k), partial(_stepping, step, place)) for k, place in enumerate(places))
     return World(build_room(scene, plan), partial(_camera, step, scene), window_of(plan), actors=actors)
 
 
@@ -204,61 +148,57 @@ def _stepping(step: Step, place: tuple[float, float], time: float) -> Posture:
 
 
 def _camera(step: Step, scene: int, times: Array) -> Array:
-    rng, t = stream(scene, "synthetic", "camera", "synchronous"), np.asarray(times, dtype=np.float64)
-    poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, :3] = product(camera_axes(TILT_RAD), rotations(hand(rng, t, math.radians(0.5), 3)))
-    poses[:, :3, 3] = hand(rng, t, 0.004, 3) + np.array([0.0, 0.0, EYE_HEIGHT_M])
-    poses[:, 0, 3] += step.at(t)
-    return poses
+    rng = stream(scene, "synthetic", "camera", "synchronous")
+    rotation = product(camera_axes(TILT_RAD), rotations(hand(rng, times, math.radians(0.5), 3)))
+    place = hand(rng, times, 0.004, 3) + np.array([0.0, 0.0, EYE_HEIGHT_M])
+    place[:, 0] += step.at(times)
+    return poses_of(rotation, place)
 
 
-SYNCHRONOUS = Family("synchronous", ("",), build_synchronous, ("high-dynamic",))
+SYNCHRONOUS = {"synchronous": Variant(build_synchronous, "high-dynamic")}
 
 
 # What the sensors dislike: little light, little texture, little depth, depth as in sunlight.
 
+Change = Callable[[World, int], World]
 DARK = Optics(gain=0.13, color={"read_noise": 2.4, "shot_noise": 0.12, "shutter": 0.8})
 SUNLIGHT = Optics(gain=1.25, depth={"disparity_noise_px": 0.25, "far_m": 4.0, "dark": 0.1, "edge_px": 4})
 
 
-def build_condition(alter: Callable[[World, int], World], variant: str, scene: int) -> World:
+def build_condition(change: Change, people: bool, scene: int) -> World:
     """The replica of a walking sequence under a condition, with a camera path of its own."""
-    world = alter(build_replica("walking", "xyz", scene), scene)
-    camera = partial(camera_poses, "halfsphere", "conditions", scene)
-    if variant == "walking":
-        return replace(world, camera=camera)
-    return replace(world, camera=camera, actors=(), bodies=())
+    world = change(build_replica("walking", "xyz", scene), scene)
+    world = replace(world, camera=partial(camera_poses, "halfsphere", "conditions", scene))
+    return world if people else replace(world, actors=(), bodies=())
 
 
 def _plain(world: World, scene: int) -> World:
     """The same things without a pattern."""
-    room = Parts()
-    room.extend(world.static)
-    room.texture = [tuple("plain" for _ in row) for row in room.texture]
-    return replace(world, static=room)
+    return replace(world, static=Parts(replace(part, texture=("plain",) * 6) for part in world.static))
 
 
 def _hall(world: World, scene: int) -> World:
     """A hall whose walls and furniture stand beyond the depth sensor's reach."""
-    plan, room, x, front, back = plan_room(scene, 0), Parts(), 7.0, -3.0, 8.6
-    add_floor(room, (-x, front), (x, back), plan)
+    plan, hall, x, front, back = plan_room(scene, 0), Parts(), 7.0, -3.0, 8.6
+    add_floor(hall, (-x, front), (x, back), plan)
     for start, end in (((-x, front), (x, front)), ((x, front), (x, back)), ((x, back), (-x, back)),
                        ((-x, back), (-x, front))):  # fmt: skip
-        add_wall(room, start, end, plan)
-    for k in range(3):
-        room.extend(office_bay(scene, k), 0.0, ((k - 1) * 4.3, back - 0.05, 0.0), f"/{k}")
-    for k, side in enumerate((-1, 1)):
-        room.extend(office_bay(scene, 3 + k), -90.0 * side, (side * (x - 0.05), 5.0, 0.0), f"/{3 + k}")
-    return replace(world, static=room, window=(0.0, back, 2.15))
+        add_wall(hall, start, end, plan)
+    places = [(0.0, ((k - 1) * 4.3, back - 0.05, 0.0)) for k in range(3)]
+    places += [(-90.0 * side, (side * (x - 0.05), 5.0, 0.0)) for side in (-1, 1)]
+    for k, (yaw, at) in enumerate(places):
+        hall.add_copies(office_bay(scene, k), yaw, at, f"/{k}")
+    return replace(world, static=hall, window=(0.0, back, 2.15))
 
 
-def _seen_by(optics: Optics) -> Callable[[World, int], World]:
-    return lambda world, _: replace(world, optics=optics)
-
-
-_TAGS: dict[str, tuple[str, ...]] = {"empty": ("static",), "walking": ("high-dynamic",)}
-
-CONDITIONS = tuple(
-    Family(name, tuple(_TAGS), partial(build_condition, alter), _TAGS)
-    for name, alter in (("dark", _seen_by(DARK)), ("blank", _plain), ("far", _hall), ("outdoor", _seen_by(SUNLIGHT)))
-)
+_CHANGES: dict[str, Change] = {
+    "dark": lambda world, _: replace(world, optics=DARK),
+    "blank": _plain,
+    "far": _hall,
+    "outdoor": lambda world, _: replace(world, optics=SUNLIGHT),
+}
+CONDITIONS = {
+    f"{name}_{kind}": Variant(partial(build_condition, change, kind == "walking"), tag)
+    for name, change in _CHANGES.items()
+    for kind, tag in (("empty", "static"), ("walking", "high-dynamic"))
+}

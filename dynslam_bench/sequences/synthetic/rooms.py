@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,10 @@ class Plan:
     posters: int
     mirrored: bool
     tints: dict[str, Array]
+
+
+Style = dict[str, Any]
+"""Arguments of `Parts.add` that several primitives share."""
 
 
 def pick(rng: np.random.Generator, scene: int, low: float, high: float, steps: int = 64) -> float:
@@ -93,203 +98,103 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
     )
 
 
-# The room's furniture: desk with monitors and clutter, shelf, posters, cabinet with a plant, office chairs.
+# The office's furniture: desk with monitors and clutter, shelf, posters, cabinet with a plant, office chairs.
 
 TOP = 0.74
 """Height of a desk, metres."""
+_EYE = np.eye(3)
 
 
 def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> None:
-    """A desk (0.8 m deep, 0.74 m high) with monitors, keyboards, books, papers, mugs and a lamp."""
-    _add_table(parts, plan, x, y, half)
-    _add_monitors(parts, rng, plan, x, y, half)
-    _add_papers(parts, rng, x, y, half)
-    _add_books(parts, rng, x, y, half)
-    _add_mugs(parts, rng, x, y)
-    side = 1 if plan.mirrored else -1
-    eye, lamp = np.eye(3), np.array([x + side * (0.55 - half), y + 0.62, TOP])
-    parts.add(ROUND_CONE, eye, lamp, (0.02, 0.07, 0.06), tint=plan.tints["metal"], scale=(1, 1, 0.4))
-    parts.add(ROUND_CONE, eye, lamp, (0.42, 0.012, 0.012), tint=plan.tints["metal"])
-    parts.add(ROUND_CONE, eye, lamp + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=plan.tints["bin"])
-
-
-def _add_table(parts: Parts, plan: Plan, x: float, y: float, half: float) -> None:
-    """The table, and a drawer unit under one end."""
-    eye, tint, top = np.eye(3), plan.tints, TOP
-    parts.add(
-        BOX,
-        eye,
-        np.array([x, y + 0.4, top - 0.018]),
-        (half, 0.4, 0.018),
-        texture="wood",
-        repeat=(1.2, 1.6),
-        tint=tint["desk"],
-    )
-    for side in (-1, 1):
-        parts.add(
-            BOX,
-            eye,
-            np.array([x + side * (half - 0.04), y + 0.4, (top - 0.036) / 2]),
-            (0.02, 0.36, (top - 0.036) / 2),
-            texture="wood",
-            tint=tint["desk"] * 0.9,
-        )
-    parts.add(
-        BOX, eye, np.array([x, y + 0.74, 0.45]), (half - 0.06, 0.01, 0.25), texture="wood", tint=tint["desk"] * 0.85
-    )
-    side = 1 if plan.mirrored else -1
+    """A desk (0.8 m deep, 0.74 m high) with drawers, monitors, keyboards, books, papers, mugs and a lamp."""
+    tint, side = plan.tints, 1 if plan.mirrored else -1
+    top, leg = np.array([x, y + 0.4, TOP - 0.018]), (TOP - 0.036) / 2
+    parts.add(BOX, _EYE, top, (half, 0.4, 0.018), texture="wood", repeat=(1.2, 1.6), tint=tint["desk"])
+    for end in (-1, 1):
+        at = np.array([x + end * (half - 0.04), y + 0.4, leg])
+        parts.add(BOX, _EYE, at, (0.02, 0.36, leg), texture="wood", tint=tint["desk"] * 0.9)
+    back = np.array([x, y + 0.74, 0.45])
+    parts.add(BOX, _EYE, back, (half - 0.06, 0.01, 0.25), texture="wood", tint=tint["desk"] * 0.85)
     unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
-    parts.add(BOX, eye, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"])
+    parts.add(BOX, _EYE, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"])
     for k in range(3):
-        parts.add(
-            BOX, eye, unit + np.array([0, -0.305, 0.19 - 0.19 * k]), (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92
-        )
-        parts.add(BOX, eye, unit + np.array([0, -0.32, 0.22 - 0.19 * k]), (0.05, 0.008, 0.008), tint=tint["metal"])
+        front, handle = unit + np.array([0, -0.305, 0.19 - 0.19 * k]), unit + np.array([0, -0.32, 0.22 - 0.19 * k])
+        parts.add(BOX, _EYE, front, (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92)
+        parts.add(BOX, _EYE, handle, (0.05, 0.008, 0.008), tint=tint["metal"])
+    _add_monitors(parts, rng, plan, x, y, half)
+    for k in range(5):
+        px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
+        facing, sheet = turn(rng.random() * 50 - 25), f"poster:{k % 4}"
+        at = np.array([px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k])
+        parts.add(BOX, facing, at, (0.105, 0.148, 0.001), texture=sheet, fit=(5,), tint=(0.95,) * 3)
+    for k in range(2):  # a pile of books at either end
+        bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
+        for level in range(int(rng.integers(2, 5))):
+            shade, facing = 0.25 + 0.7 * rng.random(3), turn(rng.random() * 30 - 15)
+            book, faces = np.array([bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level]), ("books",) * 4 + ("plain",)
+            parts.add(
+                BOX, facing, book, (0.12, 0.085, 0.017), texture=(*faces, f"poster:{level % 4}"), fit=(5,), tint=shade,
+                repeat=(0.4, 3.0),
+            )  # fmt: skip
+    for k in range(2):
+        mug = np.array([x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012])
+        pattern, shade = "stripes" if k else "plain", 0.35 + 0.6 * rng.random(3)
+        parts.add(ROUND_CONE, _EYE, mug, (0.085, 0.04, 0.042), texture=pattern, repeat=(1.0, 4.0), tint=shade)
+    lamp = np.array([x + side * (0.55 - half), y + 0.62, TOP])
+    parts.add(ROUND_CONE, _EYE, lamp, (0.02, 0.07, 0.06), tint=tint["metal"], scale=(1, 1, 0.4))
+    parts.add(ROUND_CONE, _EYE, lamp, (0.42, 0.012, 0.012), tint=tint["metal"])
+    parts.add(ROUND_CONE, _EYE, lamp + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=tint["bin"])
+
+
+_FRAME = ((0, 0.18, 0.285, 0.013), (0, -0.18, 0.285, 0.013), (-0.277, 0, 0.013, 0.19), (0.277, 0, 0.013, 0.19))
+"""Bars around a monitor's picture: middle and half extents along both of its sides, metres."""
 
 
 def _add_monitors(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> None:
     """Monitors, each with its foot, a keyboard and a mouse."""
-    tint, top = plan.tints, TOP
-    spacing = 2 * half / (plan.monitors + 0.6)
+    plastic, spacing = plan.tints["plastic"], 2 * half / (plan.monitors + 0.6)
     for k in range(plan.monitors):
         mx = x + (k - (plan.monitors - 1) / 2) * spacing + 0.06 * (rng.random() - 0.5)
         facing = turn((rng.random() - 0.5) * 24)
         my = y + 0.52 + 0.08 * rng.random()
-        parts.add(
-            BOX,
-            facing,
-            np.array([mx, my, top + 0.3]),
-            (0.27, 0.02, 0.175),
-            texture=("plain", "plain", f"screen:{k}", "plain", "plain", "plain"),
-            tint=(1.0, 1.0, 1.0),
-            fit=(2,),
-        )
-        for dx, dz, hx, hz in (
-            (0, 0.18, 0.285, 0.013),
-            (0, -0.18, 0.285, 0.013),
-            (-0.277, 0, 0.013, 0.19),
-            (0.277, 0, 0.013, 0.19),
-        ):
-            parts.add(
-                BOX,
-                facing,
-                np.array([mx, my, top + 0.3]) + product(facing, np.array([dx, -0.012, dz])),
-                (hx, 0.024, hz),
-                tint=tint["plastic"],
-            )
-        parts.add(BOX, facing, np.array([mx, my + 0.03, top + 0.09]), (0.03, 0.02, 0.09), tint=tint["plastic"])
-        parts.add(BOX, facing, np.array([mx, my + 0.01, top + 0.008]), (0.12, 0.09, 0.008), tint=tint["plastic"])
-        parts.add(
-            BOX,
-            turn(6 * (rng.random() - 0.5)),
-            np.array([mx - 0.03, my - 0.3, top + 0.012]),
-            (0.22, 0.075, 0.012),
-            texture="keyboard",
-            fit=(5,),
-        )
-        parts.add(
-            ROUND_CONE,
-            turn(20),
-            np.array([mx + 0.27, my - 0.3, top + 0.005]),
-            (0, 1, 1),
-            scale=(0.032, 0.055, 0.025),
-            tint=tint["plastic"],
-        )
-
-
-def _add_papers(parts: Parts, rng: np.random.Generator, x: float, y: float, half: float) -> None:
-    top = TOP
-    for k in range(5):
-        px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
-        parts.add(
-            BOX,
-            turn(rng.random() * 50 - 25),
-            np.array([px, y + 0.1 + 0.2 * rng.random(), top + 0.002 + 0.001 * k]),
-            (0.105, 0.148, 0.001),
-            texture=f"poster:{k % 4}",
-            fit=(5,),
-            tint=(0.95,) * 3,
-        )
-
-
-def _add_books(parts: Parts, rng: np.random.Generator, x: float, y: float, half: float) -> None:
-    """A pile of books at either end."""
-    top = TOP
-    for k in range(2):
-        bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
-        for level in range(int(rng.integers(2, 5))):
-            shade = 0.25 + 0.7 * rng.random(3)
-            parts.add(
-                BOX,
-                turn(rng.random() * 30 - 15),
-                np.array([bx, y + 0.3 + 0.1 * k, top + 0.018 + 0.036 * level]),
-                (0.12, 0.085, 0.017),
-                texture=("books",) * 4 + ("plain", f"poster:{level % 4}"),
-                fit=(5,),
-                tint=shade,
-                repeat=(0.4, 3.0),
-            )
-
-
-def _add_mugs(parts: Parts, rng: np.random.Generator, x: float, y: float) -> None:
-    eye, top = np.eye(3), TOP
-    for k in range(2):
-        mug = np.array([x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), top + 0.012])
-        parts.add(
-            ROUND_CONE,
-            eye,
-            mug,
-            (0.085, 0.04, 0.042),
-            texture="stripes" if k else "plain",
-            repeat=(1.0, 4.0),
-            tint=0.35 + 0.6 * rng.random(3),
-        )
+        middle, faces = np.array([mx, my, TOP + 0.3]), ("plain", "plain", f"screen:{k}", "plain", "plain", "plain")
+        parts.add(BOX, facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,))
+        for dx, dz, hx, hz in _FRAME:
+            bar = middle + product(facing, np.array([dx, -0.012, dz]))
+            parts.add(BOX, facing, bar, (hx, 0.024, hz), tint=plastic)
+        parts.add(BOX, facing, np.array([mx, my + 0.03, TOP + 0.09]), (0.03, 0.02, 0.09), tint=plastic)
+        parts.add(BOX, facing, np.array([mx, my + 0.01, TOP + 0.008]), (0.12, 0.09, 0.008), tint=plastic)
+        keyboard, mouse = np.array([mx - 0.03, my - 0.3, TOP + 0.012]), np.array([mx + 0.27, my - 0.3, TOP + 0.005])
+        parts.add(BOX, turn(6 * (rng.random() - 0.5)), keyboard, (0.22, 0.075, 0.012), texture="keyboard", fit=(5,))
+        parts.add(ROUND_CONE, turn(20), mouse, (0, 1, 1), scale=(0.032, 0.055, 0.025), tint=plastic)
 
 
 def add_shelf(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> None:
     """A bookcase against the back wall with rows of books and boxes."""
-    eye, tint = np.eye(3), plan.tints
+    tint = plan.tints["shelf"]
     x = (plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5) - side * 0.25 * rng.random()
     y, half, height = plan.back_y - 0.17, 0.42, 1.95
     for dx in (-half, half):
-        parts.add(
-            BOX, eye, np.array([x + dx, y, height / 2]), (0.015, 0.15, height / 2), texture="wood", tint=tint["shelf"]
-        )
-    parts.add(
-        BOX,
-        eye,
-        np.array([x, y + 0.145, height / 2]),
-        (half, 0.008, height / 2),
-        texture="wood",
-        tint=tint["shelf"] * 0.8,
-    )
+        at = np.array([x + dx, y, height / 2])
+        parts.add(BOX, _EYE, at, (0.015, 0.15, height / 2), texture="wood", tint=tint)
+    back = np.array([x, y + 0.145, height / 2])
+    parts.add(BOX, _EYE, back, (half, 0.008, height / 2), texture="wood", tint=tint * 0.8)
     for k in range(6):
         z = 0.06 + k * (height - 0.08) / 5
-        parts.add(BOX, eye, np.array([x, y, z]), (half, 0.15, 0.014), texture="wood", tint=tint["shelf"])
+        parts.add(BOX, _EYE, np.array([x, y, z]), (half, 0.15, 0.014), texture="wood", tint=tint)
         if k == 5:
             continue
         width = half * (0.45 + 0.5 * rng.random())
         tall = 0.12 + 0.03 * rng.random()
         offset = (half - width - 0.02) * (1 if rng.random() < 0.5 else -1)
+        books, shift = np.array([x + offset, y - 0.01, z + 0.014 + tall]), (float(rng.random()), 0.5)
         parts.add(
-            BOX,
-            eye,
-            np.array([x + offset, y - 0.01, z + 0.014 + tall]),
-            (width, 0.1, tall),
-            texture="books",
-            repeat=(0.9, 0.5 / tall),
-            shift=(float(rng.random()), 0.5),
+            BOX, _EYE, books, (width, 0.1, tall), texture="books", repeat=(0.9, 0.5 / tall), shift=shift,
             tint=(0.9,) * 3,
-        )
+        )  # fmt: skip
         if width < half * 0.75:
-            parts.add(
-                BOX,
-                eye,
-                np.array([x - offset * 1.9, y, z + 0.1]),
-                (0.1, 0.1, 0.085),
-                texture="plain",
-                tint=0.3 + 0.6 * rng.random(3),
-            )
+            carton = np.array([x - offset * 1.9, y, z + 0.1])
+            parts.add(BOX, _EYE, carton, (0.1, 0.1, 0.085), tint=0.3 + 0.6 * rng.random(3))
 
 
 def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
@@ -298,180 +203,68 @@ def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
         span = plan.right_x - plan.left_x - 1.6
         x = plan.left_x + 0.8 + span * (k + 0.3 + 0.4 * rng.random()) / plan.posters
         half_x, half_z = ((0.3, 0.42), (0.42, 0.3), (0.21, 0.3))[int(rng.integers(3))]
-        z = 1.55 + 0.25 * rng.random()
-        parts.add(
-            BOX,
-            np.eye(3),
-            np.array([x, plan.back_y - 0.006, z]),
-            (half_x, 0.006, half_z),
-            texture=f"poster:{k % 4}",
-            fit=(2,),
-        )
-
-
-def add_side_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
-    """A poster on each side wall."""
-    for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3)):
-        y = 1.6 + 1.2 * rng.random()
-        parts.add(
-            BOX, turn(90), np.array([x + sign * 0.006, y, 1.55]), (0.36, 0.006, 0.26), texture=f"poster:{k}", fit=(2, 3)
-        )
+        at = np.array([x, plan.back_y - 0.006, 1.55 + 0.25 * rng.random()])
+        parts.add(BOX, _EYE, at, (half_x, 0.006, half_z), texture=f"poster:{k % 4}", fit=(2,))
 
 
 def add_cabinet(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> None:
     """A low cabinet with a plant and boxes on it, at the other end of the back wall; a waste bin."""
-    eye, tint = np.eye(3), plan.tints
+    tint, y = plan.tints, plan.back_y - 0.25
     x = plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5
-    y = plan.back_y - 0.25
-    parts.add(BOX, eye, np.array([x, y, 0.42]), (0.45, 0.22, 0.42), tint=tint["cabinet"])
+    parts.add(BOX, _EYE, np.array([x, y, 0.42]), (0.45, 0.22, 0.42), tint=tint["cabinet"])
     for dx in (-0.225, 0.225):
-        parts.add(BOX, eye, np.array([x + dx, y - 0.226, 0.42]), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9)
-        parts.add(BOX, eye, np.array([x + dx * 0.3, y - 0.24, 0.6]), (0.008, 0.01, 0.06), tint=tint["metal"])
+        parts.add(BOX, _EYE, np.array([x + dx, y - 0.226, 0.42]), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9)
+        parts.add(BOX, _EYE, np.array([x + dx * 0.3, y - 0.24, 0.6]), (0.008, 0.01, 0.06), tint=tint["metal"])
     pot = np.array([x - 0.2 * side, y, 0.85])
-    parts.add(ROUND_CONE, eye, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25))
+    parts.add(ROUND_CONE, _EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25))
     for _ in range(9):
-        a, lean = rng.random() * 360, 0.3 + 0.7 * rng.random()
-        tip = pot + product(turn(a), np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()]))
-        base = pot + np.array([0, 0, 0.14])
-        z = (tip - base) / norm(tip - base)
-        u = np.cross(z, product(turn(a), np.array([0.0, 1.0, 0.0])))
-        u = u / norm(u)
-        parts.add(
-            ROUND_CONE,
-            np.stack([u, np.cross(z, u), z], 1),
-            base,
-            (float(norm(tip - base)), 0.012, 0.04),
-            scale=(0.25, 1.0, 1.0),
-            tint=np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random()),
-        )
+        a, lean = turn(rng.random() * 360), 0.3 + 0.7 * rng.random()
+        tip = pot + product(a, np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()]))
+        stem = pot + np.array([0, 0, 0.14])
+        length, green = norm(tip - stem), np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random())
+        z = (tip - stem) / length
+        u = np.cross(z, product(a, np.array([0.0, 1.0, 0.0])))
+        axes, leaf = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1), (float(length), 0.012, 0.04)
+        parts.add(ROUND_CONE, axes, stem, leaf, scale=(0.25, 1.0, 1.0), tint=green)
     for k in range(2):
         s = 0.1 + 0.05 * rng.random()
-        parts.add(
-            BOX,
-            turn(rng.random() * 30),
-            np.array([x + side * (0.1 + 0.2 * k), y, 0.84 + s]),
-            (s, s * 0.8, s),
-            texture=("plain",) * 2 + (f"poster:{k}",) + ("plain",) * 3,
-            fit=(2,),
-            tint=(0.85, 0.72, 0.55),
-        )
-    parts.add(
-        ROUND_CONE,
-        eye,
-        np.array([plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13]),
-        (0.16, 0.12, 0.14),
-        tint=tint["bin"],
-    )
-
-
-def add_chair(parts: Parts, instance: int, tint: Array, metal: Array) -> None:
-    """An office chair around its own origin on the floor, facing -y: seat, back, column, five-pointed base."""
-    eye = np.eye(3)
-    parts.add(
-        BOX,
-        eye,
-        np.array([0, 0, 0.45]),
-        (0.23, 0.22, 0.035),
-        instance=instance,
-        texture="denim",
-        repeat=(3, 3),
-        tint=tint,
-    )
-    lean = np.array([[1.0, 0, 0], [0, 0.985, -0.17], [0, 0.17, 0.985]])
-    parts.add(
-        BOX,
-        lean,
-        np.array([0, 0.26, 0.76]),
-        (0.21, 0.028, 0.25),
-        instance=instance,
-        texture="denim",
-        repeat=(3, 3),
-        tint=tint,
-    )
-    parts.add(BOX, lean, np.array([0, 0.255, 0.47]), (0.035, 0.012, 0.1), instance=instance, tint=metal)
-    parts.add(ROUND_CONE, eye, np.array([0, 0, 0.1]), (0.32, 0.03, 0.028), instance=instance, tint=metal)
-    for k in range(5):
-        a = turn(72 * k + 18)
-        tip = product(a, np.array([0.28, 0, 0.05]))
-        z = (tip - (0, 0, 0.09)) / norm(tip - (0, 0, 0.09))
-        u = product(a, np.array([0.0, 1.0, 0.0]))
-        parts.add(
-            ROUND_CONE,
-            np.stack([u, np.cross(z, u), z], 1),
-            np.array([0, 0, 0.09]),
-            (0.28, 0.024, 0.02),
-            instance=instance,
-            tint=metal,
-        )
-        parts.add(ROUND_CONE, eye, tip - (0, 0, 0.015), (0, 0.032, 0.032), instance=instance, tint=metal * 0.7)
-    for side in (-1, 1):
-        parts.add(
-            BOX, eye, np.array([side * 0.27, 0.03, 0.66]), (0.025, 0.13, 0.015), instance=instance, tint=metal * 0.8
-        )
-        parts.add(BOX, eye, np.array([side * 0.27, 0.05, 0.55]), (0.015, 0.02, 0.1), instance=instance, tint=metal)
-
-
-# The room: walls, floor and ceiling, and the places of its furniture.
+        facing, at = turn(rng.random() * 30), np.array([x + side * (0.1 + 0.2 * k), y, 0.84 + s])
+        faces = ("plain", "plain", f"poster:{k}", "plain", "plain", "plain")
+        parts.add(BOX, facing, at, (s, s * 0.8, s), texture=faces, fit=(2,), tint=(0.85, 0.72, 0.55))
+    waste = np.array([plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13])
+    parts.add(ROUND_CONE, _EYE, waste, (0.16, 0.12, 0.14), tint=tint["bin"])
 
 
 def build_room(scene: int, plan: Plan) -> Parts:
-    """All fixed primitives."""
+    """All fixed primitives of the office: walls, floor and ceiling, and its furniture."""
     rng = stream(scene, "synthetic", "furniture")
-    parts, tint = Parts(), plan.tints
-    height = 2.8
-    back, front = plan.back_y, -2.5
+    parts, tint, height, back, front = Parts(), plan.tints, 2.8, plan.back_y, -2.5
     mid_y, half_y = (back + front) / 2, (back - front) / 2
     mid_x, half_x = (plan.left_x + plan.right_x) / 2, (plan.right_x - plan.left_x) / 2
-    quad = {"shift": (float(rng.random()), float(rng.random()))}
+    floor, across, along = np.array([mid_x, mid_y, 0.0]), (half_x, height / 2, 0), (half_y, height / 2, 0)
+    shift = (float(rng.random()), float(rng.random()))
+    parts.add(QUAD, wall((1, 0, 0), (0, 1, 0)), floor, (half_x, half_y, 0), texture="carpet", tint=tint["floor"],
+              shift=shift)  # fmt: skip
     parts.add(
-        QUAD,
-        wall((1, 0, 0), (0, 1, 0)),
-        np.array([mid_x, mid_y, 0.0]),
-        (half_x, half_y, 0),
-        texture="carpet",
-        repeat=(1.0, 1.0),
-        tint=tint["floor"],
-        shift=quad["shift"],
+        QUAD, wall((1, 0, 0), (0, -1, 0)), floor + np.array([0, 0, height]), (half_x, half_y, 0), tint=(0.95,) * 3
     )
-    parts.add(
-        QUAD, wall((1, 0, 0), (0, -1, 0)), np.array([mid_x, mid_y, height]), (half_x, half_y, 0), tint=(0.95,) * 3
-    )
-    for x, sign in ((plan.left_x, 1.0), (plan.right_x, -1.0)):
-        parts.add(
-            QUAD,
-            wall((0, -sign, 0), (0, 0, 1)),
-            np.array([x, mid_y, height / 2]),
-            (half_y, height / 2, 0),
-            texture="plaster",
-            repeat=(0.5, 0.5),
-            tint=tint["side"],
-        )
-    parts.add(
-        QUAD,
-        wall((1, 0, 0), (0, 0, 1)),
-        np.array([mid_x, back, height / 2]),
-        (half_x, height / 2, 0),
-        texture="plaster",
-        repeat=(0.5, 0.5),
-        tint=tint["wall"],
-    )
-    parts.add(
-        QUAD,
-        wall((-1, 0, 0), (0, 0, 1)),
-        np.array([mid_x, front, height / 2]),
-        (half_x, height / 2, 0),
-        texture="plaster",
-        repeat=(0.5, 0.5),
-        tint=tint["wall"],
-    )
-    eye = np.eye(3)
+    for right, x, y, half, name in (
+        ((0, -1, 0), plan.left_x, mid_y, along, "side"),
+        ((0, 1, 0), plan.right_x, mid_y, along, "side"),
+        ((1, 0, 0), mid_x, back, across, "wall"),
+        ((-1, 0, 0), mid_x, front, across, "wall"),
+    ):
+        facing, at = wall(right, (0, 0, 1)), np.array([x, y, height / 2])
+        parts.add(QUAD, facing, at, half, texture="plaster", repeat=(0.5, 0.5), tint=tint[name])
     # Skirting board and a cable duct along the back wall.
-    parts.add(BOX, eye, np.array([mid_x, back - 0.01, 0.05]), (half_x, 0.01, 0.05), tint=tint["shelf"])
-    parts.add(BOX, eye, np.array([mid_x, back - 0.02, 0.95]), (half_x, 0.02, 0.04), tint=(0.82,) * 3)
+    parts.add(BOX, _EYE, np.array([mid_x, back - 0.01, 0.05]), (half_x, 0.01, 0.05), tint=tint["shelf"])
+    parts.add(BOX, _EYE, np.array([mid_x, back - 0.02, 0.95]), (half_x, 0.02, 0.04), tint=(0.82,) * 3)
     add_desk(parts, rng, plan, plan.desk_x, plan.desk_y, half=1.15)
     add_shelf(parts, rng, plan, plan.shelf_side)
     add_posters(parts, rng, plan)
-    add_side_posters(parts, rng, plan)
+    for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3)):
+        at = np.array([x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55])
+        parts.add(BOX, turn(90), at, (0.36, 0.006, 0.26), texture=f"poster:{k}", fit=(2, 3))
     add_cabinet(parts, rng, plan, -plan.shelf_side)
     return parts
 
@@ -488,10 +281,9 @@ def add_floor(parts: Parts, low: Point, high: Point, plan: Plan) -> None:
     """Floor and ceiling of a rectangle."""
     middle = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2]
     half = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0)
-    parts.add(
-        QUAD, wall((1, 0, 0), (0, 1, 0)), np.array([*middle, 0.0]), half, texture="carpet", tint=plan.tints["floor"]
-    )
-    parts.add(QUAD, wall((1, 0, 0), (0, -1, 0)), np.array([*middle, HEIGHT_M]), half, tint=(0.95,) * 3)
+    floor, ceiling = wall((1, 0, 0), (0, 1, 0)), wall((1, 0, 0), (0, -1, 0))
+    parts.add(QUAD, floor, np.array([*middle, 0.0]), half, texture="carpet", tint=plan.tints["floor"])
+    parts.add(QUAD, ceiling, np.array([*middle, HEIGHT_M]), half, tint=(0.95,) * 3)
 
 
 def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = ()) -> None:
@@ -502,28 +294,29 @@ def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[fl
         start: One end, metres.
         end: The other.
         plan: Its colour.
-        doors: Middles of the doorways, metres from `start`.
+        doors: Middles of the doorways, metres from `start`, in order.
     """
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = math.sqrt(dx * dx + dy * dy)
     facing, direction = turn(math.degrees(atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
-
-    def piece(a: float, b: float, bottom: float) -> None:
+    edges = [0.0, *(door + side * DOOR_M / 2 for door in doors for side in (-1, 1)), length]
+    pieces = [(a, b, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    pieces += [(door - DOOR_M / 2, door + DOOR_M / 2, _LINTEL_M) for door in doors]
+    for a, b, bottom in pieces:
         half = ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2)
         at = np.array([*start, 0.0]) + (a + b) / 2 * direction + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2])
         parts.add(BOX, facing, at, half, texture="plaster", repeat=(0.5, 0.5), tint=plan.tints["wall"])
 
-    edges = [0.0] + [door + side * DOOR_M / 2 for door in sorted(doors) for side in (-1, 1)] + [length]
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        piece(a, b, 0.0)
-    for door in doors:
-        piece(door - DOOR_M / 2, door + DOOR_M / 2, _LINTEL_M)
+
+def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator, Parts]:
+    """The plan of a stretch of wall about its own origin, its stream, and its primitives, still none."""
+    plan = replace(plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0)
+    return plan, stream(scene, "synthetic", "bay", number), Parts()
 
 
 def office_bay(scene: int, number: int) -> Parts:
     """Four metres of an office's wall: desk, shelf, cabinet, posters."""
-    plan = _wall_plan(scene, number, 2.0)
-    rng, parts = stream(scene, "synthetic", "bay", number), Parts()
+    plan, rng, parts = _stretch(scene, number, 2.0)
     add_desk(parts, rng, plan, plan.desk_x, plan.desk_y, half=0.92)
     add_shelf(parts, rng, plan, plan.shelf_side)
     add_posters(parts, rng, plan)
@@ -533,15 +326,17 @@ def office_bay(scene: int, number: int) -> Parts:
 
 def corridor_bay(scene: int, number: int) -> Parts:
     """Two metres of a corridor's wall: posters, a shelf, a closed door or a notice board."""
-    plan = _wall_plan(scene, number, 0.7)
-    rng, parts = stream(scene, "synthetic", "bay", number), Parts()
-    kind = number % 4
+    plan, rng, parts = _stretch(scene, number, 0.7)
+    kind, tint = number % 4, plan.tints
     if kind == 0:
         add_posters(parts, rng, replace(plan, left_x=-1.5, right_x=1.5))
     elif kind == 1:
         add_shelf(parts, rng, plan, 1)
     elif kind == 2:
-        _add_closed_door(parts, plan)
+        parts.add(BOX, _EYE, np.array([0, -0.02, 1.03]), (0.5, 0.02, 1.03), tint=tint["shelf"])
+        parts.add(BOX, _EYE, np.array([0, -0.04, 1.0]), (0.44, 0.02, 1.0), texture="wood", tint=tint["door"])
+        parts.add(BOX, _EYE, np.array([0.36, -0.09, 1.02]), (0.05, 0.012, 0.012), tint=tint["metal"])
+        parts.add(BOX, _EYE, np.array([0.0, -0.062, 1.5]), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,))
     else:
         for k in range(6):
             at = np.array([-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)])
@@ -555,98 +350,93 @@ def notices(scene: int, number: int) -> Parts:
     for k in range(4):
         half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
         at = np.array([-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random()])
-        parts.add(BOX, np.eye(3), at, half, texture=f"poster:{k}", fit=(2,))
+        parts.add(BOX, _EYE, at, half, texture=f"poster:{k}", fit=(2,))
     return parts
 
 
-def _add_closed_door(parts: Parts, plan: Plan) -> None:
-    eye, tint = np.eye(3), plan.tints
-    parts.add(BOX, eye, np.array([0, -0.02, 1.03]), (0.5, 0.02, 1.03), tint=tint["shelf"])
-    parts.add(BOX, eye, np.array([0, -0.04, 1.0]), (0.44, 0.02, 1.0), texture="wood", tint=tint["door"])
-    parts.add(BOX, eye, np.array([0.36, -0.09, 1.02]), (0.05, 0.012, 0.012), tint=tint["metal"])
-    parts.add(BOX, eye, np.array([0.0, -0.062, 1.5]), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,))
+# Things that are moved, each about its own origin: chair, cartons, box, balloon, trolley, door.
+
+_PRINT: Style = {"texture": tuple(f"poster:{face}" for face in range(6)), "fit": tuple(range(6)),
+                 "tint": (0.95, 0.86, 0.74)}  # fmt: skip
 
 
-def _wall_plan(scene: int, number: int, half: float) -> Plan:
-    """The plan of a stretch of wall about its own origin."""
-    return replace(
-        plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0
-    )  # fmt: skip
-
-
-def office_chair(scene: int, number: int, id: int) -> Parts:
-    """An office chair about its own origin on the floor."""
-    parts, tints = Parts(), plan_room(scene, number).tints
-    add_chair(parts, id, tints["chair"], tints["metal"])
+def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
+    """An office chair facing -y: seat, back, column, five-pointed base; the origin lies on the floor."""
+    parts, tint, metal = Parts(), plan.tints["chair"] * shade, plan.tints["metal"]
+    lean = np.array([[1.0, 0, 0], [0, 0.985, -0.17], [0, 0.17, 0.985]])
+    cloth: Style = {"instance": instance, "texture": "denim", "repeat": (3, 3), "tint": tint}
+    frame: Style = {"instance": instance, "tint": metal}
+    parts.add(BOX, _EYE, np.array([0, 0, 0.45]), (0.23, 0.22, 0.035), **cloth)
+    parts.add(BOX, lean, np.array([0, 0.26, 0.76]), (0.21, 0.028, 0.25), **cloth)
+    parts.add(BOX, lean, np.array([0, 0.255, 0.47]), (0.035, 0.012, 0.1), **frame)
+    parts.add(ROUND_CONE, _EYE, np.array([0, 0, 0.1]), (0.32, 0.03, 0.028), **frame)
+    hub = np.array([0, 0, 0.09])
+    for k in range(5):
+        a = turn(72 * k + 18)
+        tip = product(a, np.array([0.28, 0, 0.05]))
+        z = (tip - hub) / norm(tip - hub)
+        u = product(a, np.array([0.0, 1.0, 0.0]))
+        parts.add(ROUND_CONE, np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame)
+        parts.add(ROUND_CONE, _EYE, tip - (0, 0, 0.015), (0, 0.032, 0.032), **frame | {"tint": metal * 0.7})
+    for side in (-1, 1):
+        parts.add(BOX, _EYE, np.array([side * 0.27, 0.03, 0.66]), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8})
+        parts.add(BOX, _EYE, np.array([side * 0.27, 0.05, 0.55]), (0.015, 0.02, 0.1), **frame)
     return parts
 
 
 def cartons(scene: int, number: int, id: int) -> Parts:
     """Two printed cartons on each other."""
-    parts, rng = Parts(), stream(scene, "synthetic", "cartons", number)
-    bottom = 0.0
+    parts, rng, bottom = Parts(), stream(scene, "synthetic", "cartons", number), 0.0
     for k in range(2):
         half = (0.19 + 0.08 * rng.random(), 0.16 + 0.06 * rng.random(), 0.14 + 0.05 * rng.random())
         names = (*(f"poster:{(face + k) % 4}" for face in range(4)), "plain", "plain")
-        at = np.array([0.0, 0.0, bottom + half[2]])
-        tint = (0.9, 0.8, 0.66)
-        parts.add(BOX, turn(30 * rng.random()), at, half, instance=id, texture=names, fit=(0, 1, 2, 3), tint=tint)
+        at, style = np.array([0.0, 0.0, bottom + half[2]]), {"instance": id, "texture": names, "fit": (0, 1, 2, 3)}
+        parts.add(BOX, turn(30 * rng.random()), at, half, tint=(0.9, 0.8, 0.66), **style)
         bottom += 2 * half[2]
     return parts
-
-
-# Things that are carried, rolled and opened, each about its own origin: box, balloon, trolley, door.
-
-CARDBOARD = (0.95, 0.86, 0.74)
-_PRINT = {"texture": tuple(f"poster:{face}" for face in range(6)), "fit": tuple(range(6)), "tint": CARDBOARD}
 
 
 def printed_box(id: int, half: tuple[float, float, float]) -> Parts:
     """A carton with a print on every side; its origin is its middle."""
     parts = Parts()
-    parts.add(BOX, np.eye(3), np.zeros(3), half, instance=id, **_PRINT)  # type: ignore[arg-type]  # a style
+    parts.add(BOX, _EYE, np.zeros(3), half, instance=id, **_PRINT)
     return parts
 
 
 def balloon(id: int, radius: float) -> Parts:
     """A printed balloon with its knot; the origin is its middle."""
-    parts, eye = Parts(), np.eye(3)
-    style = {"instance": id, "texture": "print:balloon", "repeat": (2.0, 2.0)}
-    parts.add(ROUND_CONE, eye, np.zeros(3), (0.0, radius, radius), scale=(1.0, 1.0, 1.15), **style)  # type: ignore[arg-type]
+    parts, scale = Parts(), (1.0, 1.0, 1.15)
+    parts.add(ROUND_CONE, _EYE, np.zeros(3), (0.0, radius, radius), instance=id, texture="print:balloon",
+              repeat=(2.0, 2.0), scale=scale)  # fmt: skip
     low = np.array([0.0, 0.0, -1.2 * radius])
-    parts.add(ROUND_CONE, eye, low, (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3))
+    parts.add(ROUND_CONE, _EYE, low, (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3))
     return parts
 
 
 def trolley(id: int, scene: int, plan: Plan) -> Parts:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
-    parts, eye, rng = Parts(), np.eye(3), stream(scene, "synthetic", "trolley")
-    parts.add(BOX, eye, np.array([0, 0, 0.16]), (0.45, 0.3, 0.02), instance=id, tint=plan.tints["metal"])
-    for x in (-0.38, 0.38):
-        for y in (-0.24, 0.24):
-            parts.add(ROUND_CONE, eye, np.array([x, y, 0.07]), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3)
+    parts, rng, bottom = Parts(), stream(scene, "synthetic", "trolley"), 0.18
+    metal: Style = {"instance": id, "tint": plan.tints["metal"]}
+    parts.add(BOX, _EYE, np.array([0, 0, 0.16]), (0.45, 0.3, 0.02), **metal)
+    for x, y in ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24)):
+        parts.add(ROUND_CONE, _EYE, np.array([x, y, 0.07]), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3)
     for y in (-0.26, 0.26):
-        bar = np.array([-0.43, y, 0.16])
-        parts.add(ROUND_CONE, eye, bar, (0.85, 0.015, 0.015), instance=id, tint=plan.tints["metal"])
-    parts.add(BOX, eye, np.array([-0.43, 0, 1.01]), (0.015, 0.27, 0.015), instance=id, tint=plan.tints["metal"])
-    bottom = 0.18
+        parts.add(ROUND_CONE, _EYE, np.array([-0.43, y, 0.16]), (0.85, 0.015, 0.015), **metal)
+    parts.add(BOX, _EYE, np.array([-0.43, 0, 1.01]), (0.015, 0.27, 0.015), **metal)
     for _ in range(3):
         half = (0.26 + 0.12 * rng.random(), 0.2 + 0.08 * rng.random(), 0.15 + 0.06 * rng.random())
-        at = np.array([0.02, 0.0, bottom + half[2]])
-        parts.add(BOX, eye, at, half, instance=id, **_PRINT)  # type: ignore[arg-type]  # a style
+        parts.add(BOX, _EYE, np.array([0.02, 0.0, bottom + half[2]]), half, instance=id, **_PRINT)
         bottom += 2 * half[2]
     return parts
 
 
 def door_leaf(id: int, plan: Plan, width: float) -> Parts:
     """A door leaf whose hinge stands at the origin and which runs along +x; posters on both sides."""
-    parts, eye = Parts(), np.eye(3)
-    at, half = np.array([width / 2, 0.0, 1.03]), (width / 2, 0.02, 1.02)
-    parts.add(BOX, eye, at, half, instance=id, texture="wood", tint=plan.tints["door"])
+    parts, half = Parts(), (width / 2, 0.02, 1.02)
+    leaf, handle = np.array([width / 2, 0.0, 1.03]), np.array([width - 0.08, 0.0, 1.03])
+    parts.add(BOX, _EYE, leaf, half, instance=id, texture="wood", tint=plan.tints["door"])
     for k, (x, z) in enumerate(((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))):
-        sheet = np.array([x * width, 0.0, z])
         names = ("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain")
-        parts.add(BOX, eye, sheet, (0.15, 0.024, 0.2), instance=id, texture=names, fit=(2, 3))
-    handle = np.array([width - 0.08, 0.0, 1.03])
-    parts.add(BOX, eye, handle, (0.06, 0.05, 0.012), instance=id, tint=plan.tints["metal"])
+        parts.add(BOX, _EYE, np.array([x * width, 0.0, z]), (0.15, 0.024, 0.2), instance=id, texture=names, fit=(2, 3))
+    parts.add(BOX, _EYE, handle, (0.06, 0.05, 0.012), instance=id, tint=plan.tints["metal"])
     return parts

@@ -1,6 +1,6 @@
-"""What a scene of a family films: static parts, rigid bodies on paths, people, a camera, two sensors.
+"""What a scene films: static parts, rigid bodies on paths, people, a camera, two sensors.
 
-`World` is the description, `Scene` its primitives at any time and their motion between two times.
+`World` is the description, `Scene` its primitives at any time, `View` how the rows of one frame see them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dynslam_bench.sequences.synthetic import textures
 from dynslam_bench.sequences.synthetic.arithmetic import norm, product
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE, Parts
 from dynslam_bench.sequences.synthetic.people import Person, Posture, add_person
-from dynslam_bench.sequences.synthetic.settings import FPS, RenderSettings
+from dynslam_bench.sequences.synthetic.settings import CAMERA, DEFAULT_FRAMES, FPS, RenderSettings
 
 Array = NDArray[np.float64]
 Placement = Callable[[float], tuple[Array, Array]]
@@ -42,17 +42,13 @@ class Body:
     path: Placement
 
 
-@dataclass(frozen=True, eq=False)
-class Actor:
-    """A person and what they do; `Person.instance` is the id in the masks."""
-
-    person: Person
-    posture: Callable[[float], Posture]
+Actor = tuple[Person, Callable[[float], Posture]]
+"""A person and what they do at a time in seconds; `Person.instance` is the id in the masks."""
 
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What a family's sensors do beside the defaults.
+    """What a sequence's sensors do beside the defaults.
 
     Attributes:
         readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The frame's stamp and pose
@@ -72,7 +68,7 @@ class Optics:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Everything that a scene of a family decides.
+    """Everything that a scene decides.
 
     Attributes:
         static: What never moves.
@@ -93,40 +89,63 @@ class World:
     @property
     def class_names(self) -> dict[int, str]:
         """Class name of every instance id."""
-        names = {actor.person.instance: "person" for actor in self.actors}
+        names = {person.instance: "person" for person, _ in self.actors}
         return dict(sorted((names | {body.instance: body.name for body in self.bodies}).items()))
 
 
-# A scene: the room's primitives, those of people and chairs at any time, and their motion between two times.
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A rendered sequence in all its scenes, ``synthetic/<name>``.
 
+    Attributes:
+        build: Scene number to the world that is filmed.
+        tag: As in the catalogue: ``static``, ``low-dynamic`` or ``high-dynamic``.
+        frames: Default length.
+        version: Raised whenever any pixel, pose or mask changes; 0 where the renderer's version alone counts.
+    """
+
+    build: Callable[[int], World]
+    tag: str
+    frames: int = DEFAULT_FRAMES
+    version: int = 1
+
+
+# A scene: the primitives of the static world, of bodies and of people at any time.
 
 MOVED_M = 5e-4
 """An instance moves in a frame if a point of it has moved by more than this since the previous frame."""
 
 
 @dataclass(frozen=True, eq=False)
-class Snapshot:
-    """All primitives at one time: world placement, and the map from the camera to each local frame.
+class View:
+    """All P primitives as one frame sees them.
 
     Attributes:
-        T_world_cam: The camera's pose.
-        rotation: ``[P, 3, 3]`` local (scaled) to world.
-        origin: ``[P, 3]``.
-        local: ``[P, 12]`` row-major 3x4 map of points of the camera frame into the local frame.
+        pose: The camera's pose when the middle of the image is exposed.
+        rows: ``[R, 4, 4]`` poses of all rows; R is 1 under a global shutter, else the height of the image.
+        rotation: ``[P, 3, 3]`` local (scaled) to world, when the middle of the image is exposed.
+        origin: ``[P, 3]``, then.
     """
 
-    T_world_cam: Array
+    pose: Array
+    rows: Array
     rotation: Array
     origin: Array
-    local: Array
+
+    @property
+    def rolling(self) -> bool:
+        """Whether every row has its own pose."""
+        return len(self.rows) > 1
+
+    def pose_of(self, row: int) -> Array:
+        """The pose of a row."""
+        return self.rows[row] if self.rolling else self.pose
 
 
-class _Poses(Parts):
-    """Collects the placement only; everything else is known from the first time."""
-
-    def add(self, kind: int, rotation: Array, origin: Array, *_: object, **__: object) -> None:
-        self.rotation.append(rotation)
-        self.origin.append(origin)
+def row_times(index: int, readout_s: float) -> Array:
+    """When each row of frame `index` is exposed, seconds from the start; the image's middle at the frame's stamp."""
+    rows = (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
+    return index / FPS + rows * readout_s
 
 
 class Scene:
@@ -139,32 +158,30 @@ class Scene:
     """
 
     def __init__(self, world: World, scene: int, settings: RenderSettings) -> None:
-        self.world = world
-        self.seed = scene
-        self.mode = settings.people
-        self.actors = () if self.mode == "none" else world.actors
-        parts = Parts()
-        parts.extend(world.static)
-        self._bodies = [(np.stack(body.parts.rotation), np.stack(body.parts.origin)) for body in world.bodies]
+        self.world, self.seed = world, scene
+        self.moves = settings.people == "moving"
+        self.actors = () if settings.people == "none" else world.actors
+        parts = Parts(world.static)
         for body in world.bodies:
             parts.extend(body.parts)
-        self.fixed = len(world.static)
-        for actor in self.actors:
-            add_person(parts, actor.person, actor.posture(0.0))
-        self.kind = np.array(parts.kind, np.int32)
-        self.scale, self.shape = np.stack(parts.scale), np.stack(parts.shape)
-        self.instance = np.array(parts.instance, np.int32)
-        self.uv, self.tint = np.stack(parts.uv), np.stack(parts.tint)
-        self._fixed_rotation = np.stack(parts.rotation[: self.fixed])
-        self._fixed_origin = np.stack(parts.origin[: self.fixed])
-        names = sorted({name for row in parts.texture for name in row})
-        index = {name: i for i, name in enumerate(names)}
-        self.texture = np.array([[index[name] for name in row] for row in parts.texture], np.int32)
-        self.texture_names = names
+        for person, posture in self.actors:
+            add_person(parts, person, posture(0.0))
+        columns = {
+            name: np.array([getattr(part, name) for part in parts])
+            for name in ("kind", "instance", "scale", "shape", "uv", "tint", "rotation", "origin")
+        }
+        self.kind, self.instance = columns["kind"].astype(np.int32), columns["instance"].astype(np.int32)
+        self.scale, self.shape, self.uv, self.tint = (columns[name] for name in ("scale", "shape", "uv", "tint"))
+        self._rotation, self._origin = columns["rotation"], columns["origin"]
+        self.texture_names = sorted({name for part in parts for name in part.texture})
+        index = {name: i for i, name in enumerate(self.texture_names)}
+        self.texture = np.array([[index[name] for name in part.texture] for part in parts], np.int32)
         self.corners = self._corners()
         self._placed = lru_cache(maxsize=8)(self._place)
+        self.view = lru_cache(maxsize=8)(self._view)
+        """How frame `index` sees the scene; neighbouring frames ask for the same views."""
 
-    def atlas(self) -> textures.TextureAtlas:
+    def atlas(self) -> textures.Atlas:
         """The scene's textures."""
         images = {}
         for name in self.texture_names:
@@ -172,54 +189,40 @@ class Scene:
             images[name] = maker(stream(self.seed, "synthetic", "texture", name))
         return textures.build_atlas(images)
 
-    def poses(self, times: Array) -> Array:
-        """Camera-to-world poses ``[N, 4, 4]``."""
-        return self.world.camera(times)
-
     def place(self, time: float) -> tuple[Array, Array]:
-        """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start).
+        """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start)."""
+        return self._placed(time if self.moves else 0.0)
 
-        The last few times are kept, since neighbouring frames ask for the same ones.
-        """
-        return self._placed(time if self.mode == "moving" else 0.0)
+    def _place(self, time: float) -> tuple[Array, Array]:
+        rotation, origin, end = self._rotation.copy(), self._origin.copy(), len(self.world.static)
+        for body in self.world.bodies:
+            part = slice(end, end + len(body.parts))
+            turned, shift = body.path(time)
+            rotation[part], origin[part] = product(turned, rotation[part]), product(origin[part], turned.T) + shift
+            end = part.stop
+        people = Parts()
+        for person, posture in self.actors:
+            add_person(people, person, posture(time))
+        if people:
+            rotation[end:] = [part.rotation for part in people]
+            origin[end:] = [part.origin for part in people]
+        return rotation, origin
 
-    def _place(self, t: float) -> tuple[Array, Array]:
-        parts = _Poses()
-        for actor in self.actors:
-            add_person(parts, actor.person, actor.posture(t))
-        rotations, origins = [self._fixed_rotation], [self._fixed_origin]
-        for (rotation, origin), body in zip(self._bodies, self.world.bodies, strict=True):
-            turned, shift = body.path(t)
-            rotations.append(product(turned, rotation))
-            origins.append(product(origin, turned.T) + shift)
-        if parts.rotation:
-            rotations.append(np.stack(parts.rotation))
-            origins.append(np.stack(parts.origin))
-        return np.concatenate(rotations), np.concatenate(origins)
-
-    def snapshot(self, time: float) -> Snapshot:
-        """The scene as the camera sees it at a time (seconds from the start)."""
-        return self.snapshot_from(self.poses(np.array([time]))[0], time)
-
-    def snapshot_from(self, pose: Array, time: float) -> Snapshot:
-        """The scene at a time as a camera at another pose (camera to world, 4x4) would see it."""
-        rotation, origin = self.place(time)
-        inverse = np.swapaxes(rotation, 1, 2) / self.scale[:, :, None]
-        local = np.empty((len(origin), 3, 4))
-        local[:, :, :3] = product(inverse, pose[:3, :3])
-        local[:, :, 3] = product(inverse, (pose[:3, 3] - origin)[:, :, None])[:, :, 0]
-        return Snapshot(pose, rotation, origin, np.ascontiguousarray(local.reshape(-1, 12)))
+    def _view(self, index: int) -> View:
+        time, readout_s = index / FPS, self.world.optics.readout_s
+        pose = self.world.camera(np.array([time]))[0]
+        rows = self.world.camera(row_times(index, readout_s)) if readout_s else pose[None]
+        return View(pose, rows, *self.place(time))
 
     def moving(self, index: int) -> frozenset[int]:
         """Instances with a point that moved by more than `MOVED_M` since the previous frame; frame 0 has none."""
-        if index == 0 or self.mode != "moving":
+        if index == 0 or not self.moves:
             return frozenset()
         before, after = self.place((index - 1) / FPS), self.place(index / FPS)
-        box = self.corners[:, :, :] * self.scale[:, None, :]
-        moved = norm(product(box, np.swapaxes(after[0] - before[0], 1, 2)) + (after[1] - before[1])[:, None, :]).max(
-            axis=1
-        )
-        return frozenset(int(k) for k in np.unique(self.instance[moved > MOVED_M]) if k > 0)
+        box = self.corners * self.scale[:, None, :]
+        shift = product(box, np.swapaxes(after[0] - before[0], 1, 2)) + (after[1] - before[1])[:, None, :]
+        moved = norm(shift).max(axis=1) > MOVED_M
+        return frozenset(int(k) for k in np.unique(self.instance[moved]) if k > 0)
 
     def _corners(self) -> Array:
         """Corners ``[P, 8, 3]`` of each primitive's box in its local frame."""

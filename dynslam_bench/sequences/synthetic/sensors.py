@@ -47,15 +47,8 @@ def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, f
     """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below."""
     height, width = depth.shape
     lowest, highest = depth[row, u], depth[row, u]
-    for k in range(4):
-        if k == 0:
-            v2, u2 = row, u - reach
-        elif k == 1:
-            v2, u2 = row, u + reach
-        elif k == 2:
-            v2, u2 = row - reach, u
-        else:
-            v2, u2 = row + reach, u
+    for down, right in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
+        v2, u2 = row + down, u + right
         if 0 <= v2 < height and 0 <= u2 < width:
             other = depth[v2, u2]
             if other > 0.0:

@@ -8,7 +8,6 @@ render into one folder, an interrupted rendering is resumed, and a damaged file 
 from __future__ import annotations
 
 import struct
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -28,14 +27,12 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.stamps import format_ns
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.sequences.cameras import write_camera
-from dynslam_bench.sequences.readers.lists import read_stamped_lines
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
-from dynslam_bench.sequences.synthetic.renderer import Rendered, Renderer, default_threads, row_times
-from dynslam_bench.sequences.synthetic.scene import Scene
+from dynslam_bench.sequences.synthetic.renderer import Rendered, Renderer, default_threads
+from dynslam_bench.sequences.synthetic.scene import Scene, row_times
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
 from dynslam_bench.sequences.view import Masks
 
@@ -52,32 +49,26 @@ _MASK_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 def encode_png(image: NDArray[Any]) -> bytes:
-    """A PNG of an RGB (uint8, three channels) or single-channel (uint8, uint16) image.
-
-    Raises:
-        SequenceError: The encoder refuses the image.
-    """
+    """A PNG of an RGB (uint8, three channels) or single-channel (uint8, uint16) image."""
     stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
-    done, data = cv2.imencode(".png", stored, _MASK_PNG if image.ndim == 2 and image.dtype == np.uint8 else _FAST_PNG)
-    if not done:
-        raise SequenceError(f"cannot encode an image of shape {image.shape} and type {image.dtype} as PNG")
-    return bytes(data.tobytes())
+    options = _MASK_PNG if image.ndim == 2 and image.dtype == np.uint8 else _FAST_PNG
+    return bytes(cv2.imencode(".png", stored, options)[1].tobytes())
 
 
-def is_intact_png(data: bytes, size: tuple[int, int] | None = None, modes: tuple[str, ...] = ()) -> bool:
+def is_intact_png(data: bytes, size: tuple[int, int], modes: tuple[str, ...]) -> bool:
     """Whether the bytes are a complete PNG whose chunks all carry the right checksum.
 
     Args:
         data: The file.
-        size: Width and height that it has to have; None for any.
-        modes: Pillow's names of the pixel formats it may have; empty for any.
+        size: Width and height that it has to have.
+        modes: Pillow's names of the pixel formats it may have.
     """
     try:
         with Image.open(BytesIO(data), formats=["PNG"]) as image:
             image.verify()
     except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError):  # Pillow's, if damaged
         return False
-    return data.endswith(_END) and size in (None, image.size) and (not modes or image.mode in modes)
+    return data.endswith(_END) and image.size == size and image.mode in modes
 
 
 class FrameStore:
@@ -89,81 +80,61 @@ class FrameStore:
     """
 
     def __init__(self, folder: Path, camera: Camera) -> None:
-        self.folder = folder
-        self.camera = camera
+        self.folder, self.camera = folder, camera
 
     def path(self, kind: str, stamp: float) -> Path:
         """Where a frame's image of a kind (``rgb``, ``depth``, ``masks``) lies."""
         return self.folder / kind / f"{stamp:.6f}.png"
 
-    def is_intact(self, stamp: float) -> bool:
-        """Whether all images of a frame lie in the cache, complete and of the right size and type."""
-        return all(self._bytes(kind, stamp) is not None for kind in _MODES)
-
-    def read(self, kind: str, stamp: float) -> NDArray[Any] | None:
-        """An image (RGB order), or None if it is missing or damaged.
+    def bytes_of(self, kind: str, stamp: float) -> bytes | None:
+        """An image file of the right size and type; None if it is missing or damaged.
 
         Raises:
             SequenceError: The file exists but cannot be read (permissions, input error).
         """
-        data = self._bytes(kind, stamp)
-        try:
-            image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            return None
-        if image is None:
-            return None
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if kind == "rgb" else image
-
-    def _bytes(self, kind: str, stamp: float) -> bytes | None:
-        """The bytes of an image file if it is intact and what it should be."""
         path = self.path(kind, stamp)
         try:
             data = path.read_bytes()
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise SequenceError(
-                f"cannot read {path}: {error.strerror}", "check the permissions of the cache"
-            ) from error
+            hint = "check the permissions of the cache"
+            raise SequenceError(f"cannot read {path}: {error.strerror}", hint) from error
         return data if is_intact_png(data, (self.camera.width, self.camera.height), _MODES[kind]) else None
 
-    def write(self, stamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.uint16], masks: NDArray[np.uint8]) -> None:
+    def read(self, kind: str, stamp: float) -> NDArray[Any] | None:
+        """An image (RGB order), or None if it is missing or damaged; raises as `bytes_of`."""
+        data = self.bytes_of(kind, stamp)
+        try:
+            image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            return None
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image is not None and kind == "rgb" else image
+
+    def write(self, stamp: float, frame: Rendered) -> None:
         """Store a frame; the colour image comes last, so that a frame with one is complete.
 
         Raises:
             DynslamError: The folder cannot be written.
         """
-        images: dict[str, NDArray[Any]] = {"masks": masks, "depth": depth, "rgb": rgb}
-        for kind, image in images.items():
+        images: tuple[NDArray[Any], ...] = (frame.instances, frame.raw_depth, frame.rgb)
+        for kind, image in zip(_MODES, images, strict=True):
             write_atomic(self.path(kind, stamp), encode_png(image))
-
-    def has(self, stamp: float) -> bool:
-        """Whether all images of a frame lie in the cache (not checked for damage)."""
-        return all(self.path(kind, stamp).is_file() for kind in _MODES)
 
     def write_lists(self, truth: Trajectory) -> None:
         """Write ``rgb.txt``, ``depth.txt`` and ``masks.txt`` of the frames there are, the poses and the camera.
 
         The poses are those of `truth`, or those already listed where these are more.
         """
-        listed = [float(stamp) for stamp in truth.timestamps if self.has(float(stamp))]
         for kind in _MODES:
             lines = [f"# {kind} images of a rendered sequence", "# timestamp filename", "#"]
-            stamps = {f"{stamp:.6f}" for stamp in listed} | self._listed(kind)
-            lines += [f"{stamp} {kind}/{stamp}.png" for stamp in sorted(stamps, key=float)]
+            stamps = sorted((path.stem for path in (self.folder / kind).glob("*.png")), key=float)
+            lines += [f"{stamp} {kind}/{stamp}.png" for stamp in stamps]
             write_atomic(self.folder / f"{kind}.txt", "\n".join(lines) + "\n")
         poses = self.folder / "groundtruth.txt"
         if not poses.is_file() or sum(1 for _ in read_lines(poses, kind=SequenceError)) < len(truth) + 2:
             write_tum(poses, truth, comment="exact poses of a rendered sequence")
         write_camera(self.folder / "camera.toml", self.camera, fps=FPS)
-
-    def _listed(self, kind: str) -> set[str]:
-        path = self.folder / f"{kind}.txt"
-        if not path.is_file():
-            return set()
-        stamps = {format_ns(ns)[:-3] for ns, _ in read_stamped_lines(path) if ns is not None}
-        return {stamp for stamp in stamps if (self.folder / kind / f"{stamp}.png").is_file()}
 
 
 START_S = 1000.0
@@ -193,20 +164,15 @@ class SyntheticSequence:
         self, sequence: SyntheticId, cache_root: Path | None, settings: RenderSettings, threads: int | None = None
     ) -> None:
         self._id, self._cache_root = sequence, cache_root
-        self.settings = settings
-        self.threads = threads or default_threads()
-        self._lock = threading.Lock()
+        self.settings, self.threads = settings, threads or default_threads()
         self.id, self.whole_id = str(sequence), sequence.whole
         self.split, self.noise = sequence.split, sequence.noise
         self.fps, self.license = FPS, "CC0-1.0"
         self.citation = f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
         self.timestamps = np.round(START_S + np.arange(sequence.frames) / FPS, 6)
-        self.store: FrameStore | None = None
-        if cache_root is not None:
-            noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
-            # No "?" in a folder's name: Windows has none.
-            label = f"{sequence.name}@{sequence.scene}{noise}-{self._key()}"
-            self.store = FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
+        noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
+        label = f"{sequence.name}@{sequence.scene}{noise}-{self._key()}"  # no "?": Windows has none in names
+        self.store = None if cache_root is None else FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._id, self._cache_root, self.settings, self.threads)
@@ -219,7 +185,7 @@ class SyntheticSequence:
     @cached_property
     def ground_truth(self) -> Trajectory:
         """Exact camera-to-world poses of all frames; needs no rendering."""
-        return Trajectory(self.timestamps, self.scene.poses(np.arange(len(self)) / FPS))
+        return Trajectory(self.timestamps, self.scene.world.camera(np.arange(len(self)) / FPS))
 
     @property
     def masks(self) -> Masks:
@@ -236,12 +202,12 @@ class SyntheticSequence:
     @cached_property
     def scene(self) -> Scene:
         """The geometry behind the frames."""
-        return Scene(self._id.world(), self._id.scene, self.settings)
+        return Scene(self._id.variant.build(self._id.scene), self._id.scene, self.settings)
 
     @cached_property
     def renderer(self) -> Renderer:
         """The renderer; built when the first frame is rendered."""
-        return Renderer(self._id, self.settings, self.threads)
+        return Renderer(self._id, self.scene, self.settings, self.threads)
 
     def digest(self) -> str:
         """Short digest of the renderer's version and all parameters."""
@@ -252,7 +218,7 @@ class SyntheticSequence:
         return digest({"scene": f"{self._id.name}@{self._id.scene}", "key": self._key()})
 
     def _key(self) -> str:
-        family = {"family": self._id.version} if self._id.version else {}
+        family = {"family": self._id.variant.version} if self._id.variant.version else {}
         return digest({"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")} | family, 8)
 
     def __len__(self) -> int:
@@ -265,7 +231,9 @@ class SyntheticSequence:
             rgb, raw = self.store.read("rgb", stamp), self.store.read("depth", stamp)
             if rgb is not None and raw is not None:
                 return Frame(i, stamp, rgb, _metres(raw))
-        made = self._make(i)
+        made = self._make(i, self.renderer)
+        if self.store is not None and i in (0, len(self) - 1):
+            self.store.write_lists(self.ground_truth)
         return Frame(i, stamp, made.rgb, _metres(made.raw_depth))
 
     def flow(self, index: int, other: int | None = None) -> NDArray[np.float32]:
@@ -282,8 +250,7 @@ class SyntheticSequence:
 
         The frame's own pose (`ground_truth`) is that of the middle of the image.
         """
-        times = row_times(range(len(self))[index], self.scene.world.optics.readout_s)
-        return self.scene.poses(times)
+        return self.scene.world.camera(row_times(range(len(self))[index], self.scene.world.optics.readout_s))
 
     def exact_depth(self, index: int) -> NDArray[np.float64]:
         """Exact z-depth float64 ``[H, W]`` in metres at the pixel centres, 0 where nothing is hit."""
@@ -301,37 +268,29 @@ class SyntheticSequence:
         Raises:
             DynslamError: The cache cannot be written; frames already rendered stay.
         """
-        store = self.store
-        todo = [i for i in range(len(self)) if store is None or not store.is_intact(float(self.timestamps[i]))]
-        done = len(self) - len(todo)
-        if progress is not None:
-            progress(done, len(self))
+        store, total = self.store, len(self)
+        todo = [i for i in range(total) if store is None or not self._is_stored(store, i)]
+        report = progress or (lambda done, total: None)
+        report(total - len(todo), total)
         if todo:
-            single = Renderer(self._id, self.settings, 1)
-            single.prepare()
+            renderer = Renderer(self._id, self.scene, self.settings, threads=1)
+            _ = renderer.atlas  # drawn once, before several threads ask for it
             with ThreadPoolExecutor(self.threads) as pool:
-                try:
-                    for _ in pool.map(lambda i: self._make(i, single, lists=False) and None, todo):
-                        done += 1
-                        if progress is not None:
-                            progress(done, len(self))
-                except BaseException:
-                    pool.shutdown(cancel_futures=True)
-                    raise
-        if self.store is not None:
-            self.store.write_lists(self.ground_truth)
+                frames = pool.map(lambda index: self._make(index, renderer) and None, todo)
+                for done, _ in enumerate(frames, total - len(todo) + 1):
+                    report(done, total)
+        if store is not None:
+            store.write_lists(self.ground_truth)
         return len(todo)
 
-    def _make(self, index: int, renderer: Renderer | None = None, lists: bool = True) -> Rendered:
+    def _is_stored(self, store: FrameStore, index: int) -> bool:
+        return all(store.bytes_of(kind, float(self.timestamps[index])) is not None for kind in _MODES)
+
+    def _make(self, index: int, renderer: Renderer) -> Rendered:
         """Render a frame and store it."""
-        if renderer is None:
-            with self._lock:
-                renderer = self.renderer
         made = renderer.render(index)
         if self.store is not None:
-            self.store.write(float(self.timestamps[index]), made.rgb, made.raw_depth, made.instances)
-            if lists and (index == len(self) - 1 or index == 0):
-                self.store.write_lists(self.ground_truth)
+            self.store.write(float(self.timestamps[index]), made)
         return made
 
 

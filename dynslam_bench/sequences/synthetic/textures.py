@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,22 +13,13 @@ Image = NDArray[np.float64]
 """Float ``[S, S, 3]`` in 0-255, S a power of two; it wraps around."""
 
 
-@dataclass(frozen=True, eq=False)
-class TextureAtlas:
-    """All textures and their mip levels as one array.
-
-    Attributes:
-        texels: uint8, four bytes a texel (the last unused), level after level, texture after texture.
-        level_offset: int64 ``[T, L]`` offset of each level's first byte.
-        log2_size: int32 ``[T]`` base-2 logarithm of each texture's edge.
-    """
-
-    texels: NDArray[np.uint8]
-    level_offset: NDArray[np.int64]
-    log2_size: NDArray[np.int32]
+Atlas = tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int32]]
+"""All textures and their mip levels as one array: uint8 texels, four bytes each (the last unused), level after level,
+texture after texture; int64 ``[T, L]`` offset of each level's first byte; int32 ``[T]`` base-2 logarithm of each
+texture's edge."""
 
 
-def build_atlas(textures: dict[str, Image]) -> TextureAtlas:
+def build_atlas(textures: dict[str, Image]) -> Atlas:
     """Pack textures; each is halved by 2x2 means down to one texel."""
     levels = 12
     offsets = np.zeros((len(textures), levels), np.int64)
@@ -50,7 +40,7 @@ def build_atlas(textures: dict[str, Image]) -> TextureAtlas:
                 offsets[index, level:] = offsets[index, level]
                 break
             current = 0.25 * (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2])
-    return TextureAtlas(np.concatenate(parts), offsets, log2)
+    return np.concatenate(parts), offsets, log2
 
 
 def smooth_noise(rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None) -> NDArray[np.float64]:
@@ -75,8 +65,6 @@ def fractal(rng: np.random.Generator, size: int, cells: int, octaves: int) -> ND
     """Sum of octaves of `smooth_noise`, each half as strong as the one before; about [-1, 1]."""
     total = np.zeros((size, size))
     for octave in range(octaves):
-        if cells << octave > size:
-            break
         total += smooth_noise(rng, size, cells << octave) * 0.5**octave
     return total / 1.5
 
