@@ -20,7 +20,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.figures import COLOURS, significant
 from dynslam_bench.reports.html.page import render_run_page, write_side
 from dynslam_bench.reports.html.run_page import MOST_FRAMES, PictureBook, exact_shares, read_frames, run_content
-from dynslam_bench.reports.model.board import Board, Cell, representatives
+from dynslam_bench.reports.model.board import Board, Cell
 from dynslam_bench.reports.model.load import JOB, run_jobs
 from dynslam_bench.reports.model.row import SEEN, RunRow
 from dynslam_bench.reports.tables.leaderboard import middle, rank_cell, timed
@@ -139,7 +139,7 @@ def write_explore(
     Raises:
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
-    typical = {row.run_id for name in board.sequences for row in representatives(board, name).values()}
+    typical = {row.run_id for name in board.sequences for row in board.typical_runs(name).values()}
     paged = _paged(board, typical, most_pages)
     failed = {row.run_id for row in paged if row.failed}
     shown = (typical | failed) & {row.run_id for row in paged}
@@ -229,7 +229,7 @@ def write_pages(
     """
     pages, drawn = Pages(), _picture_book(*book)
     for row in rows:
-        record, frames = row.whole_record(), read_frames(row, share)
+        record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
         content = run_content(row, record, frames, protocol, most_frames)
         write_side(drawn.output, f"run-{row.run_id}", content)
         if len(frames):

@@ -8,7 +8,7 @@ from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, folded
-from dynslam_bench.reports.model.board import Board, common_errors, representatives
+from dynslam_bench.reports.model.board import Board, common_errors
 from dynslam_bench.reports.model.load import Loaded, trial_words, without_scale_words
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s, records_for, reported_for
@@ -25,6 +25,7 @@ from dynslam_bench.reports.tables.errors import (
     time_table,
 )
 from dynslam_bench.reports.tables.table import significant_text
+from dynslam_bench.runs.run_index import part_words
 
 _MOST_NOTES = 60
 _MOST_COMMANDS = 200
@@ -95,7 +96,7 @@ def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> S
         return section
     excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
     recorded = [row for row in board.rows if not row.sequence.id.startswith("synthetic/")]
-    parts = sorted(excerpts | {board.sequence(row) for row in recorded if row.frame_words})
+    parts = sorted(excerpts | {board.sequence(row) for row in recorded if part_words(row)})
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     whole = [name for name in board.sequences if name not in parts]
@@ -112,7 +113,7 @@ def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> S
     table_of_errors = error_tables.per_sequence(board, protocol, published)
     section.blocks.append(Block("table", "Absolute trajectory error", table_of_errors))
     common, frames = common_errors(board, protocol, pool)
-    section.blocks += folded(tables.common_frames_table(board, common, frames))
+    section.blocks += folded(error_tables.common_frames_table(board, common, frames))
     if protocol.trajectory == "online":
         section.blocks += folded(error_tables.final_errors(board, protocol))
     if any(row.coverage < 1 and not row.failed for row in board.rows):
@@ -128,9 +129,9 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
     """Paths and errors over time of one run a tracker, by sequence; drawn of the runs' side files when it opens."""
     section = Section("trajectories", "Trajectories and error over time", "Trajectories")
     palette = colours(board)
-    shown = (board.ranked_order() or board.trackers)[:6] + ([board.reference] if board.reference else [])
+    shown = (board.ranked or board.trackers)[:6] + ([board.reference] if board.reference else [])
     for sequence in board.sequences:
-        chosen = representatives(board, sequence)
+        chosen = board.typical_runs(sequence)
         tracks = [
             {"run": row.run_id, "name": safe(board.labels[key]), "colour": palette[key], "shown": key in shown}
             for key, row in chosen.items()

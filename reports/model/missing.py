@@ -68,7 +68,8 @@ def _command(row: RunRow, words: Iterable[str]) -> str:
 
 def _lacking(board: Board) -> dict[str, list[str]]:
     """The sequences on which each tracker that could be ranked was not run."""
-    lacking = {key: board.lacking(key) for key in board.trackers if board.is_rankable(key)}
+    rankable = [key for key in board.trackers if board.is_rankable(key)]
+    lacking = {key: [name for name in board.sequences if name not in board.cells[key]] for key in rankable}
     return {key: names for key, names in lacking.items() if names}
 
 

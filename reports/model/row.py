@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Hashable, Iterable
+from contextlib import suppress
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import ConfigDict, Field
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import write_lines
@@ -22,7 +23,6 @@ from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
-from dynslam_bench.runs.run_index import part_words
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
@@ -60,7 +60,10 @@ class RunRow(RunRecord):
         split_by: Parts of `program` in which the runs of this tracker and variant differ: each program has a line of
             its own.
         is_current: Whether its identity is verified, and no newer program has made runs of this tracker and variant.
+        store: Where its files lie; not written.
     """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
 
     protocol_id: str
     protocol_digest: str
@@ -75,37 +78,24 @@ class RunRow(RunRecord):
     hints: list[str] = Field(default_factory=list)
     split_by: dict[str, str] = Field(default_factory=dict)
     is_current: bool = True
-    _store: RunStore = PrivateAttr(default_factory=RunStore)
-
-    def stored_in(self, store: RunStore) -> RunRow:
-        """The same row, which reads its files from a store."""
-        self._store = store
-        return self
+    store: RunStore = Field(default_factory=RunStore, exclude=True, repr=False)
 
     @property
     def folder(self) -> Path:
         """Folder of the run's files."""
-        return self._store.folder(self.run_id)
-
-    def whole_record(self) -> RunRecord:
-        """The record with all its settings and stage times.
-
-        Raises:
-            DynslamError: It is damaged, or no longer there.
-        """
-        return self._store.read_whole(self.run_id)
+        return self.store.folder(self.run_id)
 
     def estimate(self, which: Which) -> Trajectory | None:
         """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
         try:
-            return self._store.trajectory(self.run_id, which)
+            return self.store.trajectory(self.run_id, which)
         except DynslamError:
             return None
 
     def ground_truth(self) -> Trajectory | None:
         """The ground truth of its part of the sequence; None if there is none, or it is damaged."""
         try:
-            return self._store.ground_truth(self.sequence.part)
+            return self.store.ground_truth(self.sequence.part)
         except DynslamError:
             return None
 
@@ -121,7 +111,7 @@ class RunRow(RunRecord):
 
     @property
     def origin(self) -> str:
-        """The same in words."""
+        """Whether it was run here or is imported, in words."""
         return "imported" if self.imported else "run here"
 
     @property
@@ -133,11 +123,6 @@ class RunRow(RunRecord):
     def ranked(self) -> bool:
         """Whether it may rank: its tracker's spec lets it, and it began without a map."""
         return self.tracker.ranked and self.start_map is None
-
-    @property
-    def frame_words(self) -> str:
-        """Part of the sequence in words, empty for all of it."""
-        return part_words(self)
 
     @property
     def column_id(self) -> str:
@@ -280,71 +265,73 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     """The row of one stored run, scored under a protocol."""
     scored = score(store, record, protocol)
     evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    alignment = None if evaluation is None else evaluation.alignment
-    static_m = static_camera_error(store, record, protocol, evaluation)
+    static_m = _static_camera_error(store, record, protocol, evaluation)
     trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
     diagnostics = [] if evaluation is None else evaluation.diagnostics
+    alignment = None if evaluation is None else evaluation.alignment
     scores: dict[str, Any] = dict(
         settings={name: record.settings[name] for name in record.overrides if name in record.settings},
         identity={name: value for name, value in record.identity.items() if name != "settings"},
         timings={name: time for name, time in record.timings.items() if name == "total"},
         protocol_id=scored.protocol_id,
         protocol_digest=scored.protocol_digest,
+        trajectory=protocol.trajectory,
         metrics={} if evaluation is None else evaluation.metrics,
         final_metrics={} if scored.final is None else scored.final.metrics,
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
-        hold_last_pose_ate_m=hold_last_pose_error(store, record, protocol, evaluation, static_m),
+        hold_last_pose_ate_m=_hold_last_pose_error(store, record, protocol, evaluation, static_m),
         static_camera_ate_rmse_m=static_m,
         seen_in_training=seen_in_training(record.segmentation, record.sequence.id),
         notes=[*(f"hint: {hint}" for hint in scored.hints), *trial, *record.notes, *diagnostics],
         hints=scored.hints,
+        store=store,
     )
-    return RunRow(**(dict(record) | scores | _outcome(record, scored, protocol))).stored_in(store)
+    return RunRow(**(dict(record) | scores | _outcome(record, scored, protocol, evaluation)))
 
 
-def _outcome(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> dict[str, Any]:
-    """Whose errors a row holds, how the run ended and what it covered, where that differs from the record."""
-    only_final = record.kind == "imported" and scored.online is None and scored.final is not None
-    which = "final" if only_final else protocol.trajectory
-    outcome: dict[str, Any] = {"trajectory": which}
-    evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    failed = record.failed or record.status == "lost"
-    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
-        reason = record.reason or scored.reasons.get(which, "it cannot be evaluated")
-        return outcome | {"not_evaluated": True, "reason": reason}
-    if record.kind == "imported" or which == "online" or scored.final is None or scored.final.n_tracked is None:
-        return outcome
-    n_tracked = scored.final.n_tracked
-    if scored.final.coverage is not None:
-        outcome |= {"n_tracked": n_tracked, "coverage": scored.final.coverage}
-    due = record.n_frames - record.n_dropped
+def _outcome(
+    record: RunRecord, scored: MetricRecord, protocol: Protocol, evaluation: Evaluation | None
+) -> dict[str, Any]:
+    """Fields of a row that differ from the record's: which trajectory is scored, how the run ended, its coverage."""
+    if record.kind == "imported" and scored.online is None and scored.final is not None:
+        return {"trajectory": "final"}
+    if evaluation is None:
+        if record.failed or record.status == "lost" or not record.sequence.ground_truth:
+            return {}
+        reason = record.reason or scored.reasons.get(protocol.trajectory, "it cannot be evaluated")
+        return {"not_evaluated": True, "reason": reason}
+    n_tracked = evaluation.n_tracked
+    if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:
+        return {}
+    outcome: dict[str, Any] = {}
+    if evaluation.coverage is not None:
+        outcome = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
+    frames_due = record.n_frames - record.n_dropped
     if record.failed or not n_tracked:
         return outcome
-    if n_tracked < LOST_COVERAGE * due:
-        reason = f"the final trajectory has poses of {n_tracked} of {due} frames"
+    if n_tracked < LOST_COVERAGE * frames_due:
+        reason = f"the final trajectory has poses of {n_tracked} of {frames_due} frames"
         return outcome | {"status": "lost", "reason": reason}
-    if n_tracked >= due:  # frames that were lost online were found later
+    if n_tracked >= frames_due:  # frames that were lost online were found later
         return outcome | {"status": "ok", "reason": ""}
     return outcome
 
 
-def static_camera_error(
+def _static_camera_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> float | None:
     """What a static camera scores under the protocol's alignment; None without ground truth."""
-    if evaluation is not None and "static_camera_ate_rmse_m" in evaluation.metrics:
+    if evaluation is not None:
         return evaluation.metrics["static_camera_ate_rmse_m"]
-    try:
+    with suppress(DynslamError):
         truth = store.ground_truth(record.sequence.part)
-        if truth is None:
-            return None
-        errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
-    except DynslamError:
-        return None
-    return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+        if truth is not None:
+            errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
+            return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+    return None
 
 
-def hold_last_pose_error(
+def _hold_last_pose_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None, static_m: float | None
 ) -> float | None:
     """The ATE with every lost frame held at the last tracked pose; None without evaluation.
@@ -356,15 +343,12 @@ def hold_last_pose_error(
     error = evaluation.metrics["ate_rmse_m"]
     if evaluation.coverage == 1.0:
         return error
-    at_least = error if record.coverage >= 1.0 else max(error, static_m or 0.0)
-    try:
+    with suppress(DynslamError):
         trajectory = store.trajectory(record.run_id, protocol.trajectory)
         truth = store.ground_truth(record.sequence.part)
-        if trajectory is None or truth is None:
-            return at_least
-        return ate_rmse_m(trajectory, truth, protocol, held_at=store.timestamps(record.sequence.part))
-    except DynslamError:
-        return at_least
+        if trajectory is not None and truth is not None:
+            return ate_rmse_m(trajectory, truth, protocol, held_at=store.timestamps(record.sequence.part))
+    return error if record.coverage >= 1.0 else max(error, static_m or 0.0)
 
 
 def command_line(command: list[str]) -> str:

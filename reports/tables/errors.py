@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import median
 
 import numpy as np
 
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell
+from dynslam_bench.reports.model.board import MOST_COMPARED, STATIC_CAMERA, Board, Cell, mean_skipped
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FLOOR_M
-from dynslam_bench.reports.tables.leaderboard import (
-    SEEN_NOTE,
-    Marks,
-    best_marks,
-    run_link,
-    sequence_columns,
-    skipped_words,
+from dynslam_bench.reports.tables.leaderboard import SEEN_NOTE, run_link
+from dynslam_bench.reports.tables.table import (
+    Column,
+    Emphasis,
+    Table,
+    TableCell,
+    emphasise,
+    mm,
+    number,
+    percent,
+    significant_text,
+    texts,
 )
-from dynslam_bench.reports.tables.table import Column, Emphasis, Table, TableCell, mm, number, significant_text, texts
 
 Value = Callable[[RunRow], float | None]
 """A number of a run; None where it has none."""
@@ -63,27 +67,94 @@ def metric_table(
     doubts = {(key, sequence): doubt(board.cells[key][sequence]) for key, sequence in values}
     sign = -1.0 if larger_is_better else 1.0
     marks = column_marks(board, {place: sign * number for place, number in values.items() if not doubts[place]})
-    keys = list(dict.fromkeys(key for key, _ in values))
+
+    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
+        words = text(values[place]) + DOUBT * bool(doubts[place]) + SEEN * cell.in_training
+        mark: Emphasis = "muted" if doubts[place] else marks.get(place, "")
+        tip = doubts[place] or (SEEN_NOTE if cell.in_training else cell.ending)
+        return TableCell(words, skipped_words(cell), values[place], mark, tip=tip)
+
+    return _sequence_table(board, {"": values}, shown, name, title, caption, f"{title} ({unit})")
+
+
+Values = Mapping[tuple[str, str], float]
+"""``(variant key, sequence)`` to a number."""
+
+
+def _sequence_table(
+    board: Board,
+    measures: Mapping[str, Values],
+    shown: Callable[[Cell, tuple[str, str], str], TableCell],
+    name: str,
+    title: str,
+    caption: str,
+    brief: str,
+) -> Table:
+    """A row a tracker that has any of the numbers, a column a sequence and kind of number.
+
+    Args:
+        board: The board.
+        measures: The numbers of each kind; ``""`` for the only one.
+        shown: The cell of a number, from its runs, its place and its kind.
+        name: Id of the table.
+        title: Heading.
+        caption: How to read it.
+        brief: Caption where there is little room.
+    """
+    measured = {key for values in measures.values() for key, _ in values}
+    keys = [key for key in (*board.trackers, *board.final_only) if key in measured]
     rows = []
     for key in keys:
         cells = [TableCell(board.labels[key])]
         for place in ((key, sequence) for sequence in board.sequences):
-            cell, why = board.cells[key].get(place[1]), doubts.get(place, "")
-            if cell is not None and not cell.success:
-                cells.append(TableCell(emphasis="failed", tip=cell.ending))
-            elif cell is None or place not in values:
-                cells.append(TableCell())
-            else:
-                shown = text(values[place]) + DOUBT * bool(why) + SEEN * cell.in_training
-                mark: Emphasis = "muted" if why else marks.get(place, "")
-                tip = why or (SEEN_NOTE if cell.in_training else cell.ending)
-                cells.append(TableCell(shown, skipped_words(cell), values[place], mark, tip=tip))
+            runs = board.cells[key].get(place[1])
+            for kind, values in measures.items():
+                if runs is not None and not runs.success:
+                    cells.append(TableCell(emphasis="failed", tip=runs.ending))
+                elif runs is None or place not in values:
+                    cells.append(TableCell())
+                else:
+                    cells.append(shown(runs, place, kind))
         rows.append(cells)
-    columns = [*texts("tracker"), *sequence_columns(board)]
     muted = board.unranked_rows(keys)
     ranked = len(keys) - len(muted)
     separators = {ranked} if 0 < ranked < len(rows) else set()
-    return Table(name, title, caption, columns, rows, muted, separators, f"{title} ({unit})")
+    columns = [*texts("tracker"), *sequence_columns(board, list(measures))]
+    return Table(name, title, caption, columns, rows, muted, separators, brief)
+
+
+def common_frames_table(board: Board, common: Values, frames: Mapping[str, str]) -> Table | None:
+    """ATE on the frames that all evaluated runs of a sequence tracked; None where there are none.
+
+    Args:
+        board: The board.
+        common: ``(variant, sequence)`` to the median ATE there.
+        frames: Sequence to how many frames are common, in words.
+    """
+    if not common:
+        return None
+    marks = column_marks(board, common)
+    caption = (
+        "Median ATE (RMSE, millimetres) on those frames only that every successful run of the sequence tracked: a "
+        "tracker gains nothing here by losing the hard frames. Failed runs take no part."
+    )
+    counts = [sum(len(cells[name].kept) for cells in board.cells.values() if name in cells) for name in board.sequences]
+    if max(counts) > MOST_COMPARED:
+        caption += (
+            f" Of more than {MOST_COMPARED} runs on a sequence, these are the runs of every tracker around its median "
+            "error, as many of each."
+        )
+
+    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
+        words = mm(common[place]) + SEEN * cell.in_training
+        return TableCell(words, skipped_words(cell), common[place], marks.get(place, ""))
+
+    brief = "Absolute trajectory error on the common frames (RMSE, mm)"
+    table = _sequence_table(board, {"": common}, shown, "common_frames", "Error on the common frames", caption, brief)
+    table.muted_rows |= {len(table.rows)}
+    table.separators |= {len(table.rows)}
+    table.rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
+    return table
 
 
 def medians(board: Board, value: Value, keys: Sequence[str]) -> dict[tuple[str, str], float]:
@@ -97,26 +168,27 @@ def medians(board: Board, value: Value, keys: Sequence[str]) -> dict[tuple[str, 
     return of_cell
 
 
-def column_marks(board: Board, values: Mapping[tuple[str, str], float]) -> Marks:
+def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis]:
     """Best and second best of every column among the ranked trackers whose runs there compete and all succeeded.
 
     Args:
         board: The board.
-        values: ``(variant, sequence)`` to a number, less is better; what has none takes no part.
+        values: A number a cell, less is better; a cell that has none takes no part.
     """
-    competing = {}
+    marks: dict[tuple[str, str], Emphasis] = {}
     for name in board.sequences:
-        cells = {key: board.cells[key][name] for key in board.ranked if name in board.cells[key]}
-        competing[name] = [key for key, cell in cells.items() if not cell.failed and board.competes(key, name)]
-    return best_marks(board, values, competing)
+        keys = [key for key in board.ranked if name in board.cells[key] and not board.cells[key][name].failed]
+        places = [(key, name) for key in keys if board.competes(key, name)]
+        marks |= zip(places, emphasise([values.get(place) for place in places]), strict=True)
+    return marks
 
 
 def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
     """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
     sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
     usual = sizes.most_common(1)[0][0] if sizes else 1
-    medians = {(key, name): cell.median for key in board.ranked for name, cell in board.cells[key].items()}
-    marks = column_marks(board, {place: value for place, value in medians.items() if value is not None})
+    medians = {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
+    marks = column_marks(board, medians)
     rows = []
     for key in board.trackers:
         cells = [TableCell(board.labels[key], tag="imported" if board.first(key).imported else "")]
@@ -311,8 +383,8 @@ LOST_NOTE = f"{LOST_MARK} Frames were lost in a run of the cell: the error is of
 def subject_of(board: Board) -> str | None:
     """The tracker that is compared with the others: `SUBJECT` as it is by default, else the best ranked one."""
     own = [key for key in board.trackers if board.first(key).tracker.id == SUBJECT and key not in board.hopeless]
-    ranked = board.ranked_order()
-    return min(own, key=lambda key: len(board.first(key).variant), default=ranked[0] if ranked else None)
+    best = board.ranked[0] if board.ranked else None
+    return min(own, key=lambda key: len(board.first(key).variant), default=best)
 
 
 def absolute_table(board: Board, protocol: Protocol) -> Table | None:
@@ -345,25 +417,21 @@ def time_table(board: Board) -> Table | None:
         "error (%)": _share,
         "time (ms)": lambda row: row.frame_ms,
     }
-    medians_of = {name: medians(board, value, board.trackers) for name, value in columns.items()}
-    keys = list(dict.fromkeys(key for key, _ in medians_of["error (%)"]))
-    if not keys:
+    measures = {name: medians(board, value, board.trackers) for name, value in columns.items()}
+    if not measures["error (%)"]:
         return None
-    rows = []
-    for key in keys:
-        numbers = [of_cell.get((key, name)) for name in board.sequences for of_cell in medians_of.values()]
-        rows.append([TableCell(board.labels[key]), *(number(value, ".1f") for value in numbers)])
     caption = (
         "As the paper's Table 3. Error: the median ATE, lost frames held, in percent of that of a static camera"
         "; accuracy: what is left of 100 %, negative for a tracker that is worse than that. (The paper does "
         "not define its own; its numbers are 100 times one minus the standard deviation in metres.) Time: median of a "
         "frame, segmentation included, decoding excluded. Runs that succeeded."
     )
-    muted = board.unranked_rows(keys)
+
+    def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
+        return number(measures[kind][place], ".1f")
+
     brief = "Error in percent of a static camera, accuracy, and time of a frame"
-    return Table(
-        "paper_accuracy", "Accuracy, error and time", caption, _columns(board, columns), rows, muted, brief=brief
-    )
+    return _sequence_table(board, measures, shown, "paper_accuracy", "Accuracy, error and time", caption, brief)
 
 
 def _share(row: RunRow) -> float | None:
@@ -379,60 +447,57 @@ def _statistics_table(
         kind: medians(board, lambda row, metric=metric: row.metrics.get(metric), board.trackers)  # type: ignore[misc]
         for kind, metric in metrics.items()
     }
-    keys = list(dict.fromkeys(key for key, _ in errors["rmse"]))
-    if not keys:
+    if not errors["rmse"]:
         return None
     marks = {kind: column_marks(board, values) for kind, values in errors.items()}
-    rows = [[TableCell(board.labels[key]), *_error_cells(board, key, errors, marks)] for key in keys]
+
+    def shown(cell: Cell, place: tuple[str, str], kind: str) -> TableCell:
+        error = errors[kind][place]
+        words = mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell)
+        return TableCell(words, value=error, emphasis=marks[kind].get(place, ""))
+
+    caption = f"{source} Millimetres (metres in the CSV), median over the runs that succeeded."
+    table = _sequence_table(board, errors, shown, name, title, caption, brief)
+    if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
+        table.caption += f" {LOST_NOTE}"
+    keys = {key for key, _ in errors["rmse"]}
     subject = subject_of(board)
-    others = [key for key in keys if key in board.ranked and key != subject] if subject in keys else []
+    others = [key for key in board.ranked if key in keys and key != subject]
+    if subject not in keys or not others:
+        return table
+    table.caption += (
+        f" Below the line: by how many percent the error of {board.labels[subject]} is smaller than that of "
+        "the other tracker."
+    )
+    table.separators |= {len(table.rows)}
     for other in others:
         cells = [TableCell(f"improvement on {board.labels[other]}")]
         for sequence in board.sequences:
             for values in errors.values():
-                ours, theirs = values.get((str(subject), sequence)), values.get((other, sequence))
+                ours, theirs = values.get((subject, sequence)), values.get((other, sequence))
                 gain = None if ours is None or not theirs else 100 * (theirs - ours) / theirs
                 cells.append(number(gain, ".1f", " %"))
-        rows.append(cells)
-    muted = board.unranked_rows(keys)
-    lost = any(cell.text.endswith(LOST_MARK) for row in rows for cell in row)
-    caption = (
-        f"{source} Millimetres (metres in the CSV), median over the runs that succeeded."
-        + (f" {LOST_NOTE}" if lost else "")
-        + (
-            f" Below the line: by how many percent the error of {board.labels[str(subject)]} is smaller than that of "
-            "the other tracker."
-            if others
-            else ""
-        )
-    )
-    separators = {len(keys)} if others else set()
-    return Table(name, title, caption, _columns(board, metrics), rows, muted, separators, brief)
+        table.rows.append(cells)
+    return table
 
 
-def _columns(board: Board, kinds: Iterable[str]) -> list[Column]:
-    return texts("tracker") + [
+def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]:
+    """One column for every sequence, grouped; of several kinds of numbers one for each of them."""
+    if len(kinds) == 1:
+        return [
+            Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences
+        ]
+    return [
         Column(STATISTICS.get(kind, kind), board.short[name], full=f"{name}: {STATISTICS.get(kind, kind)}")
         for name in board.sequences
         for kind in kinds
     ]
 
 
-def _error_cells(
-    board: Board, key: str, errors: Mapping[str, Mapping[tuple[str, str], float]], marks: Mapping[str, Marks]
-) -> Iterator[TableCell]:
-    for name in board.sequences:
-        cell = board.cells[key].get(name)
-        for kind, values in errors.items():
-            if cell is not None and not cell.success:
-                yield TableCell(emphasis="failed", tip=cell.ending)
-            elif cell is None or (key, name) not in values:
-                yield TableCell()
-            else:
-                error, mark = values[key, name], marks[kind].get((key, name), "")
-                yield TableCell(
-                    mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell), value=error, emphasis=mark
-                )
+def skipped_words(cell: Cell) -> str:
+    """On which share of the frames the fundamental matrix was not used, e.g. ``F skipped 98 %``; empty for none."""
+    share = mean_skipped(cell.rows)
+    return "" if share is None else f"F skipped {percent(share)}"
 
 
 def has_lost(cell: Cell | None) -> bool:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from statistics import median
 
 import numpy as np
 
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import MOST_COMPARED, Board, Cell, mean_skipped, rank
+from dynslam_bench.reports.model.board import Board, mean_skipped, rank
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (
@@ -19,16 +19,11 @@ from dynslam_bench.reports.tables.table import (
     Emphasis,
     Table,
     TableCell,
-    emphasise,
-    mm,
     number,
     numbers,
     percent,
     texts,
 )
-
-Marks = dict[tuple[str, str], Emphasis]
-"""Variant key and sequence to the emphasis of their cell."""
 
 _PROVENANCE = {
     "own": "put together in this project: no one paper or program describes the whole",
@@ -227,17 +222,6 @@ def _has_interval(interval: Interval) -> bool:
     return math.isfinite(interval.low) and math.isfinite(interval.high)
 
 
-def skipped_words(cell: Cell) -> str:
-    """On which share of the frames the fundamental matrix was not used, e.g. ``F skipped 98 %``; empty for none."""
-    share = cell.epipolar_skipped
-    return "" if share is None else f"F skipped {percent(share)}"
-
-
-def sequence_columns(board: Board) -> list[Column]:
-    """One column for every sequence, grouped."""
-    return [Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences]
-
-
 def middle(values: Iterable[float | None]) -> float | None:
     """Median of what is present; None if nothing is."""
     present = [value for value in values if value is not None]
@@ -246,68 +230,6 @@ def middle(values: Iterable[float | None]) -> float | None:
 
 def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' if count != 1 else ''}"
-
-
-def best_marks(board: Board, values: Mapping[tuple[str, str], float], keys: Mapping[str, Sequence[str]]) -> Marks:
-    """Best and second best of every sequence; less is better.
-
-    Args:
-        board: The board.
-        values: ``(variant, sequence)`` to a number; what has none takes no part.
-        keys: Sequence to the variants that compete there.
-    """
-    marks: Marks = {}
-    for name in board.sequences:
-        emphasis = emphasise([values.get((key, name)) for key in keys[name]])
-        marks |= {(key, name): mark for key, mark in zip(keys[name], emphasis, strict=True)}
-    return marks
-
-
-def common_frames_table(
-    board: Board, common: Mapping[tuple[str, str], float], frames: Mapping[str, str]
-) -> Table | None:
-    """ATE on the frames that all evaluated runs of a sequence tracked.
-
-    Args:
-        board: The board.
-        common: ``(variant, sequence)`` to the median ATE there.
-        frames: Sequence to how many frames are common, in words.
-    """
-    if not common:
-        return None
-    competing = {
-        name: [key for key in board.ranked if (key, name) in common and board.competes(key, name)]
-        for name in board.sequences
-    }
-    marks = best_marks(board, common, competing)
-    rows = []
-    for key in board.trackers:
-        cells = [TableCell(board.labels[key])]
-        for name in board.sequences:
-            error = common.get((key, name))
-            if error is None:
-                cells.append(TableCell())
-            else:
-                cell = board.cells[key][name]
-                mark = marks.get((key, name), "")
-                cells.append(TableCell(mm(error) + SEEN * cell.in_training, skipped_words(cell), error, mark))
-        rows.append(cells)
-    rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
-    caption = (
-        "Median ATE (RMSE, millimetres) on those frames only that every successful run of the sequence tracked: a "
-        "tracker gains nothing here by losing the hard frames. Failed runs take no part."
-    )
-    counts = [sum(len(cells[name].kept) for cells in board.cells.values() if name in cells) for name in board.sequences]
-    if max(counts) > MOST_COMPARED:
-        caption += (
-            f" Of more than {MOST_COMPARED} runs on a sequence, these are the runs of every tracker around its median "
-            "error, as many of each."
-        )
-    columns = [*texts("tracker"), *sequence_columns(board)]
-    last = len(board.trackers)
-    muted = board.unranked_rows(board.trackers) | {last}
-    brief = "Absolute trajectory error on the common frames (RMSE, mm)"
-    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, {last}, brief)
 
 
 def failure_rule_table(board: Board) -> Table | None:
@@ -322,7 +244,7 @@ def failure_rule_table(board: Board) -> Table | None:
     by_rule = [{s.key: s for s in rank(board, board.ranked, board.ranked, rule)} for rule in rules.values()]
     columns = [*texts("tracker"), *(column for name in rules for column in numbers("#", "ATE ratio", group=name))]
     rows = []
-    for key in board.ranked_order():
+    for key in board.ranked:
         cells = [TableCell(board.labels[key])]
         for standings in by_rule:
             if key in standings:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from math import ceil
 from typing import Literal
@@ -107,9 +107,9 @@ class Table:
     title: str
     caption: str
     columns: Sequence[Column]
-    rows: Sequence[Sequence[TableCell]]
-    muted_rows: Collection[int] = ()
-    separators: Collection[int] = ()
+    rows: list[list[TableCell]]
+    muted_rows: set[int] = field(default_factory=set)
+    separators: set[int] = field(default_factory=set)
     brief: str = ""
 
     def frame(self) -> pd.DataFrame:
