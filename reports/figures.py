@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.reports.model.board import Board
 from dynslam_bench.reports.model.statistics import Interval
-from dynslam_bench.reports.tables.errors import LOST_MARK, STATISTICS, has_lost, medians
-from dynslam_bench.reports.tables.leaderboard import CACHED_MARK, timed
+from dynslam_bench.reports.tables.leaderboard import CACHED_MARK, LOST_MARK, STATISTICS, has_lost, medians, timed
 
 # How the report's figures look: colours, axes, layout, and numbers and names made fit for the page.
 

@@ -28,7 +28,7 @@ from dynslam_bench.reports.figures import broken, significant
 from dynslam_bench.reports.html.page import packed_rows, write_side
 from dynslam_bench.reports.model.missing import run_command
 from dynslam_bench.reports.model.row import RunRow, command_line
-from dynslam_bench.reports.tables.errors import DOUBT
+from dynslam_bench.reports.tables.leaderboard import DOUBT
 from dynslam_bench.runs.artifacts import Snapshot, read_snapshots, spread
 from dynslam_bench.runs.exchange.export import open_stored
 from dynslam_bench.runs.frames import CSV_FILE

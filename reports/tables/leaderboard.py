@@ -1,17 +1,19 @@
-"""The leaderboard, its sensitivity to the rules, tables of the runs, and the cells that several tables share."""
+"""The tables of a board: the leaderboard, errors by sequence, tables of the runs, and the paper's Tables 1 to 3."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from statistics import median
 
 import numpy as np
 
 from dynslam_bench.core.toml import label_text
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import Board, mean_skipped, rank
+from dynslam_bench.reports.model.board import MOST_COMPARED, STATIC_CAMERA, Board, Cell, mean_skipped, rank
+from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (
@@ -19,11 +21,16 @@ from dynslam_bench.reports.tables.table import (
     Emphasis,
     Table,
     TableCell,
+    emphasise,
+    mm,
     number,
     numbers,
     percent,
+    significant_text,
     texts,
 )
+
+# -- the leaderboard, and cells that several tables share
 
 _PROVENANCE = {
     "own": "put together in this project: no one paper or program describes the whole",
@@ -232,6 +239,354 @@ def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' if count != 1 else ''}"
 
 
+# -- numbers by tracker and sequence
+
+Value = Callable[[RunRow], float | None]
+"""A number of a run; None where it has none."""
+DOUBT = "‡"
+"""Behind a number that says nothing of its tracker."""
+
+
+def metric_table(
+    board: Board,
+    value: Value,
+    name: str,
+    title: str,
+    caption: str,
+    *,
+    unit: str = "RMSE, mm",
+    text: Callable[[float], str] = mm,
+    larger_is_better: bool = False,
+    trackers: Sequence[str] | None = None,
+    doubt: Callable[[Cell], str] = lambda cell: "",
+) -> Table | None:
+    """Median of any number of the runs that succeeded, by tracker and sequence; None if no run has it.
+
+    Args:
+        board: The board.
+        value: The number of a run.
+        name: Id of the table.
+        title: Heading.
+        caption: How to read it.
+        unit: What the numbers are, in a word or two.
+        text: How the number is written; metres become millimetres by default.
+        larger_is_better: Which end is bold.
+        trackers: Variant keys; the board's by default.
+        doubt: Why the number of a cell says nothing, empty if it does; such a cell carries `DOUBT` and is never bold.
+    """
+    values = medians(board, value, board.trackers if trackers is None else trackers)
+    if not values:
+        return None
+    doubts = {(key, sequence): doubt(board.cells[key][sequence]) for key, sequence in values}
+    sign = -1.0 if larger_is_better else 1.0
+    marks = column_marks(board, {place: sign * number for place, number in values.items() if not doubts[place]})
+
+    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
+        words = text(values[place]) + DOUBT * bool(doubts[place]) + SEEN * cell.in_training
+        mark: Emphasis = "muted" if doubts[place] else marks.get(place, "")
+        tip = doubts[place] or (SEEN_NOTE if cell.in_training else cell.ending)
+        return TableCell(words, skipped_words(cell), values[place], mark, tip=tip)
+
+    return _sequence_table(board, {"": values}, shown, name, title, caption, f"{title} ({unit})")
+
+
+Values = Mapping[tuple[str, str], float]
+"""``(variant key, sequence)`` to a number."""
+
+
+def _sequence_table(
+    board: Board,
+    measures: Mapping[str, Values],
+    shown: Callable[[Cell, tuple[str, str], str], TableCell],
+    name: str,
+    title: str,
+    caption: str,
+    brief: str,
+) -> Table:
+    """A row a tracker that has any of the numbers, a column a sequence and kind of number.
+
+    Args:
+        board: The board.
+        measures: The numbers of each kind; ``""`` for the only one.
+        shown: The cell of a number, from its runs, its place and its kind.
+        name: Id of the table.
+        title: Heading.
+        caption: How to read it.
+        brief: Caption where there is little room.
+    """
+    measured = {key for values in measures.values() for key, _ in values}
+    keys = [key for key in (*board.trackers, *board.final_only) if key in measured]
+    rows = []
+    for key in keys:
+        cells = [TableCell(board.labels[key])]
+        for place in ((key, sequence) for sequence in board.sequences):
+            runs = board.cells[key].get(place[1])
+            for kind, values in measures.items():
+                if runs is not None and not runs.success:
+                    cells.append(TableCell(emphasis="failed", tip=runs.ending))
+                elif runs is None or place not in values:
+                    cells.append(TableCell())
+                else:
+                    cells.append(shown(runs, place, kind))
+        rows.append(cells)
+    muted = board.unranked_rows(keys)
+    ranked = len(keys) - len(muted)
+    separators = {ranked} if 0 < ranked < len(rows) else set()
+    columns = [*texts("tracker"), *sequence_columns(board, list(measures))]
+    return Table(name, title, caption, columns, rows, muted, separators, brief)
+
+
+def common_frames_table(board: Board, common: Values, frames: Mapping[str, str]) -> Table | None:
+    """ATE on the frames that all evaluated runs of a sequence tracked; None where there are none.
+
+    Args:
+        board: The board.
+        common: ``(variant, sequence)`` to the median ATE there.
+        frames: Sequence to how many frames are common, in words.
+    """
+    if not common:
+        return None
+    marks = column_marks(board, common)
+    caption = (
+        "Median ATE (RMSE, millimetres) on those frames only that every successful run of the sequence tracked: a "
+        "tracker gains nothing here by losing the hard frames. Failed runs take no part."
+    )
+    counts = [sum(len(cells[name].kept) for cells in board.cells.values() if name in cells) for name in board.sequences]
+    if max(counts) > MOST_COMPARED:
+        caption += (
+            f" Of more than {MOST_COMPARED} runs on a sequence, these are the runs of every tracker around its median "
+            "error, as many of each."
+        )
+
+    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
+        words = mm(common[place]) + SEEN * cell.in_training
+        return TableCell(words, skipped_words(cell), common[place], marks.get(place, ""))
+
+    brief = "Absolute trajectory error on the common frames (RMSE, mm)"
+    table = _sequence_table(board, {"": common}, shown, "common_frames", "Error on the common frames", caption, brief)
+    table.muted_rows |= {len(table.rows)}
+    table.separators |= {len(table.rows)}
+    table.rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
+    return table
+
+
+def medians(board: Board, value: Value, keys: Sequence[str]) -> dict[tuple[str, str], float]:
+    """Median of a number over the runs that count and succeeded, by tracker and sequence."""
+    of_cell = {}
+    for key in keys:
+        for name, cell in board.cells[key].items():
+            values = [number for row in cell.kept if not row.failed and (number := value(row)) is not None]
+            if values and name in board.sequences:
+                of_cell[key, name] = median(values)
+    return of_cell
+
+
+def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis]:
+    """Best and second best of every column among the ranked trackers whose runs there compete and all succeeded.
+
+    Args:
+        board: The board.
+        values: A number a cell, less is better; a cell that has none takes no part.
+    """
+    marks: dict[tuple[str, str], Emphasis] = {}
+    for name in board.sequences:
+        keys = [key for key in board.ranked if name in board.cells[key] and not board.cells[key][name].failed]
+        places = [(key, name) for key in keys if board.competes(key, name)]
+        marks |= zip(places, emphasise([values.get(place) for place in places]), strict=True)
+    return marks
+
+
+def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
+    """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
+    sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
+    usual = sizes.most_common(1)[0][0] if sizes else 1
+    medians = {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
+    marks = column_marks(board, medians)
+    rows = []
+    for key in board.trackers:
+        cells = [TableCell(board.labels[key], tag="imported" if board.first(key).imported else "")]
+        rows.append(
+            cells + [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
+        )
+    rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
+    separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
+    for name, tag in dict.fromkeys((cell.system, cell.tag) for cell in reported):
+        by_sequence: dict[str, ReportedCell] = {}
+        for cell in reported:
+            if (cell.system, cell.tag) == (name, tag):
+                by_sequence.setdefault(cell.sequence, cell)
+        line = [by_sequence.get(sequence) for sequence in board.sequences]
+        cells = [TableCell(mm(cell.value), value=cell.value, tip=cell.source) if cell else TableCell() for cell in line]
+        rows.append([TableCell(name, tag=tag), *cells])
+    muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
+    caption = (
+        f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
+        "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
+        "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a static "
+        "camera, or worse; a cell with a failure takes no part in bold and green, and is hatched where "
+        f"nothing succeeded. Colour: ratio to {board.reference_name}, from green (a quarter or less) to red (four "
+        f"times or more). Bold best, italic second among ranked trackers. {_names_note(board)}{protocol.describe()}."
+    )
+    if reported:
+        caption += (
+            " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only, "
+            "and lost frames are left out of most. Rows marked 'claimed by the paper' are the implemented paper's own, "
+            "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
+            "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
+        )
+    columns = [*texts("tracker"), *sequence_columns(board)]
+    if any(row.seen_in_training for row in board.rows):
+        columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
+        keys = [*board.trackers, *[None] * (len(rows) - len(board.trackers))]
+        rows = [[*row, TableCell(_trained_on(board, key))] for key, row in zip(keys, rows, strict=True)]
+        caption += f" {SEEN_NOTE}"
+    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
+    return Table(
+        "per_sequence", "Absolute trajectory error by sequence (mm)", caption, columns, rows, muted, separators, brief
+    )
+
+
+def _trained_on(board: Board, key: str | None) -> str:
+    """The sequences on which the masks of a tracker were trained; empty for no tracker."""
+    cells = {} if key is None else board.cells[key]
+    return ", ".join(board.short[name] for name in board.sequences if name in cells and cells[name].in_training)
+
+
+def final_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the final trajectories, of the trackers that have one."""
+    return metric_table(
+        board,
+        lambda row: row.final_ate_m,
+        "final_trajectory",
+        "Error of the final trajectory",
+        "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
+        f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
+        trackers=[*board.trackers, *board.final_only],
+    )
+
+
+def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the tracked frames only."""
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ate_rmse_m"),
+        "lost_frames_excluded",
+        "Error without the lost frames",
+        "Median ATE (RMSE, millimetres) of the tracked frames only, of the runs that succeeded: the sensitivity to "
+        f"lost frames, not what ranks. {protocol.describe()}.",
+    )
+
+
+def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
+    """One table for each relative error of the protocol and each of its parts."""
+    tables = []
+    for spec in protocol.rpe:
+        for part, unit, name in (("trans", "m", "translation"), ("rot", "deg", "rotation")):
+            metric = spec.metric(part)
+            per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 or spec.rate else ""
+            table = metric_table(
+                board,
+                lambda row, metric=metric: row.metrics.get(metric),  # type: ignore[misc]
+                f"rpe_{spec.key}_{part}",
+                f"Relative pose error over {spec.describe()}: {name}",
+                f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
+                f"they tracked. {protocol.describe()}.",
+                unit=f"RMSE, {'mm' if unit == 'm' else '°'}{per}",
+                text=mm if unit == "m" else significant_text,
+            )
+            if table is not None:
+                tables.append(table)
+    return tables
+
+
+def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Absolute rotational error, marked where it is an error of the alignment rather than of the tracker."""
+    caption = (
+        "Absolute rotational error (RMSE in °), median over the runs that succeeded, after the alignment of the "
+        f"positions, on the frames that they tracked. {protocol.describe()}."
+    )
+    if any(_rotation_doubt(cell) for cells in board.cells.values() for cell in cells.values()):
+        caption += (
+            f" {DOUBT} Unreliable: the path hardly determines the alignment's rotation (its standard error is above "
+            f"{RELIABLE_DEG:.0f}° in a run of the cell), so the number says nothing of the tracker and takes no part "
+            "in emphasis. Translational and relative errors are not affected."
+        )
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ape_rot_rmse_deg"),
+        "ape_rotation",
+        "Absolute rotational error",
+        caption,
+        unit="RMSE, °",
+        text=significant_text,
+        doubt=_rotation_doubt,
+    )
+
+
+def _rotation_doubt(cell: Cell) -> str:
+    """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
+    uncertain = [row for row in cell.kept if not row.failed and not row.rotation_reliable]
+    largest = max((row.rotation_uncertainty_deg or 0.0 for row in uncertain), default=0.0)
+    return f"unreliable: the alignment's rotation is known to ±{largest:.0f}° only" if uncertain else ""
+
+
+def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
+    cell = board.cells[key].get(sequence)
+    if cell is None or cell.median is None:
+        return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
+    coverage = f"coverage {100 * float(np.mean([row.coverage for row in cell.rows])):.1f} %"
+    link = run_link(cell.typical)
+    count = "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
+    if not cell.success:
+        tip = f"counts as {mm(cell.median)} mm, {coverage}"
+        return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
+    notes = [_spread(cell), count, skipped_words(cell)]
+    if board.no_better_than_static(key, sequence):
+        notes.append("no better than a static camera")
+    if cell.failed:
+        notes.append(f"{cell.success}/{len(cell.rows)} succeeded")
+    base = board.reference_median(sequence)
+    colour = None
+    tip = coverage
+    if base is not None and cell.in_training:
+        tip = SEEN_NOTE
+    elif base is not None:
+        ratio = cell.median / max(base, FLOOR_M)
+        colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
+        tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
+    shown = mm(cell.median) + SEEN * cell.in_training
+    return TableCell(shown, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
+
+
+def _spread(cell: Cell) -> str:
+    if len(cell.scores) > 1:
+        low, high = np.percentile(cell.scores, [25, 75])
+        return f"±{significant_text(500.0 * float(high - low), 2)}"
+    return "deterministic" if cell.deterministic else ""
+
+
+def _static_camera_cell(board: Board, sequence: str) -> TableCell:
+    value, base = board.static_camera[sequence], board.reference_median(sequence)
+    if base is None:
+        return TableCell(mm(value), value=value)
+    ratio = value / max(base, FLOOR_M)
+    return TableCell(mm(value), value=value, shade=shade(ratio), tip=f"{ratio:.2f} × the reference")
+
+
+def shade(ratio: float) -> float:
+    """-1 at a quarter of the reference's error or less, 0 at the same, 1 at four times or more."""
+    return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
+
+
+def _names_note(board: Board) -> str:
+    """What the shortened headings stand for; empty where they are whole."""
+    first = board.sequences[0]
+    return "" if board.short[first] == first else f"'{board.short[first]}' stands for {first}, and so on. "
+
+
+# -- the rules, and the runs
+
+
 def failure_rule_table(board: Board) -> Table | None:
     """How much the ranking depends on how failures and lost frames are counted; None if nothing was lost."""
     if not board.ranked or all(row.coverage >= 1 and not row.failed for row in board.rows):
@@ -343,3 +698,137 @@ def machines(board: Board) -> Table:
     rows = [[number(count), TableCell(name)] for name, count in counts.most_common()]
     caption = "Times of different machines are not comparable."
     return Table("machines", "Machines and versions", caption, columns, rows)
+
+
+# -- the implemented paper's Tables 1 to 3, made of our own runs
+
+SUBJECT = "emfoa-oft"
+"""Tracker whose improvement over the others is shown, where it was run."""
+STATISTICS = {"rmse": "RMSE", "mean": "mean", "median": "median", "std": "SD"}
+LOST_MARK = "¶"
+LOST_NOTE = f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
+
+
+def subject_of(board: Board) -> str | None:
+    """The tracker that is compared with the others: `SUBJECT` as it is by default, else the best ranked one."""
+    own = [key for key in board.trackers if board.first(key).tracker.id == SUBJECT and key not in board.hopeless]
+    best = board.ranked[0] if board.ranked else None
+    return min(own, key=lambda key: len(board.first(key).variant), default=best)
+
+
+def absolute_table(board: Board, protocol: Protocol) -> Table | None:
+    """Table 1: RMSE, mean, median and standard deviation of the absolute error; None if no run has it."""
+    return _statistics_table(
+        board, {name: f"ate_{name}_m" for name in STATISTICS}, "paper_ape", "Absolute pose error, four statistics",
+        f"As the paper's Table 1. {protocol.describe()}.", "Absolute pose error (mm)",
+    )  # fmt: skip
+
+
+def relative_table(board: Board, protocol: Protocol) -> Table | None:
+    """Table 2: the same of the protocol's first relative error; None if it has none."""
+    if not protocol.rpe:
+        return None
+    spec = protocol.rpe[0]
+    return _statistics_table(
+        board,
+        {name: f"rpe_{spec.key}_trans_{name}_m" for name in STATISTICS},
+        "paper_rpe",
+        "Relative pose error, four statistics",
+        f"As the paper's Table 2, over {spec.describe()}. {protocol.describe()}.",
+        f"Relative pose error over {spec.describe()} (mm)",
+    )
+
+
+def time_table(board: Board) -> Table | None:
+    """Table 3: accuracy, error and time of a frame; None if nothing was scored."""
+    columns: dict[str, Value] = {
+        "accuracy (%)": lambda row: None if (share := _share(row)) is None else 100 - share,
+        "error (%)": _share,
+        "time (ms)": lambda row: row.frame_ms,
+    }
+    measures = {name: medians(board, value, board.trackers) for name, value in columns.items()}
+    if not measures["error (%)"]:
+        return None
+    caption = (
+        "As the paper's Table 3. Error: the median ATE, lost frames held, in percent of that of a static camera"
+        "; accuracy: what is left of 100 %, negative for a tracker that is worse than that. (The paper does "
+        "not define its own; its numbers are 100 times one minus the standard deviation in metres.) Time: median of a "
+        "frame, segmentation included, decoding excluded. Runs that succeeded."
+    )
+
+    def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
+        return number(measures[kind][place], ".1f")
+
+    brief = "Error in percent of a static camera, accuracy, and time of a frame"
+    return _sequence_table(board, measures, shown, "paper_accuracy", "Accuracy, error and time", caption, brief)
+
+
+def _share(row: RunRow) -> float | None:
+    """A run's error in percent of that of a static camera."""
+    static_m = row.static_camera_ate_rmse_m
+    return None if not static_m or row.hold_last_pose_ate_m is None else 100 * row.hold_last_pose_ate_m / static_m
+
+
+def _statistics_table(
+    board: Board, metrics: Mapping[str, str], name: str, title: str, source: str, brief: str
+) -> Table | None:
+    errors = {
+        kind: medians(board, lambda row, metric=metric: row.metrics.get(metric), board.trackers)  # type: ignore[misc]
+        for kind, metric in metrics.items()
+    }
+    if not errors["rmse"]:
+        return None
+    marks = {kind: column_marks(board, values) for kind, values in errors.items()}
+
+    def shown(cell: Cell, place: tuple[str, str], kind: str) -> TableCell:
+        error = errors[kind][place]
+        words = mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell)
+        return TableCell(words, value=error, emphasis=marks[kind].get(place, ""))
+
+    caption = f"{source} Millimetres (metres in the CSV), median over the runs that succeeded."
+    table = _sequence_table(board, errors, shown, name, title, caption, brief)
+    if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
+        table.caption += f" {LOST_NOTE}"
+    keys = {key for key, _ in errors["rmse"]}
+    subject = subject_of(board)
+    others = [key for key in board.ranked if key in keys and key != subject]
+    if subject not in keys or not others:
+        return table
+    table.caption += (
+        f" Below the line: by how many percent the error of {board.labels[subject]} is smaller than that of "
+        "the other tracker."
+    )
+    table.separators |= {len(table.rows)}
+    for other in others:
+        cells = [TableCell(f"improvement on {board.labels[other]}")]
+        for sequence in board.sequences:
+            for values in errors.values():
+                ours, theirs = values.get((subject, sequence)), values.get((other, sequence))
+                gain = None if ours is None or not theirs else 100 * (theirs - ours) / theirs
+                cells.append(number(gain, ".1f", " %"))
+        table.rows.append(cells)
+    return table
+
+
+def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]:
+    """One column for every sequence, grouped; of several kinds of numbers one for each of them."""
+    if len(kinds) == 1:
+        return [
+            Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences
+        ]
+    return [
+        Column(STATISTICS.get(kind, kind), board.short[name], full=f"{name}: {STATISTICS.get(kind, kind)}")
+        for name in board.sequences
+        for kind in kinds
+    ]
+
+
+def skipped_words(cell: Cell) -> str:
+    """On which share of the frames the fundamental matrix was not used, e.g. ``F skipped 98 %``; empty for none."""
+    share = mean_skipped(cell.rows)
+    return "" if share is None else f"F skipped {percent(share)}"
+
+
+def has_lost(cell: Cell | None) -> bool:
+    """Whether frames were lost in a run that succeeded: the errors of the cell are of the tracked ones only."""
+    return cell is not None and any(row.coverage < 1 for row in cell.kept if not row.failed)

@@ -14,7 +14,7 @@ from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import load_board, publish
 from dynslam_bench.reports.figures import FIGURES, bar_figure
 from dynslam_bench.reports.model.board import common_errors
-from dynslam_bench.reports.tables.errors import LOST_MARK, absolute_table, relative_table, subject_of, time_table
+from dynslam_bench.reports.tables.leaderboard import LOST_MARK, absolute_table, relative_table, subject_of, time_table
 from dynslam_bench.runs.store import RunStore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")

@@ -15,7 +15,7 @@ from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
-from dynslam_bench.reports.tables.errors import per_sequence, relative_errors
+from dynslam_bench.reports.tables.leaderboard import per_sequence, relative_errors
 from dynslam_bench.reports.tables.leaderboard import leaderboard
 from dynslam_bench.reports.tables.table import mm, percent
 from dynslam_bench.runs.store import RunStore
