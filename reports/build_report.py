@@ -18,9 +18,8 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
-from dynslam_bench.reports.html.explore import PICTURE_SECONDS, RUN_PAGE, write_explore
+from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, folded, render, resource
-from dynslam_bench.reports.html.run_page import MOST_FRAMES
 from dynslam_bench.reports.model.board import Board, On, common_errors, make_board
 from dynslam_bench.reports.model.load import (
     Loaded,
@@ -116,7 +115,7 @@ def build_report(
     with worker_pool(sum(len(store.ids()) for store in stores)) as pool:
         loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)
         board = make_board(loaded.rows, reference, on, rank_seen=rank_seen)
-        explored = write_explore(
+        explore_notes = write_explore(
             board, protocol, output, title=title, pool=pool,
             picture_seconds=picture_seconds, most_frames=most_frames, most_pages=most_pages,
             progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
@@ -125,7 +124,7 @@ def build_report(
         again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
         sections = [
             leaderboard_section(board, protocol, loaded),
-            Section("explore", "Explore", "Explore", explored.notes, [Block("explore")]),
+            Section("explore", "Explore", "Explore", explore_notes, [Block("explore")]),
             speed_section(board),
             errors_section(board, protocol, pool),
             paper_section(board, protocol),

@@ -22,9 +22,9 @@ from dynslam_bench.reports.figures import Figure
 from dynslam_bench.reports.tables.table import Table
 
 _STYLES = ("report.css", "figures.css")
-_CHARTS = ("scales.js", "marks.js", "chart.js", "hover.js", "store.js", "page.js")
+_CHARTS = ("scales.js", "traces.js", "chart.js", "hover.js", "store.js", "page.js")
 _EXPLORE = ("explore.js", "explore_figures.js", "tracks.js")
-_RUN = ("run.js", "run_figures.js", "space.js", "looks.js")
+_RUN = ("run.js", "run_figures.js", "view3d.js", "annotations.js")
 
 
 @dataclass

@@ -61,7 +61,7 @@ def main() -> None:
         report = build_report(store, Path(folder) / "report", picture_seconds=60)
         browser.open(report.run, 1100, anchor=f"#{store.ids()[0]}")
         browser.until("one('.thumb canvas')", tries=200)
-        browser.run(f"slide(all('#looks input[type=range]')[0], {options.frame})") if options.frame >= 0 else None
+        browser.run(f"slide(all('#annotations input[type=range]')[0], {options.frame})") if options.frame >= 0 else None
         browser.settle()
         framed(browser, "#s-track .grid-2", options.output / "culling.webp")
         browser.close()

@@ -180,10 +180,10 @@ def test_angles_that_only_the_alignment_made_are_called_unreliable(browser, tmp_
 
 def test_the_slider_moves_image_track_and_cursor(browser, report):
     open_page(browser, report, "run", 1400)
-    state = "[one('#looks .caption').textContent, one('#over-time .cursor').outerHTML]"
+    state = "[one('#annotations .caption').textContent, one('#over-time .cursor').outerHTML]"
     browser.until("one('#over-time .cursor')")
     last = browser.run(state)
-    browser.run("slide(one('#looks input[type=range]'), 0)")
+    browser.run("slide(one('#annotations input[type=range]'), 0)")
     browser.settle()
     first = browser.run(state)
     assert "frame 0" in first[0] and "frame 39" in last[0]
