@@ -52,16 +52,8 @@ SEEN_NOTE = (
 
 def leaderboard(board: Board, protocol: Protocol) -> Table:
     """Ranking with what the data leave open, success, coverage, speed and provenance."""
-    epipolar = any(row.epipolar_skipped is not None for row in board.rows)
     standings = {standing.key: standing for standing in board.standings}
-    rows = []
-    for key in board.trackers:
-        runs = board.runs(key)
-        share = mean_skipped(runs)
-        *measures, origin, provenance = _run_cells(runs)
-        if epipolar:
-            measures.append(TableCell() if share is None else TableCell(percent(share), value=share))
-        rows.append([*_standing_cells(board, key, standings.get(key)), *measures, origin, provenance])
+    epipolar = any(row.epipolar_skipped is not None for row in board.rows)
     columns = [
         Column(
             name,
@@ -72,9 +64,13 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         for name, meaning in _MEANINGS.items()
         if epipolar or name != "F skipped"
     ]
+    rows = []
+    for key in board.trackers:
+        cells = _leaderboard_cells(board, key, standings.get(key))
+        rows.append([cells.get(column.name, TableCell()) for column in columns])
     caption = _caption(board, protocol, epipolar)
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
-    brief += ", with 95 % intervals" * any(_has_interval(standing.ratio) for standing in board.standings)
+    brief += ", with 95 % intervals" * any(math.isfinite(standing.ratio.low) for standing in board.standings)
     muted = board.unranked_rows(board.trackers)
     return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators(), brief)
 
@@ -118,7 +114,13 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "in the map of an earlier one or by an older program, real-time runs beside others, trackers that lack "
         "sequences, never succeeded, or are no better than a static camera.",
     ]
-    worse, hinted = _no_better_than_static(board), _hinted(board.rows)
+    counts = {key: sum(board.no_better_than_static(key, name) for name in board.sequences) for key in board.trackers}
+    worse = "; ".join(
+        f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
+        for key, count in counts.items()
+        if count
+    )
+    hinted = _hinted(board.rows)
     rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
     remarks = {
         f"No better than a static camera, although their runs ended: {worse}.": worse,
@@ -139,59 +141,51 @@ def _hinted(rows: Iterable[RunRow]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.most_common())
 
 
-def _no_better_than_static(board: Board) -> str:
-    """Trackers with how many sequences they are no better on than a static camera; empty if none is."""
-    counts = {key: sum(board.no_better_than_static(key, name) for name in board.sequences) for key in board.trackers}
-    return "; ".join(
-        f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
-        for key, count in counts.items()
-        if count
-    )
-
-
-def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[TableCell]:
+def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dict[str, TableCell]:
+    """The cells of a tracker by the names of their columns; what is not known is left out."""
     runs = board.runs(key)
-    good = sum(not row.failed for row in runs)
-    success = TableCell(f"{good}/{len(runs)}", value=good / len(runs))
+    ended = [row for row in runs if not row.failed]
+    coverage = float(np.mean([row.coverage for row in runs]))
     hinted = _hinted(runs)
-    name = TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=board.first(key).tracker.id)
+    masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
+    tracker = runs[0].tracker
+    cells = {
+        "#": TableCell("–"),
+        "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
+        "tracker": TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id),
+        "coverage": TableCell(f"{100 * coverage:.1f} %", value=coverage),
+        "× real time": speed_cell(ended),
+        "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
+        "rows": TableCell(tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items())),
+        "provenance": TableCell(
+            _NAMES.get(tracker.provenance, tracker.provenance),
+            f"{masks} masks" if masks else "",
+            tip=_PROVENANCE.get(tracker.provenance, ""),
+        ),
+    }
+    skipped = mean_skipped(runs)
+    if skipped is not None:
+        cells["F skipped"] = TableCell(percent(skipped), value=skipped)
     if key in board.hopeless:
-        return [TableCell("–"), success, name, TableCell("nothing succeeded", emphasis="failed"), *[TableCell()] * 3]
+        return cells | {"ATE ratio": TableCell("nothing succeeded", emphasis="failed")}
     if standing is None:
-        return [TableCell("–"), success, name, *[TableCell()] * 4]
-    ratio = interval_cell(standing.ratio, ".2f", _mark(board, standing))
+        return cells
+    # bold for those that may be first, unless that is most of them: then it would say nothing
+    first = [other.key for other in board.standings if other.group is not None and other.group[0] == 1]
+    best = key in first and 2 * len(first) <= len(board.ranked)
+    ratio = interval_cell(standing.ratio, ".2f", "best" if best else "")
     if standing.sequences < len(board.common):
         text = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
         ratio = TableCell(ratio.text, text, ratio.value)
     better = f"P {standing.better:.2f}" if standing.sequences >= FEWEST else ""
     wins = TableCell(f"{standing.wins} of {standing.sequences}", better, standing.wins)
-    if key == board.reference:
-        wins = TableCell("reference")
-    mean_rank, p = number(standing.mean_rank, ".2f"), number(standing.p_value, ".3f")
-    rank = TableCell("–", "no better than a static camera") if key in board.no_better else rank_cell(standing)
-    return [rank, success, name, ratio, mean_rank, wins, p]
-
-
-def _mark(board: Board, standing: Standing) -> Emphasis:
-    """Bold for those that may be first, unless that is most of them: then it would say nothing."""
-    first = [s for s in board.standings if s.group is not None and s.group[0] == 1]
-    return "best" if standing in first and 2 * len(first) <= len(board.ranked) else ""
-
-
-def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
-    coverage = float(np.mean([row.coverage for row in runs]))
-    ended = [row for row in runs if not row.failed]
-    origins = " + ".join(f"{count} {origin}" for origin, count in Counter(row.origin for row in runs).items())
-    provenance = runs[0].tracker.provenance
-    masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
-    masks_words = f"{masks} masks" if masks else ""
-    return [
-        TableCell(f"{100 * coverage:.1f} %", value=coverage),
-        speed_cell(ended),
-        number(middle(row.peak_memory_mb for row in ended), ".0f"),
-        TableCell(tag=origins),
-        TableCell(_NAMES.get(provenance, provenance), masks_words, tip=_PROVENANCE.get(provenance, "")),
-    ]
+    return cells | {
+        "#": TableCell("–", "no better than a static camera") if key in board.no_better else rank_cell(standing),
+        "ATE ratio": ratio,
+        "mean rank": number(standing.mean_rank, ".2f"),
+        "wins": TableCell("reference") if key == board.reference else wins,
+        "p": number(standing.p_value, ".3f"),
+    }
 
 
 def timed(runs: Sequence[RunRow]) -> list[RunRow]:
@@ -221,12 +215,8 @@ def rank_cell(standing: Standing) -> TableCell:
 
 def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:
     """A value with its interval, if it has one."""
-    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if _has_interval(interval) else ""
+    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if math.isfinite(interval.low) else ""
     return TableCell(f"{interval.value:{digits}}", small, interval.value, emphasis)
-
-
-def _has_interval(interval: Interval) -> bool:
-    return math.isfinite(interval.low) and math.isfinite(interval.high)
 
 
 def middle(values: Iterable[float | None]) -> float | None:
@@ -257,7 +247,6 @@ def metric_table(
     unit: str = "RMSE, mm",
     text: Callable[[float], str] = mm,
     larger_is_better: bool = False,
-    trackers: Sequence[str] | None = None,
     doubt: Callable[[Cell], str] = lambda cell: "",
 ) -> Table | None:
     """Median of any number of the runs that succeeded, by tracker and sequence; None if no run has it.
@@ -271,10 +260,9 @@ def metric_table(
         unit: What the numbers are, in a word or two.
         text: How the number is written; metres become millimetres by default.
         larger_is_better: Which end is bold.
-        trackers: Variant keys; the board's by default.
         doubt: Why the number of a cell says nothing, empty if it does; such a cell carries `DOUBT` and is never bold.
     """
-    values = medians(board, value, board.trackers if trackers is None else trackers)
+    values = medians(board, value)
     if not values:
         return None
     doubts = {(key, sequence): doubt(board.cells[key][sequence]) for key, sequence in values}
@@ -370,14 +358,14 @@ def common_frames_table(board: Board, common: Values, frames: Mapping[str, str])
     return table
 
 
-def medians(board: Board, value: Value, keys: Sequence[str]) -> dict[tuple[str, str], float]:
+def medians(board: Board, value: Value) -> dict[tuple[str, str], float]:
     """Median of a number over the runs that count and succeeded, by tracker and sequence."""
     of_cell = {}
-    for key in keys:
-        for name, cell in board.cells[key].items():
-            values = [number for row in cell.kept if not row.failed and (number := value(row)) is not None]
-            if values and name in board.sequences:
-                of_cell[key, name] = median(values)
+    for key, cells in board.cells.items():
+        for name, cell in cells.items():
+            middle_value = middle(value(row) for row in cell.kept if not row.failed)
+            if middle_value is not None and name in board.sequences:
+                of_cell[key, name] = middle_value
     return of_cell
 
 
@@ -461,7 +449,6 @@ def final_errors(board: Board, protocol: Protocol) -> Table | None:
         "Error of the final trajectory",
         "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
         f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
-        trackers=[*board.trackers, *board.final_only],
     )
 
 
@@ -744,9 +731,9 @@ def time_table(board: Board) -> Table | None:
     columns: dict[str, Value] = {
         "accuracy (%)": lambda row: None if (share := _share(row)) is None else 100 - share,
         "error (%)": _share,
-        "time (ms)": lambda row: row.frame_ms,
+        "time (ms)": lambda row: None if _share(row) is None else row.frame_ms,
     }
-    measures = {name: medians(board, value, board.trackers) for name, value in columns.items()}
+    measures = {name: medians(board, value) for name, value in columns.items()}
     if not measures["error (%)"]:
         return None
     caption = (
@@ -773,7 +760,7 @@ def _statistics_table(
     board: Board, metrics: Mapping[str, str], name: str, title: str, source: str, brief: str
 ) -> Table | None:
     errors = {
-        kind: medians(board, lambda row, metric=metric: row.metrics.get(metric), board.trackers)  # type: ignore[misc]
+        kind: medians(board, lambda row, metric=metric: row.metrics.get(metric))  # type: ignore[misc]
         for kind, metric in metrics.items()
     }
     if not errors["rmse"]:
