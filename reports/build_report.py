@@ -20,7 +20,7 @@ from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, folded, render, resource
-from dynslam_bench.reports.model.board import Board, On, common_errors, make_board
+from dynslam_bench.reports.model.board import Board, On, common_errors, make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import (
     Loaded,
     OnProgress,
@@ -31,7 +31,6 @@ from dynslam_bench.reports.model.load import (
     without_scale_words,
     worker_pool,
 )
-from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s, records_for, reported_for
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, command_line
 from dynslam_bench.reports.model.statistics import FEWEST, power_note

@@ -29,8 +29,7 @@ from dynslam_bench.reports.figures import COLOURS, significant
 from dynslam_bench.reports.html.page import packed_rows, render_run_page, write_side
 from dynslam_bench.reports.model.board import Board, Cell
 from dynslam_bench.reports.model.load import JOB, run_jobs
-from dynslam_bench.reports.model.missing import run_command
-from dynslam_bench.reports.model.row import SEEN, RunRow, command_line, grouped
+from dynslam_bench.reports.model.row import SEEN, RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.tables.leaderboard import DOUBT, middle, rank_cell, timed
 from dynslam_bench.runs.artifacts import Snapshot, read_snapshots, spread
 from dynslam_bench.runs.exchange.export import open_stored

@@ -19,7 +19,7 @@ from dynslam_bench.evaluation.prepare import common_frames
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores, run_jobs
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
-from dynslam_bench.reports.model.row import RunRow, grouped
+from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
 from dynslam_bench.runs.run_index import part_words
 from dynslam_bench.runs.store import RunStore
@@ -36,6 +36,8 @@ _GROUPS = {"static": "static", "low-dynamic": "low dynamic", "high-dynamic": "hi
 """Tag of a sequence to the name of its group, in their order."""
 _NAMES = (("walking", "high dynamic"), ("sitting", "low dynamic"))
 _OTHER = "other"
+_MOST_MISSING = 8
+"""Trackers whose missing cells are named."""
 
 
 @dataclass
@@ -189,7 +191,7 @@ def make_board(
     for key in board.labels:
         cells = grouped(board.runs(key), board.sequence)
         board.cells[key] = {name: make_cell(runs) for name, runs in cells.items()}
-    board.final_only = [key for key in board.labels if all(row.only_final for row in board.runs(key))]
+    board.final_only = [key for key in board.labels if all(map(_is_final_only, board.runs(key)))]
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
@@ -200,6 +202,11 @@ def make_board(
     board.trackers = sorted(placed, key=lambda key: key in board.hopeless)
     board.ranked = [key for key in board.trackers if key in board.ranked]
     return board
+
+
+def _is_final_only(row: RunRow) -> bool:
+    """Whether an import has nothing of the trajectory that the protocol asks for."""
+    return row.imported and not row.metrics and row.final_ate_m is not None
 
 
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
@@ -371,6 +378,61 @@ def mean_skipped(rows: Sequence[RunRow]) -> float | None:
     shares = [row.epipolar_skipped for row in rows if row.epipolar_skipped is not None]
     return sum(shares) / len(shares) if shares else None
 
+
+# -- the cells that are missing, and the commands that fill them
+
+
+def lacking(board: Board) -> dict[str, list[str]]:
+    """The sequences on which each tracker that could be ranked was not run."""
+    rankable = [key for key in board.trackers if board.is_rankable(key)]
+    lacking = {key: [name for name in board.sequences if name not in board.cells[key]] for key in rankable}
+    return {key: names for key, names in lacking.items() if names}
+
+
+def missing_note(board: Board) -> str:
+    """One paragraph: what the ranking stands on, and what is missing for more; empty where nothing is."""
+    missing = lacking(board)
+    if not missing:
+        return ""
+    common, total = len(board.common), len(board.sequences)
+    left = ", ".join(board.labels[key] for key in board.incomplete)
+    why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
+    cells = []
+    for key, names in list(missing.items())[:_MOST_MISSING]:
+        others = f" and {len(names) - 4} more" if len(names) > 4 else ""
+        cells.append(f"{board.labels[key]} on {', '.join(names[:4])}{others}")
+    if len(missing) > _MOST_MISSING:
+        cells.append(f"and {len(missing) - _MOST_MISSING} more trackers")
+    sentences = {
+        f"The ranking stands on the {common} of {total} sequences that all ranked trackers have.": (
+            board.on == "common" and board.ranked and common < total
+        ),
+        f"Not ranked, since they {why}: {left}.": left,
+        f"Missing cells: {'; '.join(cells)}. The commands that fill them stand at the end of this section.": True,
+    }
+    return " ".join(sentence for sentence, holds in sentences.items() if holds)
+
+
+def missing_commands(board: Board) -> list[str]:
+    """Commands that make the runs of the missing cells of all that can be run here."""
+    commands: list[str] = []
+    plainest = sorted(board.rows, key=lambda row: (row.sequence.noise is not None, row.offset))
+    by_sequence = grouped(plainest, board.sequence)
+    for key, names in lacking(board).items():
+        if board.first(key).imported:
+            continue
+        seeds = sorted({run.seed for run in board.runs(key)})
+        offsets = sorted({run.offset for run in board.runs(key)})
+        repeats = ["--seed", *map(str, seeds)] if seeds != [0] else []
+        repeats += ["--offset", *map(str, offsets)] if offsets != [0] else []
+        others = grouped((by_sequence[name][0] for name in names), lambda row: tuple(part_options(row)))
+        for part, rows in others.items():
+            places = [row.place or row.sequence.id for row in rows]
+            commands.append(command_with(board.first(key), [*places, *part, *repeats]))
+    return commands
+
+
+# -- the rows as a frame
 
 _TEXTS = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
 _TEXTS += ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"]

@@ -17,6 +17,7 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import write_lines
 from dynslam_bench.core.reading import TABLE_BYTES
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.core.toml import setting_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
 from dynslam_bench.evaluation.evaluate import Evaluation
@@ -113,11 +114,6 @@ class RunRow(RunRecord):
     def origin(self) -> str:
         """Whether it was run here or is imported, in words."""
         return "imported" if self.imported else "run here"
-
-    @property
-    def only_final(self) -> bool:
-        """Whether an import has nothing of the trajectory that the protocol asks for."""
-        return self.imported and not self.metrics and self.final_ate_m is not None
 
     @property
     def ranked(self) -> bool:
@@ -357,3 +353,38 @@ def command_line(command: list[str]) -> str:
         return ""
     head = Path(command[0]).name
     return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *command[1:]])
+
+
+def run_command(row: RunRow) -> str:
+    """The command that makes a run again; empty for an imported trajectory."""
+    if row.imported:
+        return ""
+    words = [row.place or row.sequence.id, *part_options(row)]
+    words += ["--seed", str(row.seed)] if row.seed else []
+    words += ["--offset", str(row.offset)] if row.offset else []
+    return command_with(row, words)
+
+
+def command_with(row: RunRow, words: Iterable[str]) -> str:
+    """The command ``run`` with the tracker and the settings of a run; `words` name sequences, part and repeats."""
+    options: dict[str, list[str]] = {
+        "threads": ["--threads", str(row.threads)] if row.threads != 1 else [],
+        "device": ["--device", row.device] if row.device not in ("cpu", "") else [],
+        "map": ["--map", row.start_map.file if row.start_map else ""],
+        "realtime": ["--realtime"],
+        "drop_share": ["--drop", str(row.drop_share)],
+    }
+    settings: list[str] = []
+    for name, value in row.variant.items():
+        if name.startswith("degrade."):
+            settings += ["--degrade", f"{name.removeprefix('degrade.')}={value}"]
+        else:
+            settings += options.get(name, ["--set", f"{name}={setting_text(value)}"])
+    return shlex.join(["dynslam-bench", "run", row.tracker.given or row.tracker.id, *words, *settings])
+
+
+def part_options(row: RunRow) -> list[str]:
+    """Its part of the sequence as options of the command line."""
+    start, stop = row.frames or (0, None)
+    frames = ["--frames", f"{start}:{'' if stop is None else stop}"] if row.frames is not None else []
+    return frames + (["--stride", str(row.stride)] if row.stride != 1 else [])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import zip_longest
 from statistics import median
 
 import numpy as np
@@ -392,19 +393,16 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     marks = column_marks(board, medians)
     rows = []
     for key in board.trackers:
-        cells = [TableCell(board.labels[key], tag="imported" if board.first(key).imported else "")]
-        rows.append(
-            cells + [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
-        )
+        cells = [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
+        rows.append([TableCell(board.labels[key], tag="imported" * board.first(key).imported), *cells])
     rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
     separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
-    for name, tag in dict.fromkeys((cell.system, cell.tag) for cell in reported):
-        by_sequence: dict[str, ReportedCell] = {}
-        for cell in reported:
-            if (cell.system, cell.tag) == (name, tag):
-                by_sequence.setdefault(cell.sequence, cell)
-        line = [by_sequence.get(sequence) for sequence in board.sequences]
-        cells = [TableCell(mm(cell.value), value=cell.value, tip=cell.source) if cell else TableCell() for cell in line]
+    lines: dict[tuple[str, str], dict[str, ReportedCell]] = {}
+    for published in reported:
+        lines.setdefault((published.system, published.tag), {}).setdefault(published.sequence, published)
+    for (name, tag), line in lines.items():
+        printed = [line.get(sequence) for sequence in board.sequences]
+        cells = [TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell() for p in printed]
         rows.append([TableCell(name, tag=tag), *cells])
     muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
     caption = (
@@ -425,19 +423,15 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     columns = [*texts("tracker"), *sequence_columns(board)]
     if any(row.seen_in_training for row in board.rows):
         columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
-        keys = [*board.trackers, *[None] * (len(rows) - len(board.trackers))]
-        rows = [[*row, TableCell(_trained_on(board, key))] for key, row in zip(keys, rows, strict=True)]
+        for key, row in zip_longest(board.trackers, rows):
+            cells_of = board.cells.get(key, {})
+            trained = [name for name in board.sequences if name in cells_of and cells_of[name].in_training]
+            row.append(TableCell(", ".join(board.short[name] for name in trained)))
         caption += f" {SEEN_NOTE}"
     brief = "Absolute trajectory error (RMSE, mm), lost frames held"
     return Table(
         "per_sequence", "Absolute trajectory error by sequence (mm)", caption, columns, rows, muted, separators, brief
     )
-
-
-def _trained_on(board: Board, key: str | None) -> str:
-    """The sequences on which the masks of a tracker were trained; empty for no tracker."""
-    cells = {} if key is None else board.cells[key]
-    return ", ".join(board.short[name] for name in board.sequences if name in cells and cells[name].in_training)
 
 
 def final_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -527,14 +521,15 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
     if not cell.success:
         tip = f"counts as {mm(cell.median)} mm, {coverage}"
         return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
-    notes = [_spread(cell), count, skipped_words(cell)]
-    if board.no_better_than_static(key, sequence):
-        notes.append("no better than a static camera")
-    if cell.failed:
-        notes.append(f"{cell.success}/{len(cell.rows)} succeeded")
+    notes = [
+        _spread(cell),
+        count,
+        skipped_words(cell),
+        "no better than a static camera" * board.no_better_than_static(key, sequence),
+        f"{cell.success}/{len(cell.rows)} succeeded" if cell.failed else "",
+    ]
     base = board.reference_median(sequence)
-    colour = None
-    tip = coverage
+    colour, tip = None, coverage
     if base is not None and cell.in_training:
         tip = SEEN_NOTE
     elif base is not None:
@@ -583,17 +578,15 @@ def failure_rule_table(board: Board) -> Table | None:
         "lost frames left out": _tracked_error,
         "failures left out too": lambda row: None if row.failed else _tracked_error(row),
     }
-    by_rule = [{s.key: s for s in rank(board, board.ranked, board.ranked, rule)} for rule in rules.values()]
     columns = [*texts("tracker"), *(column for name in rules for column in numbers("#", "ATE ratio", group=name))]
-    rows = []
-    for key in board.ranked:
-        cells = [TableCell(board.labels[key])]
-        for standings in by_rule:
+    rows = [[TableCell(board.labels[key])] for key in board.ranked]
+    for rule in rules.values():
+        standings = {standing.key: standing for standing in rank(board, board.ranked, board.ranked, rule)}
+        for key, cells in zip(board.ranked, rows, strict=True):
             if key in standings:
                 cells += [rank_cell(standings[key]), interval_cell(standings[key].ratio, ".2f")]
             else:
                 cells += [TableCell(), TableCell()]
-        rows.append(cells)
     caption = (
         "The same runs under three rules. Lost frames held: the report's rule, a lost frame counts as not having moved "
         "since the last tracked one. Lost frames left out: the error of the tracked frames only, which is what most "
@@ -619,10 +612,6 @@ def failures(board: Board) -> Table | None:
     failed = [row for row in board.rows if row.failed]
     if not failed:
         return None
-
-    def order(row: RunRow) -> tuple[object, ...]:
-        return board.labels[row.variant_key], board.sequence(row), row.repeat_key
-
     columns = [*texts("tracker", "sequence", "repeat", "ended"), Column("coverage"), *texts("reason", "run")]
     rows = [
         [
@@ -634,7 +623,7 @@ def failures(board: Board) -> Table | None:
             TableCell(row.reason),
             TableCell(row.run_id, link=run_link(row)),
         ]
-        for row in sorted(failed, key=order)
+        for row in sorted(failed, key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key))
     ]
     caption = "Runs that crashed, took too long or too much, broke their contract, were lost, or cannot be evaluated."
     return Table("failures", "Failures", caption, columns, rows)

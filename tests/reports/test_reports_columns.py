@@ -4,10 +4,10 @@ from reports_fake_store import add_run
 from reports_rows import PROTOCOL, row, rows_of
 
 from dynslam_bench.reports import build_report, compare
-from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.board import make_board, missing_commands
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.reports.model.missing import missing_commands, run_command
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.reports.model.row import run_command
 from dynslam_bench.runs.store import RunStore
 
 

@@ -11,12 +11,10 @@ from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
 from dynslam_bench.reports.html.explore import Pages
-from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.board import make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
-from dynslam_bench.reports.tables.leaderboard import per_sequence, relative_errors
-from dynslam_bench.reports.tables.leaderboard import leaderboard
+from dynslam_bench.reports.tables.leaderboard import leaderboard, per_sequence, relative_errors
 from dynslam_bench.reports.tables.table import mm, percent
 from dynslam_bench.runs.store import RunStore
 
