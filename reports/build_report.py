@@ -19,7 +19,7 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
-from dynslam_bench.reports.html.page import Block, Section, figure_blocks, folded, render, resource
+from dynslam_bench.reports.html.page import Block, Section, figure_blocks, render, resource, table_blocks
 from dynslam_bench.reports.model.board import Board, On, common_errors, make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import (
     Loaded,
@@ -35,7 +35,7 @@ from dynslam_bench.reports.model.published import is_excerpt, least_length_s, re
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, command_line
 from dynslam_bench.reports.model.statistics import FEWEST, power_note
 from dynslam_bench.reports.tables import leaderboard as tables
-from dynslam_bench.reports.tables.table import Table, csv_text, prose, significant_text, to_latex, to_markdown
+from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
 from dynslam_bench.runs.run_index import part_words
 from dynslam_bench.runs.store import RunStore
 
@@ -283,15 +283,16 @@ def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> S
     table_of_errors = tables.per_sequence(board, protocol, published)
     section.blocks.append(Block("table", "Absolute trajectory error", table_of_errors))
     common, frames = common_errors(board, protocol, pool)
-    section.blocks += folded(tables.common_frames_table(board, common, frames))
-    if protocol.trajectory == "online":
-        section.blocks += folded(tables.final_errors(board, protocol))
-    if any(row.coverage < 1 and not row.failed for row in board.rows):
-        section.blocks += folded(tables.tracked_errors(board, protocol))
-    section.blocks += folded(tables.failure_rule_table(board))
-    for table in tables.relative_errors(board, protocol):
-        section.blocks += folded(table)
-    section.blocks += folded(tables.rotation_errors(board, protocol))
+    lost = any(row.coverage < 1 and not row.failed for row in board.rows)
+    section.blocks += table_blocks(
+        tables.common_frames_table(board, common, frames),
+        tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
+        tables.tracked_errors(board, protocol) if lost else None,
+        tables.failure_rule_table(board),
+        *tables.relative_errors(board, protocol),
+        tables.rotation_errors(board, protocol),
+        folded=True,
+    )
     return section
 
 
@@ -320,13 +321,10 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
 
 def repeatability_section(board: Board) -> Section:
     """How far the runs of a cell lie apart."""
-    section = Section("repeatability", "Repeatability", "Repeatability")
-    table = tables.repeatability(board)
-    if table is not None:
-        caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
-        section.blocks += figure_blocks("repeat", figures.repeat_figure(board), caption + thinned_note(board))
-        section.blocks.append(Block("table", table=table))
-    return section
+    caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
+    blocks = figure_blocks("repeat", figures.repeat_figure(board), caption + thinned_note(board))
+    blocks += table_blocks(tables.repeatability(board))
+    return Section("repeatability", "Repeatability", "Repeatability", blocks=blocks)
 
 
 def thinned_note(board: Board) -> str:
@@ -339,29 +337,15 @@ def thinned_note(board: Board) -> str:
 
 def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
-    section = Section("masks", "Mask quality and pose error", "Masks")
-    section.blocks += figure_blocks("masks", figures.mask_figure(board), "One point a run." + thinned_note(board))
-    table = tables.metric_table(
-        board,
-        lambda row: row.mask_iou,
-        "mask_iou",
-        "Mask quality",
-        "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
-        unit="IoU",
-        text=significant_text,
-        larger_is_better=True,
-    )
-    if table is not None:
-        section.blocks.append(Block("table", table=table))
-    return section
+    blocks = figure_blocks("masks", figures.mask_figure(board), "One point a run." + thinned_note(board))
+    blocks += table_blocks(tables.mask_quality(board))
+    return Section("masks", "Mask quality and pose error", "Masks", blocks=blocks)
 
 
 def failures_section(board: Board) -> Section:
     """Every run that failed, or that none did."""
-    table = tables.failures(board)
-    nothing = Block("list", entries=[f"None of {len(board.rows)} runs failed."])
-    block = nothing if table is None else Block("table", table=table)
-    return Section("failures", "Failures", "Failures", blocks=[block])
+    nothing = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
+    return Section("failures", "Failures", "Failures", blocks=table_blocks(tables.failures(board)) or nothing)
 
 
 def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
@@ -373,15 +357,15 @@ def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
     section.blocks.append(
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
     )
-    if loaded.unreadable:
-        entries = first_of(loaded.unreadable, _MOST_NOTES, "... and {} more, which `runs list` names")
-        section.blocks.append(Block(kind="list", title="Left out: no valid record", entries=entries, folded=True))
     notes = [
         f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
     ]
-    if notes:
-        entries = first_of(notes, _MOST_NOTES, "... and {} more on the pages of the runs")
-        section.blocks.append(Block(kind="list", title="Diagnostics", entries=entries, folded=True))
+    for title, entries, others in (
+        ("Left out: no valid record", loaded.unreadable, "... and {} more, which `runs list` names"),
+        ("Diagnostics", notes, "... and {} more on the pages of the runs"),
+    ):
+        if entries:
+            section.blocks.append(Block("list", title, entries=first_of(entries, _MOST_NOTES, others), folded=True))
     return section
 
 
@@ -393,9 +377,12 @@ def first_of(entries: list[str], most: int, others: str) -> list[str]:
 def paper_section(board: Board, protocol: Protocol) -> Section:
     """Tables 1 to 3 and Figures 9 to 12, as the paper lays them out."""
     section = Section("paper", "As in the paper: four statistics of the errors, and time", "As in the paper")
-    section.blocks += folded(tables.absolute_table(board, protocol))
-    section.blocks += folded(tables.relative_table(board, protocol))
-    section.blocks += folded(tables.time_table(board))
+    section.blocks += table_blocks(
+        tables.absolute_table(board, protocol),
+        tables.relative_table(board, protocol),
+        tables.time_table(board),
+        folded=True,
+    )
     for statistic, number in figures.FIGURES.items():
         figure = figures.bar_figure(board, statistic)
         lost = figure is not None and any(tables.LOST_MARK in trace["text"] for trace in figure["data"])

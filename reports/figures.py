@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import textwrap
 from collections.abc import Sequence
 from statistics import median
 from typing import Any, TypeVar
@@ -85,10 +86,10 @@ def log_axis(title: str, values: Sequence[float]) -> dict[str, Any]:
 
 def guide(x: float | None = None, y: float | None = None) -> dict[str, Any]:
     """A dashed line across the figure at one value."""
-    style = {"type": "line", "layer": "below", "line": {"color": "#9ca3af", "width": 1, "dash": "dash"}}
-    if x is not None:
-        return style | {"x0": x, "x1": x, "xref": "x", "y0": 0, "y1": 1, "yref": "paper"}
-    return style | {"y0": y, "y1": y, "yref": "y", "x0": 0, "x1": 1, "xref": "paper"}
+    place: dict[str, Any] = {"x0": x, "x1": x, "xref": "x", "y0": 0, "y1": 1, "yref": "paper"}
+    if x is None:
+        place = {"y0": y, "y1": y, "yref": "y", "x0": 0, "x1": 1, "xref": "paper"}
+    return {"type": "line", "layer": "below", "line": {"color": "#9ca3af", "width": 1, "dash": "dash"}} | place
 
 
 def significant(value: float | None, digits: int = 5) -> float | None:
@@ -106,15 +107,10 @@ def safe(text: str) -> str:
     return html.escape(text, quote=False)
 
 
-def wrapped(text: str, width: int = 34) -> str:
-    """A label broken into lines at blanks."""
-    lines = [""]
-    for word in text.split():
-        if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
-            lines.append(word)
-        else:
-            lines[-1] = f"{lines[-1]} {word}".strip()
-    return "<br>".join(safe(line) for line in lines)
+def wrapped(text: str) -> str:
+    """A label broken into lines of 34 characters at blanks."""
+    lines = textwrap.wrap(text, 34, break_long_words=False, break_on_hyphens=False)
+    return "<br>".join(map(safe, lines))
 
 
 # The report's figures as plotly-like specifications (plain data and layout), drawn by the page itself.

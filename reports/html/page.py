@@ -81,9 +81,9 @@ class Section:
     blocks: list[Block] = field(default_factory=list)
 
 
-def folded(table: Table | None) -> list[Block]:
-    """A block that shows a table behind its own title, closed at first; none for no table."""
-    return [] if table is None else [Block("table", table.title, table, folded=True)]
+def table_blocks(*tables: Table | None, folded: bool = False) -> list[Block]:
+    """Blocks that show the tables that there are; folded ones are closed at first, behind their titles."""
+    return [Block("table", t.title if folded else "", t, folded=folded) for t in tables if t is not None]
 
 
 def figure_blocks(name: str, chart: Figure | None, caption: str = "") -> list[Block]:

@@ -328,8 +328,6 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
     if isinstance(runs, RunStore):
         return [runs]
     folders = [Path(runs)] if isinstance(runs, str | Path) else [Path(path) for path in runs]
-    if not folders:
-        raise ReportError("no results folder was given", "for example results")
     stores = []
     for folder in folders:
         root = folder.expanduser()

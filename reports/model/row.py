@@ -205,14 +205,13 @@ class RunRow(RunRecord):
     @property
     def machine_words(self) -> str:
         """Computer and versions in words."""
-        parts = []
-        if self.machine is not None:
-            machine = self.machine
-            parts.append(f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}")
-            parts += [machine.gpu] if machine.gpu else []
-        parts += [f"{name} {version}" for name, version in self.versions.items()]
-        if self.git is not None:
-            parts.append(f"git {self.git.revision[:10]}{' (changed)' if self.git.dirty else ''}")
+        machine, git = self.machine, self.git
+        parts = [f"{name} {version}" for name, version in self.versions.items()]
+        if machine is not None:
+            hardware = f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}"
+            parts = [hardware, *filter(None, [machine.gpu]), *parts]
+        if git is not None:
+            parts.append(f"git {git.revision[:10]}{' (changed)' if git.dirty else ''}")
         return "; ".join(parts)
 
 
@@ -296,20 +295,17 @@ def _outcome(
             return {}
         reason = record.reason or scored.reasons.get(protocol.trajectory, "it cannot be evaluated")
         return {"not_evaluated": True, "reason": reason}
-    n_tracked = evaluation.n_tracked
+    n_tracked, frames_due = evaluation.n_tracked, record.n_frames - record.n_dropped
     if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:
         return {}
     outcome: dict[str, Any] = {}
     if evaluation.coverage is not None:
         outcome = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
-    frames_due = record.n_frames - record.n_dropped
-    if record.failed or not n_tracked:
-        return outcome
-    if n_tracked < LOST_COVERAGE * frames_due:
-        reason = f"the final trajectory has poses of {n_tracked} of {frames_due} frames"
-        return outcome | {"status": "lost", "reason": reason}
-    if n_tracked >= frames_due:  # frames that were lost online were found later
-        return outcome | {"status": "ok", "reason": ""}
+    if n_tracked and not record.failed and n_tracked < LOST_COVERAGE * frames_due:
+        outcome["status"] = "lost"
+        outcome["reason"] = f"the final trajectory has poses of {n_tracked} of {frames_due} frames"
+    elif n_tracked and not record.failed and n_tracked >= frames_due:  # frames lost online were found later
+        outcome |= {"status": "ok", "reason": ""}
     return outcome
 
 

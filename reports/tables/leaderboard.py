@@ -504,6 +504,20 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
     )
 
 
+def mask_quality(board: Board) -> Table | None:
+    """Overlap of the trackers' masks with the exact ones, of the trackers that have masks."""
+    return metric_table(
+        board,
+        lambda row: row.mask_iou,
+        "mask_iou",
+        "Mask quality",
+        "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
+        unit="IoU",
+        text=significant_text,
+        larger_is_better=True,
+    )
+
+
 def _rotation_doubt(cell: Cell) -> str:
     """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
     uncertain = [row for row in cell.kept if not row.failed and not row.rotation_reliable]
@@ -654,16 +668,18 @@ def repeatability(board: Board) -> Table | None:
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
     """How far the runs of a tracker lie apart; empty if it has no cell with several."""
     cells = {name: board.cells[key][name] for name in board.sequences if name in board.cells[key]}
-    scores = {name: [row.score_m or 0.0 for row in cell.succeeded] for name, cell in cells.items()}
-    several = {name: errors for name, errors in scores.items() if len(errors) > 1}
     copies = sum(cell.deterministic and cell.success > 1 for cell in cells.values())
+    several = {name: cell for name, cell in cells.items() if len(cell.succeeded) > 1}
     counts = [TableCell(board.labels[key]), number(len(several)), number(copies)]
     if not several:
         return [*counts, *[TableCell()] * 4] if copies else []
-    spreads = {name: max(errors) / max(min(errors), FLOOR_M) for name, errors in several.items()}
-    where, worst = max(spreads.items(), key=lambda item: (item[1], item[0]))
-    size = f"{median(len(errors) for errors in several.values()):g}"
-    ratios = [number(median(spreads.values()), ".2f"), number(worst, ".2f")]
+    spreads = {}
+    for name, cell in several.items():
+        errors = [row.score_m or 0.0 for row in cell.succeeded]
+        spreads[name] = max(errors) / max(min(errors), FLOOR_M)
+    where = max(spreads, key=lambda name: (spreads[name], name))
+    size = f"{median(len(cell.succeeded) for cell in several.values()):g}"
+    ratios = [number(median(spreads.values()), ".2f"), number(spreads[where], ".2f")]
     return [*counts, TableCell(size), *ratios, TableCell(where)]
 
 
