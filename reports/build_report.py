@@ -311,8 +311,8 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
             for key, row in board.typical_runs(sequence).items()
         ]
         if tracks:
-            small = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
-            blocks.append(Block("tracks", summary=sequence, small=small, tracks=tracks, open=not blocks))
+            words = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
+            blocks.append(Block("tracks", sequence, caption=words, tracks=tracks, folded=bool(blocks)))
     return Section(
         "trajectories", "Trajectories and error over time", "Trajectories",
         blocks=[Block("caption", text=caption), *blocks] if blocks else [],

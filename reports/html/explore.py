@@ -123,18 +123,12 @@ def write_explore(
         for first in range(0, len(rows), JOB):
             some = rows[first : first + JOB]
             jobs.append((some, shown, shares[column], protocol, output, deadline, most_frames))
-    done = 0
-
-    def on_answer(answer: tuple[list[RunPage], Counter[str]]) -> None:
-        nonlocal done
-        done += len(answer[0])
-        progress(done, len(paged))
-
     pages: list[RunPage] = []
     missing: Counter[str] = Counter()
-    for written, undrawn in run_jobs(pool, _write_pages, jobs, on_answer):
+    for written, undrawn in run_jobs(pool, _write_pages, jobs):
         pages += written
         missing += undrawn
+        progress(len(pages), len(paged))
     pageless = _pageless(len(paged), len(board.rows))
     write_side(output, "explore", _explore_content(board, protocol, pages, pageless))
     write_atomic(output / RUN_PAGE, render_run_page(title))

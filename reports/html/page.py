@@ -33,18 +33,15 @@ class Block:
 
     Attributes:
         kind: Which of the other attributes count.
-        title: Heading above it.
+        title: Heading above it, or what is seen of it when it is closed.
         table: For ``table``.
         figure: Id of the figure, for ``figure``.
         chart: Its specification.
-        caption: Below the figure.
+        caption: Below the figure, or behind the title of ``tracks``.
         text: For ``code``.
         entries: For ``list``.
-        summary: For ``tracks``: what is seen when it is closed.
-        small: Behind the summary.
-        open: Whether it is open at first.
         tracks: For ``tracks``: the runs to draw, each with its name and colour and whether it is shown at first.
-        folded: Whether a table or list is closed at first, behind its title.
+        folded: Whether a table, a list or tracks are closed at first, behind their title.
     """
 
     kind: Literal["table", "figure", "code", "list", "caption", "tracks", "explore"]
@@ -55,9 +52,6 @@ class Block:
     caption: str = ""
     text: str = ""
     entries: list[str] = field(default_factory=list)
-    summary: str = ""
-    small: str = ""
-    open: bool = False
     tracks: list[dict[str, Any]] = field(default_factory=list)
     folded: bool = False
 

@@ -434,14 +434,19 @@ def missing_commands(board: Board) -> list[str]:
 
 # -- the rows as a frame
 
-_TEXTS = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
-_TEXTS += ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
-_KINDS = dict.fromkeys(_TEXTS, "string")
-_KINDS |= dict.fromkeys(["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"], "Int64")
-_KINDS |= dict.fromkeys(["ranked", "failed", "cached", "seen_in_training"], "boolean")
-_NUMBERS = ["coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"]
-_NUMBERS += ["real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
-_KINDS |= dict.fromkeys(_NUMBERS, "Float64")
+_COLUMNS = {
+    "string": (
+        *("run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"),
+        *("repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"),
+    ),
+    "Int64": ("seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"),
+    "boolean": ("ranked", "failed", "cached", "seen_in_training"),
+    "Float64": (
+        *("coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"),
+        *("real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"),
+    ),
+}
+"""Type of a column to the names."""
 
 
 def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
@@ -471,8 +476,8 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     import pandas as pd
 
     ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
-    metrics = sorted({name for row in rows for name in row.metrics} - set(_NUMBERS))
-    kinds = _KINDS | dict.fromkeys(metrics, "Float64")
+    metrics = sorted({name for row in rows for name in row.metrics} - set(_COLUMNS["Float64"]))
+    kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(metrics, "Float64")
     lines = []
     for row in ordered:
         values: dict[str, Any] = {
@@ -555,7 +560,7 @@ def common_errors(
     Of more than `MOST_COMPARED` runs on a sequence these are the runs of each tracker around its median error.
     """
     jobs = [(compared_runs(board, sequence), protocol) for sequence in board.sequences]
-    answers = run_jobs(pool, _common_of, jobs, lambda _: None)
+    answers = run_jobs(pool, _common_of, jobs)
     errors: dict[tuple[str, str], float] = {}
     frames: dict[str, str] = {}
     for sequence, (medians, words) in zip(board.sequences, answers, strict=True):

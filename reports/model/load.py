@@ -74,37 +74,30 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def run_jobs(
-    pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]], on_answer: Callable[[T], None]
-) -> list[T]:
+def run_jobs(pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]) -> Iterator[T]:
     """Call a function once a job, in worker processes or here.
 
     Args:
         pool: The workers; None to call it here.
         function: A function of a module.
         jobs: Its arguments.
-        on_answer: Called with every answer, in the order of the jobs.
 
-    Returns:
-        The answers in the order of the jobs.
+    Yields:
+        The answers in the order of the jobs, each as soon as it is there.
 
     Raises:
         DynslamError: A job cannot be done.
         InfrastructureError: A worker has died.
     """
     if pool is None:
-        running: Iterator[T] = starmap(function, jobs)
-    else:
-        with _without_main():
-            running = pool.map(function, *zip(*jobs, strict=True))
-    answers = []
+        yield from starmap(function, jobs)
+        return
+    with _without_main():
+        answers = pool.map(function, *zip(*jobs, strict=True))
     try:
-        for answer in running:
-            on_answer(answer)
-            answers.append(answer)
+        yield from answers
     except BrokenProcessPool as error:
         raise InfrastructureError(f"a worker process of the report ended early: {error}") from error
-    return answers
 
 
 @contextmanager
@@ -246,19 +239,14 @@ def _all_rows(
     unread = [run_id for run_id in store.ids() if run_id not in rows]
     size = 1 if pool is None else JOB
     jobs = [(store, protocol, unread[first : first + size]) for first in range(0, len(unread), size)]
-    done = 0
-
-    def on_answer(answer: Scored) -> None:
-        nonlocal done
-        new_rows, unreadable = answer
-        done += len(new_rows) + len(unreadable)
-        last = f"scoring {new_rows[-1][0].tracker.id} on {new_rows[-1][0].sequence.id}" if new_rows else ""
-        on_progress(done, len(unread), last)
-
     scored: list[tuple[RunRow, str]] = []
-    for new_rows, unreadable in run_jobs(pool, _score_runs, jobs, on_answer):
+    done = 0
+    for new_rows, unreadable in run_jobs(pool, _score_runs, jobs):
         scored += new_rows
         loaded.unreadable += unreadable
+        done += len(new_rows) + len(unreadable)
+        last = f"scoring {scored[-1][0].tracker.id} on {scored[-1][0].sequence.id}" if new_rows else ""
+        on_progress(done, len(unread), last)
     _keep_rows(store, protocol, scored)
     return [*rows.values(), *(row for row, _ in scored)]
 
