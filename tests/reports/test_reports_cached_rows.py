@@ -59,10 +59,11 @@ def test_unchanged_runs_are_not_read_and_rows_are_equal(store, tmp_path, reads):
     kept = rows_of(store)
     assert reads == [] and kept[1] == 1 and len(kept[0]) == len(store.ids()) - 1
     store.root.rename(tmp_path / "moved")
-    moved = load_runs([RunStore(tmp_path / "moved")], PROTOCOL).rows
-    assert reads == [] and all(row.folder.is_dir() and row.estimate(row.trajectory) for row in moved)
-    index_of(moved[0]._store).unlink()
-    assert rows_of(moved[0]._store) == kept and sorted(reads) == moved[0]._store.ids()
+    moved = RunStore(tmp_path / "moved")
+    rows = load_runs([moved], PROTOCOL).rows
+    assert reads == [] and all(row.folder.is_dir() and row.estimate(row.trajectory) for row in rows)
+    index_of(moved).unlink()
+    assert rows_of(moved) == kept and sorted(reads) == moved.ids()
 
 
 def edited(store, run):

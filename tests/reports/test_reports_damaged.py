@@ -7,7 +7,7 @@ from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report
 from dynslam_bench.reports.figures import log_axis, mask_figure, repeat_figure
-from dynslam_bench.reports.html.run_page import exact_shares
+from dynslam_bench.reports.html.explore import exact_shares
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables.leaderboard import repeatability
