@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 from reports_browser import needs_browser
-from reports_fake_store import add_run, fill
-from test_reports_browser import add_frames, browser, open_page, report, run_of
+from reports_fake_store import add_frames, add_run, fill
+from test_reports_browser import browser, open_page, report, run_of
 
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs.store import RunStore

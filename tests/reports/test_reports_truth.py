@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import add_run
+from reports_fake_store import add_frames, add_run
 from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
-from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
 from dynslam_bench.reports.html.explore import RunPage, error_by_share
