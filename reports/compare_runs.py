@@ -19,7 +19,7 @@ from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, ratio_interval
 from dynslam_bench.reports.tables.leaderboard import interval_cell
-from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts, to_markdown
+from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
 from dynslam_bench.runs.store import RunStore
 
 
@@ -42,10 +42,6 @@ class Comparison:
     only_a: int
     only_b: int
     differences: dict[str, list[str]]
-
-    def to_markdown(self) -> str:
-        """The comparison as Markdown."""
-        return to_markdown(self.table)
 
 
 def compare(

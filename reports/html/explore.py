@@ -63,14 +63,16 @@ class RunPage:
     """What the exploring table needs of a run whose page was written.
 
     Attributes:
-        row: The run.
+        run_id: The run.
+        variant_key: Its tracker and settings.
         pictured: Whether pictures of its frames are shown.
         quantiles_mm: The 5, 25, 50, 75 and 95 % quantiles of its frame-to-frame errors; empty for none.
         share: Share of dynamic pixels ``[N]`` of its frames, of a successful run where exact masks tell it.
         errors_m: Frame-to-frame translational errors ``[N]`` of these frames.
     """
 
-    row: RunRow
+    run_id: str
+    variant_key: str
     pictured: bool
     quantiles_mm: list[float | None]
     share: Array
@@ -200,7 +202,9 @@ def _write_pages(
         quantiles = 1000 * np.percentile(frames.errors_m[finite], [5, 25, 50, 75, 95]) if finite.any() else np.zeros(0)
         told = finite & np.isfinite(frames.share) & (frames.share_source == EXACT) & (not row.failed)
         quantiles_mm = [significant(value, 4) for value in quantiles.tolist()]
-        pages.append(RunPage(row, pictured, quantiles_mm, frames.share[told], frames.errors_m[told]))
+        pages.append(
+            RunPage(row.run_id, row.variant_key, pictured, quantiles_mm, frames.share[told], frames.errors_m[told])
+        )
     return pages, pictures.missing
 
 
@@ -229,7 +233,7 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
     names = [*board.sequences, *board.unscored]
     column = {name: at for at, name in enumerate(names)}
     metrics = _metrics(protocol)
-    page_of = {page.row.run_id: page for page in pages}
+    page_of = {page.run_id: page for page in pages}
     kept = {row.run_id for cells in board.cells.values() for cell in cells.values() for row in cell.kept}
     first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
     listed = board.rows  # a page of a hundred thousand would open slowly, and nobody reads them
@@ -245,7 +249,7 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
     tags: dict[str, set[str]] = {}
     for row in board.rows:
         tags.setdefault(board.sequence(row), set()).update(row.sequence.tags)
-    by_tracker = grouped(pages, lambda page: page.row.variant_key)
+    by_tracker = grouped(pages, lambda page: page.variant_key)
     by_share = {place[key]: error_by_share(by_tracker.get(key, [])) for key in keys}
     return {
         "protocol": protocol.describe(),

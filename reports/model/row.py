@@ -28,6 +28,7 @@ from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
 K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
 Which = Literal["online", "final"]
 """Which of a run's two trajectories."""
 SEEN = "§"
@@ -215,9 +216,9 @@ class RunRow(RunRecord):
         return "; ".join(parts)
 
 
-def grouped(rows: Iterable[RunRow], key: Callable[[RunRow], K]) -> dict[K, list[RunRow]]:
-    """Rows by a key, in their order."""
-    groups: dict[K, list[RunRow]] = {}
+def grouped(rows: Iterable[V], key: Callable[[V], K]) -> dict[K, list[V]]:
+    """Rows, or other things, by a key, in their order."""
+    groups: dict[K, list[V]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)
     return groups

@@ -5,17 +5,16 @@ import re
 from itertools import product
 
 import numpy as np
+import pandas as pd
 import pytest
-from reports_fake_store import add_run, truth_of
+from reports_fake_store import add_run
 from reports_rows import page_data, rows_of
 
 from dynslam_bench.core.errors import ReportError
-from dynslam_bench.evaluation import evaluate
-from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.html.explore import broken
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.load import check_one_protocol, load_runs
+from dynslam_bench.reports.model.load import check_one_protocol
 from dynslam_bench.runs.store import RunStore
 
 
@@ -46,49 +45,26 @@ def test_every_run_has_its_side_file_and_a_cell_that_leads_to_it(made):
 def test_the_leaderboard_orders_and_compares(made):
     _, paths = made
     board = rows_of(paths.csv["leaderboard"])
-    assert [row["tracker"] for row in board[:4]] == [
-        "DynaSLAM N+G (our back end)",
-        "Mask R-CNN (our back end)",
-        "DS-SLAM (our back end)",
-        "ORB-SLAM2 (our back end)",
-    ]
+    ranked = [row["tracker"].removesuffix(" (our back end)") for row in board[:4]]
+    assert ranked == ["DynaSLAM N+G", "Mask R-CNN", "DS-SLAM", "ORB-SLAM2"] and float(board[3]["ATE ratio"]) == 1.0
     assert {row["#"] for row in board[:4]} == {"1–4 not separable"}  # four sequences tell nobody apart
-    assert {row["tracker"] for row in board[4:]} == {"ORB-SLAM3", "constant velocity"}
-    assert all(row["#"] == "–" for row in board[4:])
-    assert float(board[3]["ATE ratio"]) == 1.0
-    medians = {row["tracker"]: row for row in rows_of(paths.csv["per_sequence"])}
-    names = [name for name in medians["ORB-SLAM2 (our back end)"] if "synthetic" in name]
-    ratios = [
-        float(medians["DynaSLAM N+G (our back end)"][n]) / float(medians["ORB-SLAM2 (our back end)"][n]) for n in names
-    ]
-    assert float(board[0]["ATE ratio"]) == pytest.approx(np.exp(np.mean(np.log(ratios))))
-
-
-def test_numbers_are_those_of_the_evaluation(made):
-    store, paths = made
-    lines = rows_of(paths.csv["runs"])[::7]
-    assert lines
-    for line in lines:
-        metrics = evaluate(store.trajectory(line["run_id"]), truth_of(line["sequence"])).metrics
-        assert float(line["ate_rmse_m"]) == pytest.approx(metrics["ate_rmse_m"], rel=1e-6)
+    assert {row["tracker"]: row["#"] for row in board[4:]} == {"ORB-SLAM3": "–", "constant velocity": "–"}
+    medians = pd.read_csv(paths.csv["per_sequence"], index_col="tracker").filter(like="synthetic")
+    best, reference = (medians.loc[f"{name} (our back end)"] for name in ("DynaSLAM N+G", "ORB-SLAM2"))
+    assert float(board[0]["ATE ratio"]) == pytest.approx(np.exp(np.log(best / reference).mean()))
 
 
 def test_failures_are_rows_and_count_as_not_moving(made):
     store, paths = made
     (failed,) = rows_of(paths.csv["failures"])
-    assert failed["ended"] == "crashed at 30/120"
-    assert failed["reason"] == "RuntimeError: the map is empty"
-    runs = {row["run_id"]: row for row in rows_of(paths.csv["runs"])}
-    row = runs[failed["run"]]
+    assert (failed["ended"], failed["reason"]) == ("crashed at 30/120", "RuntimeError: the map is empty")
+    (row,) = (row for row in rows_of(paths.csv["runs"]) if row["run_id"] == failed["run"])
     assert float(row["score_m"]) == float(row["static_camera_ate_rmse_m"]) != float(row["ate_rmse_m"])
-    text = paths.html.read_text()
-    assert f'href="run.html#{failed["run"]}"' in text
+    assert f'href="run.html#{failed["run"]}"' in paths.html.read_text()
     page = page_data(paths.html.parent, f"run-{failed['run']}")
     assert page["log"] == (store.folder(failed["run"]) / "log.txt").read_text() == "a log\n"
     markdown = paths.markdown.read_text()
-    assert "2/3 succeeded" in markdown
-    assert "(3 unless n says otherwise)" in markdown
-    assert "counts as a static camera, or worse (1 of 61 runs)" in markdown
+    assert "2/3 succeeded" in markdown and "counts as a static camera, or worse (1 of 61 runs)" in markdown
 
 
 def test_a_report_can_be_made_again_under_another_protocol(made, tmp_path):
@@ -129,17 +105,6 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     assert ReportData.read(paths.data).reference == "static camera (from ground truth)"
     board = rows_of(paths.csv["leaderboard"])
     assert float(board[0]["ATE ratio"]) < 0.2
-
-
-def test_only_the_newest_of_equal_runs_counts(tmp_path):
-    store = RunStore(tmp_path / "r")
-    add_run(store, "a", "s/a", error=0.3, started="2026-01-01T00:00:00+00:00")
-    new = add_run(store, "a", "s/a", error=0.01, started="2026-02-01T00:00:00+00:00")
-    loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
-    assert [row.run_id for row in loaded.rows] == [new]
-    assert loaded.superseded == 1
-    paths = build_report(store, tmp_path / "report")
-    assert "Left out: 1 older runs" in paths.markdown.read_text()
 
 
 def test_small_and_odd_results(tmp_path):
@@ -185,17 +150,14 @@ def test_what_cannot_be_reported_is_one_clear_line(tmp_path, file, text):
 
 def test_published_numbers_stand_apart_and_never_compete(tmp_path):
     store = RunStore(tmp_path / "r")
-    for seed in (0, 1):
-        add_run(store, "orb-slam2", "tum/fr3/walking_xyz", seed, duration_s=28.8)
-        add_run(store, "dynaslam", "tum/fr3/walking_xyz", seed, error=0.05, duration_s=28.8)
+    for name, seed in product(("orb-slam2", "dynaslam"), (0, 1)):
+        add_run(store, name, "tum/fr3/walking_xyz", seed, duration_s=28.8)
     paths = build_report(store, tmp_path / "report")
-    table = rows_of(paths.csv["per_sequence"])
-    reported = {row["tracker"] for row in table if "reported" in row["tracker"]}
-    assert "DynaSLAM N+G (DynaSLAM paper) reported" in reported
-    assert not any("DROID-W" in name for name in reported)  # aligned by Sim(3)
-    assert "EMFOA-OFT-SLAM claimed by the paper" in {row["tracker"] for row in table}
-    (record,) = [row for row in table if row["tracker"].endswith(" record")]
-    assert record["tracker"] == "lowest error found in print, real time on a CPU record"
+    names = {row["tracker"] for row in rows_of(paths.csv["per_sequence"])}
+    assert {"DynaSLAM N+G (DynaSLAM paper) reported", "EMFOA-OFT-SLAM claimed by the paper"} <= names
+    assert not any("DROID-W" in name for name in names)  # aligned by Sim(3)
+    records = {name for name in names if name.endswith(" record")}
+    assert records == {"lowest error found in print, real time on a CPU record"}
     assert {row["tracker"] for row in rows_of(paths.csv["leaderboard"])} == {"orb-slam2", "dynaslam"}
     assert "Rows marked &#39;reported&#39; are published numbers" in paths.html.read_text()
 

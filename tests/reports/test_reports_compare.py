@@ -6,6 +6,7 @@ from reports_fake_store import add_run, fill
 
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.reports import compare
+from dynslam_bench.reports.tables.table import to_markdown
 from dynslam_bench.runs.store import RunStore
 
 
@@ -24,7 +25,7 @@ def test_compare_finds_what_changed(made, tmp_path):
     itself = compare(store, store).overall
     assert compare(paths.data.parent, paths.data).overall.keys() == itself.keys()
     assert all(interval.value == 1 for interval in itself.values())
-    assert "| Mask R-CNN (our back end) | all 2 sequences |" in comparison.to_markdown()
+    assert "| Mask R-CNN (our back end) | all 2 sequences |" in to_markdown(comparison.table)
 
 
 def test_compare_refuses_what_has_nothing_in_common(made, tmp_path):

@@ -304,7 +304,7 @@ def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
 def test_who_follows_people_on_few_frames_is_not_shown_as_the_better_one():
     """The exploring page's error by the share of dynamic pixels; the follower is best on most frames."""
     share, errors_mm = np.full(100, 0.35), np.r_[np.full(90, 0.9), np.full(10, 40.0)]
-    (rmse_mm,) = (mm for mm, _ in error_by_share([RunPage(row(), False, [], share, 1e-3 * errors_mm)]) if mm)
+    (rmse_mm,) = (mm for mm, _ in error_by_share([RunPage("", "", False, [], share, 1e-3 * errors_mm)]) if mm)
     assert rmse_mm == pytest.approx(np.sqrt(np.mean(errors_mm**2)), rel=1e-3)
 
 
