@@ -304,7 +304,7 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
     )
     palette = colours(board)
     shown = {*(board.ranked or board.trackers)[:6], board.reference}
-    blocks = []
+    blocks: list[Block] = []
     for sequence in board.sequences:
         tracks = [
             {"run": row.run_id, "name": safe(board.labels[key]), "colour": palette[key], "shown": key in shown}

@@ -369,7 +369,7 @@ def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
     fitting = (MOST_LINES - head_lines) // max(lines, default=1)
     parts = []
     for first in range(0, len(table.rows), fitting):
-        body = []
+        body: list[str] = []
         for position, row in enumerate(table.rows[first : first + fitting], first):
             if position in table.separators and body:
                 body.append("\\midrule")

@@ -50,7 +50,7 @@ def test_the_leaderboard_orders_and_compares(made):
     assert {row["#"] for row in board[:4]} == {"1–4 not separable"}  # four sequences tell nobody apart
     assert {row["tracker"]: row["#"] for row in board[4:]} == {"ORB-SLAM3": "–", "constant velocity": "–"}
     medians = pd.read_csv(paths.csv["per_sequence"], index_col="tracker").filter(like="synthetic")
-    best, reference = (medians.loc[f"{name} (our back end)"] for name in ("DynaSLAM N+G", "ORB-SLAM2"))
+    best, reference = (medians.loc[f"{name} (our back end)"].astype(float) for name in ("DynaSLAM N+G", "ORB-SLAM2"))
     assert float(board[0]["ATE ratio"]) == pytest.approx(np.exp(np.log(best / reference).mean()))
 
 
