@@ -56,8 +56,10 @@ def test_compare_pairs_runs_of_different_settings_and_says_what_differs(tmp_path
 def test_compare_takes_the_nearest_settings_and_leaves_the_rest(tmp_path):
     before, after = RunStore(tmp_path / "a"), RunStore(tmp_path / "b")
     add_run(before, "ours", "s/a")
-    add_run(after, "ours", "s/a", overrides={"x": 1})
+    for seed in (0, 1):
+        add_run(after, "ours", "s/a", seed, overrides={"x": 1})
     add_run(after, "ours", "s/a", overrides={"x": 1, "y": 2})
     found = compare(before, after)
     assert list(found.differences.values()) == [["x: default in A, 1 in B"]]
     assert (found.only_a, found.only_b) == (0, 1)
+    assert found.table.rows[0][-1].text == "1 + 1", "of the repeats that both have"
