@@ -405,13 +405,15 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         cells = [TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell() for p in printed]
         rows.append([TableCell(name, tag=tag), *cells])
     muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
+    first = board.sequences[0]
+    names = "" if board.short[first] == first else f"'{board.short[first]}' stands for {first}, and so on. "
     caption = (
         f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
         "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
         "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a static "
         "camera, or worse; a cell with a failure takes no part in bold and green, and is hatched where "
         f"nothing succeeded. Colour: ratio to {board.reference_name}, from green (a quarter or less) to red (four "
-        f"times or more). Bold best, italic second among ranked trackers. {_names_note(board)}{protocol.describe()}."
+        f"times or more). Bold best, italic second among ranked trackers. {names}{protocol.describe()}."
     )
     if reported:
         caption += (
@@ -555,6 +557,7 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
 
 
 def _spread(cell: Cell) -> str:
+    """Half the interquartile range in mm, or that there is none."""
     if len(cell.scores) > 1:
         low, high = np.percentile(cell.scores, [25, 75])
         return f"±{significant_text(500.0 * float(high - low), 2)}"
@@ -572,12 +575,6 @@ def _static_camera_cell(board: Board, sequence: str) -> TableCell:
 def shade(ratio: float) -> float:
     """-1 at a quarter of the reference's error or less, 0 at the same, 1 at four times or more."""
     return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
-
-
-def _names_note(board: Board) -> str:
-    """What the shortened headings stand for; empty where they are whole."""
-    first = board.sequences[0]
-    return "" if board.short[first] == first else f"'{board.short[first]}' stands for {first}, and so on. "
 
 
 # -- the rules, and the runs
