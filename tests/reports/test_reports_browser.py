@@ -1,13 +1,12 @@
 """The report in a real browser: nothing is fetched, nothing faults, everything fits and can be read."""
 
-import json
-import re
 import sys
 from pathlib import Path
 
 import pytest
 from reports_browser import Browser, needs_browser
 from reports_fake_store import add_frames, add_run, fill
+from reports_rows import page_data
 
 from dynslam_bench.envs.arguments import open_frames
 from dynslam_bench.reports import build_report
@@ -46,11 +45,10 @@ def browser(tmp_path_factory):
 
 
 def run_of(report, label, sequence):
-    text = (report.html.parent / "data" / "explore.js").read_text()
-    known = json.loads(re.fullmatch(r'keep\("explore",(.*)\);\n', text, re.DOTALL)[1])
-    tracker = next(at for at, each in enumerate(known["trackers"]) if each["label"].startswith(label))
-    column = next(at for at, each in enumerate(known["sequences"]) if each["name"].startswith(sequence))
-    return next(run[0] for run in known["runs"] if run[1:3] == [tracker, column])
+    explore = page_data(report.html.parent, "explore")
+    tracker = next(at for at, each in enumerate(explore["trackers"]) if each["label"].startswith(label))
+    column = next(at for at, each in enumerate(explore["sequences"]) if each["name"].startswith(sequence))
+    return next(run[0] for run in explore["runs"] if run[1:3] == [tracker, column])
 
 
 def see_everything(browser):
