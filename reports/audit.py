@@ -95,9 +95,8 @@ class AuditReport:
         )
         return Table("audit_summary", "Audit of the paper's tables", caption, columns, rows)
 
-    def details(self, *, failed_only: bool = True) -> Table:
-        """Every finding, or only those that do not hold."""
-        shown = [finding for finding in self.findings if not (failed_only and finding.holds)]
+    def details(self) -> Table:
+        """Every finding that does not hold."""
         rows = [
             [
                 TableCell(finding.check),
@@ -109,14 +108,15 @@ class AuditReport:
                 number(finding.expected, ".4f"),
                 TableCell(finding.remark),
             ]
-            for finding in shown
+            for finding in self.findings
+            if not finding.holds
         ]
         columns = [
             *texts("check"), *numbers("table"), *texts("system", "sequence", "quantity"),
             *numbers("printed", "held against"), *texts("remark"),
         ]  # fmt: skip
-        what = "Numbers that do not hold" if failed_only else "All findings"
-        return Table("audit_findings", what, "Metres, percent or milliseconds, as printed.", columns, rows)
+        caption = "Metres, percent or milliseconds, as printed."
+        return Table("audit_findings", "Numbers that do not hold", caption, columns, rows)
 
     def to_markdown(self) -> str:
         """Summary and failures as Markdown."""
@@ -135,16 +135,11 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
     """
     values = {(c.table, c.system, c.sequence, c.quantity): c for c in lines_of(claimed().query("kind == 'value'"))}
     static = static_camera_errors() | _computed_static_camera(ground_truth or {})
-    findings = []
-    for key, printed in values.items():
-        checks = (
-            *_statistics(values, key),
-            *_against_static_camera(static, key, printed.value),
-            *_against_published(key, printed.value),
-            *_accuracy(values, key),
-            *_time(key, printed.value),
-        )
-        findings += [Finding(check, *key, printed.value, *outcome) for check, outcome in checks]
+    findings = [
+        Finding(check, *key, printed.value, expected, holds, remark)
+        for key, printed in values.items()
+        for check, expected, holds, remark in _checks(values, static, key)
+    ]
     findings += _improvements(values)
     order = list(CHECKS)
     return AuditReport(tuple(sorted(findings, key=lambda finding: (order.index(finding.check), finding.table))))
@@ -154,25 +149,50 @@ Key = tuple[int, str, str, str]
 """Table, system, sequence and quantity of a printed number."""
 Values = Mapping[Key, Any]
 """Printed numbers as lines of `claimed`."""
-Checked = tuple[str, tuple[float, bool, str]]
-"""Check; what the number has to be, whether it holds, and why."""
 
 
-def _statistics(values: Values, key: Key) -> Iterator[Checked]:
-    """RMSE^2 = mean^2 + StD^2, up to the rounding of all three; hence RMSE >= mean."""
+def _checks(
+    values: Values, static: Mapping[tuple[str, str], float], key: Key
+) -> Iterator[tuple[str, float, bool, str]]:
+    """The checks of one printed number: the check, what the number has to be, whether it holds, and why."""
     table, system, sequence, quantity = key
-    if not quantity.endswith("_rmse"):
-        return
-    rmse = values[key]
-    metric = quantity.removesuffix("_rmse")
-    mean, std = (values[table, system, sequence, f"{metric}_{name}"].value for name in ("mean", "std"))
-    expected = math.hypot(mean, std)
-    rounding = _HALF_DIGIT * 10.0**-rmse.digits
-    tolerance = rounding * (1 + (mean + std) / expected)  # of the printed RMSE, and of what follows from the others
-    off = rmse.value - expected
-    yield "rmse-identity", (expected, abs(off) <= tolerance, f"off by {1000 * off:+.1f} mm")
-    possible = rmse.value >= mean - 2 * rounding
-    yield "rmse-at-least-mean", (mean, possible, "" if possible else "below the mean")
+    printed = values[key].value
+    if quantity.endswith("_rmse"):  # RMSE^2 = mean^2 + StD^2, up to the rounding of all three; hence RMSE >= mean
+        metric = quantity.removesuffix("_rmse")
+        mean, std = (values[table, system, sequence, f"{metric}_{name}"].value for name in ("mean", "std"))
+        expected = math.hypot(mean, std)
+        rounding = _HALF_DIGIT * 10.0 ** -values[key].digits
+        tolerance = rounding * (1 + (mean + std) / expected)  # of the printed RMSE, and of what follows from the others
+        off = printed - expected
+        yield "rmse-identity", expected, abs(off) <= tolerance, f"off by {1000 * off:+.1f} mm"
+        possible = printed >= mean - 2 * rounding
+        yield "rmse-at-least-mean", mean, possible, "" if possible else "below the mean"
+    static_m = static.get((sequence, {"ape_rmse": "ape_rmse", "rpe_rmse": "rpe_1s"}.get(quantity, "")))
+    if static_m is not None:
+        remark = "" if quantity == "ape_rmse" else "held against 1 s; the paper states no delta"
+        if quantity == "rpe_rmse" and (sequence, "rpe_1f") in static:
+            remark += f" (over 1 frame not moving scores {static[sequence, 'rpe_1f']:.4f})"
+        yield "better-than-not-moving", static_m, printed < static_m, remark
+    frame = published().query("metric == 'ate_rmse_m'")
+    elsewhere = frame[(frame["system"] == system) & (frame["sequence"] == sequence)]["value"]
+    if quantity == "ape_rmse" and len(elsewhere):
+        low, high = float(elsewhere.min()), float(elsewhere.max())
+        nearest = min(max(printed, low), high)
+        factor = printed / nearest
+        span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        remark = f"{factor:.1f} times what is published ({span} m in {len(elsewhere)} tables)"
+        yield "published", nearest, 0.5 <= factor <= 2, remark
+    if quantity == "accuracy_percent":
+        expected = 100 - values[table, system, sequence, "error_percent"].value
+        yield "accuracy", expected, abs(printed - expected) < 0.006, "100 - error"
+    if quantity == "error_percent":
+        expected = 100 * values[1, system, sequence, "ape_std"].value
+        same = abs(printed - expected) <= _ERROR_TOLERANCE
+        remark = "it is 100 times the StD of Table 1 in metres, which is no accuracy" if same else ""
+        yield "accuracy", expected, not same, remark
+    if quantity == "time_ms" and system == OURS:
+        remark = "less than the published time of its Mask R-CNN alone (DynaSLAM's: 195 ms)"
+        yield "time", _MASK_RCNN_MS, printed >= _MASK_RCNN_MS, remark
 
 
 def _improvements(values: Values) -> Iterator[Finding]:
@@ -188,57 +208,9 @@ def _improvements(values: Values) -> Iterator[Finding]:
             & (printed["sequence"] != row.sequence)
             & ((printed["value"] - row.value).abs() <= _PERCENT_TOLERANCE)
         ]
-        repeated = (
-            f"repeats the column of {same['sequence'].iloc[0]}" if len(same) else "does not follow from the table"
-        )
-        yield Finding(
-            "improvement", row.table, row.system, row.sequence, row.quantity, row.value, expected, holds,
-            "" if holds else repeated,
-        )  # fmt: skip
-
-
-def _against_static_camera(static: Mapping[tuple[str, str], float], key: Key, printed: float) -> Iterator[Checked]:
-    _, _, sequence, quantity = key
-    metric = {"ape_rmse": "ape_rmse", "rpe_rmse": "rpe_1s"}.get(quantity, "")
-    if (sequence, metric) not in static:
-        return
-    remark = "" if quantity == "ape_rmse" else "held against 1 s; the paper states no delta"
-    if quantity == "rpe_rmse" and (sequence, "rpe_1f") in static:
-        remark += f" (over 1 frame not moving scores {static[sequence, 'rpe_1f']:.4f})"
-    yield "better-than-not-moving", (static[sequence, metric], printed < static[sequence, metric], remark)
-
-
-def _against_published(key: Key, printed: float) -> Iterator[Checked]:
-    _, system, sequence, quantity = key
-    frame = published().query("metric == 'ate_rmse_m'")
-    values = frame[(frame["system"] == system) & (frame["sequence"] == sequence)]["value"]
-    if quantity != "ape_rmse" or values.empty:
-        return
-    low, high = float(values.min()), float(values.max())
-    nearest = min(max(printed, low), high)
-    factor = printed / nearest
-    span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
-    remark = f"{factor:.1f} times what is published ({span} m in {len(values)} tables)"
-    yield "published", (nearest, 0.5 <= factor <= 2, remark)
-
-
-def _accuracy(values: Values, key: Key) -> Iterator[Checked]:
-    table, system, sequence, quantity = key
-    printed = values[key].value
-    if quantity == "accuracy_percent":
-        expected = 100 - values[table, system, sequence, "error_percent"].value
-        yield "accuracy", (expected, abs(printed - expected) < 0.006, "100 - error")
-    if quantity == "error_percent":
-        expected = 100 * values[1, system, sequence, "ape_std"].value
-        same = abs(printed - expected) <= _ERROR_TOLERANCE
-        remark = "it is 100 times the StD of Table 1 in metres, which is no accuracy" if same else ""
-        yield "accuracy", (expected, not same, remark)
-
-
-def _time(key: Key, printed: float) -> Iterator[Checked]:
-    if key[3] == "time_ms" and key[1] == OURS:
-        remark = "less than the published time of its Mask R-CNN alone (DynaSLAM's: 195 ms)"
-        yield "time", (_MASK_RCNN_MS, printed >= _MASK_RCNN_MS, remark)
+        why = f"repeats the column of {same['sequence'].iloc[0]}" if len(same) else "does not follow from the table"
+        key = (row.table, row.system, row.sequence, row.quantity)
+        yield Finding("improvement", *key, row.value, expected, holds, "" if holds else why)
 
 
 def _computed_static_camera(ground_truth: Mapping[str, Trajectory]) -> dict[tuple[str, str], float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -15,14 +16,27 @@ import dynslam_bench
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.reports.html import sections
-from dynslam_bench.reports.html.explore import PICTURE_SECONDS, RUN_PAGE, write_explore
-from dynslam_bench.reports.html.page import Block, Section, render, resource
-from dynslam_bench.reports.html.run_page import MOST_FRAMES
-from dynslam_bench.reports.model.board import Board, On, make_board
-from dynslam_bench.reports.model.load import OnProgress, load_runs, no_progress, open_stores, worker_pool
-from dynslam_bench.reports.model.row import REPORT_FILE, ReportData
+from dynslam_bench.reports import figures
+from dynslam_bench.reports.figures import colours, safe
+from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
+from dynslam_bench.reports.html.page import Block, Section, figure_blocks, render, resource, table_blocks
+from dynslam_bench.reports.model.board import Board, On, common_errors, make_board, missing_commands, missing_note
+from dynslam_bench.reports.model.load import (
+    Loaded,
+    OnProgress,
+    load_runs,
+    no_progress,
+    open_stores,
+    trial_words,
+    without_scale_words,
+    worker_pool,
+)
+from dynslam_bench.reports.model.published import is_excerpt, least_length_s, records_for, reported_for
+from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, command_line
+from dynslam_bench.reports.model.statistics import FEWEST, power_note
+from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
+from dynslam_bench.runs.run_index import part_words
 from dynslam_bench.runs.store import RunStore
 
 
@@ -100,35 +114,28 @@ def build_report(
     with worker_pool(sum(len(store.ids()) for store in stores)) as pool:
         loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)
         board = make_board(loaded.rows, reference, on, rank_seen=rank_seen)
-        explored = write_explore(
+        explore_notes = write_explore(
             board, protocol, output, title=title, pool=pool,
             picture_seconds=picture_seconds, most_frames=most_frames, most_pages=most_pages,
             progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
         )  # fmt: skip
         on_progress(0, None, "putting the tables and figures together")
         again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
-        page_sections = [
-            sections.leaderboard_section(board, protocol, loaded),
-            Section("explore", "Explore", "Explore", explored.notes, [Block("explore")]),
-            sections.speed_section(board),
-            sections.errors_section(board, protocol, pool),
-            sections.paper_section(board, protocol),
-            sections.trajectories_section(board, protocol),
-            sections.repeatability_section(board),
-            sections.masks_section(board),
-            sections.failures_section(board),
-            sections.provenance_section(board, loaded, again),
+        sections = [
+            leaderboard_section(board, protocol, loaded),
+            Section("explore", "Explore", "Explore", explore_notes, [Block("explore")]),
+            speed_section(board),
+            errors_section(board, protocol, pool),
+            paper_section(board, protocol),
+            trajectories_section(board, protocol),
+            repeatability_section(board),
+            masks_section(board),
+            failures_section(board),
+            provenance_section(board, loaded, again),
         ]
     on_progress(0, None, "writing")
-    data = ReportData(
-        title=title,
-        protocol=protocol.describe(),
-        reference=board.reference_name,
-        version=dynslam_bench.__version__,
-        rows=board.rows,
-    )
-    shown = [section for section in page_sections if section.blocks or section.notes]
-    return _write(shown, board, output, data, loaded.trials)
+    shown = [section for section in sections if section.blocks or section.notes]
+    return _write(shown, board, protocol, output, title, loaded.trials)
 
 
 def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool) -> str:
@@ -140,49 +147,254 @@ def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int 
     return shlex.join(words + ["--rank-seen"] * board.rank_seen + ["--trials"] * trials)
 
 
-def _write(page_sections: Sequence[Section], board: Board, output: Path, data: ReportData, trials: int) -> ReportPaths:
-    facts = _facts(board)
-    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    footer = f"Made by dynslam-bench {data.version} on {now}. This page works without a network."
-    blocks = [block for section in page_sections for block in section.blocks]
-    tables = {block.table.id: block.table for block in blocks if block.table is not None}
-    figures = {block.figure: block.chart for block in blocks if block.figure}
-    paths = ReportPaths(
-        html=output / "index.html",
-        run=output / RUN_PAGE,
-        markdown=output / "report.md",
-        latex=output / "report.tex",
-        csv={name: output / "csv" / f"{name}.csv" for name in (*tables, "runs")},
-        data=output / REPORT_FILE,
-        leaderboard=tables["leaderboard"],
-        trials=trials,
-    )
-    for name, table in tables.items():
-        write_atomic(paths.csv[name], csv_text(table.frame()))
-    write_atomic(paths.csv["runs"], csv_text(board.frame()))
-    counted = ", ".join(f"{value} {name}" for value, name in facts)
-    notes = "".join(f"> {prose(note)}\n\n" for section in page_sections for note in section.notes)
-    texts = "\n".join(map(to_markdown, tables.values()))
-    markdown = f"# {prose(data.title)}\n\n{data.protocol}\n\n{counted}\n\n{notes}{texts}\n{footer}\n"
-    write_atomic(paths.markdown, markdown)
-    latex = [to_latex(table, data.rows[0].protocol_id) for name, table in tables.items() if name not in _NOT_IN_LATEX]
-    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
-    data.write(paths.data)
-    page = render(page_sections, figures, title=data.title, protocol=data.protocol, facts=facts, footer=footer)
-    write_atomic(paths.html, page)
-    return paths
-
-
-def _facts(board: Board) -> list[tuple[str, str]]:
-    """What a report is about, in numbers."""
+def _write(
+    sections: Sequence[Section], board: Board, protocol: Protocol, output: Path, title: str, trials: int
+) -> ReportPaths:
     counts = [
         (len(board.labels), "tracker"),
         (len(board.sequences) + len(board.unscored), "sequence"),
         (len(board.rows), "run"),
     ]
-    named = [(str(count), name + ("" if count == 1 else "s")) for count, name in counts]
-    return [*named, (str(sum(row.failed for row in board.rows)), "failed")]
+    facts = [(str(count), name + "s" * (count != 1)) for count, name in counts]
+    facts.append((str(sum(row.failed for row in board.rows)), "failed"))
+    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. This page works without a network."
+    blocks = [block for section in sections for block in section.blocks]
+    shown = {block.table.id: block.table for block in blocks if block.table is not None}
+    paths = ReportPaths(
+        html=output / "index.html",
+        run=output / RUN_PAGE,
+        markdown=output / "report.md",
+        latex=output / "report.tex",
+        csv={name: output / "csv" / f"{name}.csv" for name in (*shown, "runs")},
+        data=output / REPORT_FILE,
+        leaderboard=shown["leaderboard"],
+        trials=trials,
+    )
+    for name, table in shown.items():
+        write_atomic(paths.csv[name], csv_text(table.frame()))
+    write_atomic(paths.csv["runs"], csv_text(board.frame()))
+    counted = ", ".join(f"{value} {name}" for value, name in facts)
+    notes = "".join(f"> {prose(note)}\n\n" for section in sections for note in section.notes)
+    texts = "\n".join(map(to_markdown, shown.values()))
+    head = f"# {prose(title)}\n\n{protocol.describe()}\n\n{counted}\n\n"
+    write_atomic(paths.markdown, f"{head}{notes}{texts}\n{footer}\n")
+    latex = [to_latex(table, protocol.id) for name, table in shown.items() if name not in _NOT_IN_LATEX]
+    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
+    data = ReportData(
+        title=title,
+        protocol=protocol.describe(),
+        reference=board.reference_name,
+        version=dynslam_bench.__version__,
+        rows=board.rows,
+    )
+    data.write(paths.data)
+    charts = {block.figure: block.chart for block in blocks if block.figure}
+    page = render(sections, charts, title=title, protocol=protocol.describe(), facts=facts, footer=footer)
+    write_atomic(paths.html, page)
+    return paths
 
+
+# -- the sections: what they show, in which order, below which words
+
+_MOST_NOTES = 60
+_MOST_COMMANDS = 200
+
+
+def leaderboard_section(board: Board, protocol: Protocol, loaded: Loaded) -> Section:
+    """The ranking, what is missing for more of it, and the commands that fill the gaps."""
+    section = Section("leaderboard", "Leaderboard", "Leaderboard", notes=_leaderboard_notes(board, protocol, loaded))
+    section.blocks.append(Block("table", table=tables.leaderboard(board, protocol)))
+    caption = (
+        f"Points: geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} sequences on. Open "
+        "points are not ranked."
+    )
+    section.blocks += figure_blocks("ratio", figures.ratio_figure(board), caption)
+    commands = missing_commands(board)
+    if commands:
+        section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(commands)))
+    return section
+
+
+def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list[str]:
+    cells = [cell for key in board.ranked for name, cell in board.cells[key].items() if name in board.common]
+    fewest_repeats = min((len(cell.scores) for cell in cells if cell.scores), default=0)
+    conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
+    final_only = ", ".join(board.labels[key] for key in board.final_only)
+    older = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
+    left_out = {
+        "older runs of the same tracker, settings, frames and repeat": loaded.superseded,
+        "runs that were stopped on request": loaded.stopped,
+        "folders without a valid record": len(loaded.unreadable),
+    }
+    counts = ", ".join(f"{count} {words}" for words, count in left_out.items() if count)
+    notes = [
+        f"Runs with one id must be equal, but these have different results: {conflicts}." if conflicts else "",
+        missing_note(board),
+        power_note(board.standings, len(board.common), fewest_repeats),
+        f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
+        if final_only
+        else "",
+        f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}." if board.unscored else "",
+        f"Left out: {counts}." if counts else "",
+        "Not ranked, as a newer program has made runs of the same tracker and settings, or as the runs' ids are "
+        f"unverified: {', '.join(older)}."
+        if older
+        else "",
+        f"Left out: {without_scale_words(loaded.without_scale, protocol)}." if loaded.without_scale else "",
+        f"Left out: {trial_words(loaded.trials)}." if loaded.trials else "",
+    ]
+    return [note for note in notes if note]
+
+
+def speed_section(board: Board) -> Section:
+    """Accuracy against speed."""
+    caption = (
+        "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
+        "include segmentation and exclude decoding; they hold for the machine named below."
+    )
+    if any(row.cached for row in board.rows):
+        caption += f" {tables.CACHED_NOTE}"
+    blocks = figure_blocks("speed", figures.speed_figure(board), caption)
+    return Section("speed", "Accuracy against speed", "Speed", blocks=blocks)
+
+
+def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> Section:
+    """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
+    section = Section("errors", "Errors by sequence", "Errors")
+    if not board.sequences:
+        return section
+    excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
+    recorded = [row for row in board.rows if not row.sequence.id.startswith("synthetic/")]
+    parts = sorted(excerpts | {board.sequence(row) for row in recorded if part_words(row)})
+    if parts:
+        section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
+    whole = [name for name in board.sequences if name not in parts]
+    published = reported_for(whole, protocol) + records_for(whole, protocol)
+    beside = {cell.sequence for cell in published}
+    unsure = sorted(
+        {r.sequence.id for r in board.rows if board.sequence(r) in beside and not least_length_s(r.sequence.id)}
+    )
+    if unsure:
+        section.notes.append(
+            f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
+            "are of the whole recordings is not checked."
+        )
+    table_of_errors = tables.per_sequence(board, protocol, published)
+    section.blocks.append(Block("table", "Absolute trajectory error", table_of_errors))
+    common, frames = common_errors(board, protocol, pool)
+    lost = any(row.coverage < 1 and not row.failed for row in board.rows)
+    section.blocks += table_blocks(
+        tables.common_frames_table(board, common, frames),
+        tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
+        tables.tracked_errors(board, protocol) if lost else None,
+        tables.failure_rule_table(board),
+        *tables.relative_errors(board, protocol),
+        tables.rotation_errors(board, protocol),
+        folded=True,
+    )
+    return section
+
+
+def trajectories_section(board: Board, protocol: Protocol) -> Section:
+    """Paths and errors over time of one run a tracker, by sequence; drawn of the runs' side files when it opens."""
+    caption = (
+        f"The run with the median error of each tracker, aligned ({protocol.alignment}). Lines are broken where a "
+        "gap exceeds twice the median interval. Click a name to show or hide it."
+    )
+    palette = colours(board)
+    shown = {*(board.ranked or board.trackers)[:6], board.reference}
+    blocks: list[Block] = []
+    for sequence in board.sequences:
+        tracks = [
+            {"run": row.run_id, "name": safe(board.labels[key]), "colour": palette[key], "shown": key in shown}
+            for key, row in board.typical_runs(sequence).items()
+        ]
+        if tracks:
+            words = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
+            blocks.append(Block("tracks", sequence, caption=words, tracks=tracks, folded=bool(blocks)))
+    return Section(
+        "trajectories", "Trajectories and error over time", "Trajectories",
+        blocks=[Block("caption", text=caption), *blocks] if blocks else [],
+    )  # fmt: skip
+
+
+def repeatability_section(board: Board) -> Section:
+    """How far the runs of a cell lie apart."""
+    caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
+    blocks = figure_blocks("repeat", figures.repeat_figure(board), caption + thinned_note(board))
+    blocks += table_blocks(tables.repeatability(board))
+    return Section("repeatability", "Repeatability", "Repeatability", blocks=blocks)
+
+
+def thinned_note(board: Board) -> str:
+    """What a figure with a point for every run says where there are too many."""
+    most = figures.MOST_POINTS
+    if all(len(board.runs(key)) <= most for key in board.trackers):
+        return ""
+    return f" Of trackers with more than {most} runs fewer are drawn, from the best to the worst."
+
+
+def masks_section(board: Board) -> Section:
+    """Quality of the masks, and the pose error against it."""
+    blocks = figure_blocks("masks", figures.mask_figure(board), "One point a run." + thinned_note(board))
+    blocks += table_blocks(tables.mask_quality(board))
+    return Section("masks", "Mask quality and pose error", "Masks", blocks=blocks)
+
+
+def failures_section(board: Board) -> Section:
+    """Every run that failed, or that none did."""
+    nothing = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
+    return Section("failures", "Failures", "Failures", blocks=table_blocks(tables.failures(board)) or nothing)
+
+
+def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
+    """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
+    section = Section("provenance", "Machines, versions, commands", "Reproduce")
+    section.blocks.append(Block("table", table=tables.machines(board)))
+    commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
+    commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
+    section.blocks.append(
+        Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
+    )
+    notes = [
+        f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
+    ]
+    for title, entries, others in (
+        ("Left out: no valid record", loaded.unreadable, "... and {} more, which `runs list` names"),
+        ("Diagnostics", notes, "... and {} more on the pages of the runs"),
+    ):
+        if entries:
+            section.blocks.append(Block("list", title, entries=first_of(entries, _MOST_NOTES, others), folded=True))
+    return section
+
+
+def first_of(entries: list[str], most: int, others: str) -> list[str]:
+    """The first entries; how many others there are stands behind them."""
+    return entries if len(entries) <= most else [*entries[:most], others.format(len(entries) - most)]
+
+
+def paper_section(board: Board, protocol: Protocol) -> Section:
+    """Tables 1 to 3 and Figures 9 to 12, as the paper lays them out."""
+    section = Section("paper", "As in the paper: four statistics of the errors, and time", "As in the paper")
+    section.blocks += table_blocks(
+        tables.absolute_table(board, protocol),
+        tables.relative_table(board, protocol),
+        tables.time_table(board),
+        folded=True,
+    )
+    for statistic, number in figures.FIGURES.items():
+        figure = figures.bar_figure(board, statistic)
+        lost = figure is not None and any(tables.LOST_MARK in trace["text"] for trace in figure["data"])
+        caption = (
+            f"As the paper's Figure {number}: {tables.STATISTICS[statistic]} of the absolute pose error, median over "
+            "the runs that succeeded; pale bars are not ranked." + f" {tables.LOST_NOTE}" * lost
+        )
+        section.blocks += figure_blocks(f"paper-{statistic}", figure, caption)
+    return section
+
+
+# -- the site that is published
 
 STUDY_PAGE = "index.html"
 FRAMES = 100

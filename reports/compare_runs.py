@@ -19,7 +19,7 @@ from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, ratio_interval
 from dynslam_bench.reports.tables.leaderboard import interval_cell
-from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts, to_csv, to_markdown
+from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
 from dynslam_bench.runs.store import RunStore
 
 
@@ -43,14 +43,6 @@ class Comparison:
     only_b: int
     differences: dict[str, list[str]]
 
-    def to_markdown(self) -> str:
-        """The comparison as Markdown."""
-        return to_markdown(self.table)
-
-    def to_csv(self) -> str:
-        """The comparison as CSV."""
-        return to_csv(self.table)
-
 
 def compare(
     a: Path | str | RunStore, b: Path | str | RunStore, *, protocol: Protocol | str = "tum-rgbd/v1"
@@ -69,35 +61,41 @@ def compare(
         ReportError: One holds no runs, nothing is in both, or their numbers stem from different protocols.
     """
     protocol = get_protocol(protocol)
-    rows_a, rows_b = _rows(a, protocol), _rows(b, protocol)
+    (rows_a, evaluated), (rows_b, _) = _read(a, protocol), _read(b, protocol)
     check_one_protocol([*rows_a, *rows_b])
-    side_a, side_b = make_side(rows_a), make_side(rows_b)
-    pairs = pair_variants(side_a, side_b)
+    variants_a, variants_b = (grouped(rows, lambda row: row.variant_key) for rows in (rows_a, rows_b))
+    pairs = pair_variants(variants_a, variants_b)
+    name_a, name_b = (str(source.root if isinstance(source, RunStore) else source) for source in (a, b))
     if not pairs:
         raise ReportError(
-            f"{_name(a)} ({len(rows_a)} runs) and {_name(b)} ({len(rows_b)} runs) have no tracker and sequence in "
-            "common",
+            f"{name_a} ({len(rows_a)} runs) and {name_b} ({len(rows_b)} runs) have no tracker and sequence in common",
             "compare results of the same suite",
         )
     columns = name_columns([*rows_a, *rows_b])
+    labels = make_labels([row for one, other in pairs for row in (*variants_a[one], *variants_b[other])])
     compared: dict[str, list[Paired]] = {}
-    changed: dict[str, list[str]] = {}
-    for (one, other), name in _labels(pairs, side_a, side_b).items():
-        paired = pair_errors(side_a[one], side_b[other], columns)
+    differences: dict[str, list[str]] = {}
+    only_a, only_b = len(rows_a), len(rows_b)
+    for one, other in pairs:
+        name = labels[one] if one == other else f"{labels[one]} → {labels[other]}"
+        by_column_a, by_column_b = _by_column(variants_a[one]), _by_column(variants_b[other])
+        shared = by_column_a.keys() & by_column_b.keys()
+        only_a -= sum(len(by_column_a[column]) for column in shared)
+        only_b -= sum(len(by_column_b[column]) for column in shared)
+        paired = []
+        for column in shared:
+            cells = paired_cells(by_column_a[column], by_column_b[column])
+            if all(cell.scores for cell in cells):
+                seen = f" {SEEN}" * any(cell.in_training for cell in cells)
+                paired.append((columns[column] + seen, *cells))
         if paired:
-            compared[name] = paired
-            changed[name] = _differences(_first(side_a, one), _first(side_b, other))
+            compared[name] = sorted(paired, key=itemgetter(0))
+            differences[name] = _differences(variants_a[one][0], variants_b[other][0])
     if not compared:
         raise ReportError("none of the runs in common has ground truth", "nothing can be compared")
     overall = {name: ratio_interval(np.log([ratio_of(*pair) for pair in paired])) for name, paired in compared.items()}
-    caption = _caption(rows_a[0].protocol_id if _report_file(a) else protocol.describe(), changed)
-    return Comparison(
-        overall=overall,
-        table=_table(f"{_name(a)} (A) against {_name(b)} (B)", caption, compared, overall),
-        only_a=_unpaired(rows_a, side_a, side_b, pairs),
-        only_b=_unpaired(rows_b, side_b, side_a, [(other, one) for one, other in pairs]),
-        differences=changed,
-    )
+    table = _table(f"{name_a} (A) against {name_b} (B)", _caption(evaluated, differences), compared, overall)
+    return Comparison(overall, table, only_a, only_b, differences)
 
 
 def _caption(protocol: str, differences: Mapping[str, list[str]]) -> str:
@@ -109,54 +107,39 @@ def _caption(protocol: str, differences: Mapping[str, list[str]]) -> str:
     ) + (f" What differs: {'; '.join(changed)}." if changed else " The settings are the same.")
 
 
-def _rows(source: Path | str | RunStore, protocol: Protocol) -> list[RunRow]:
-    report = _report_file(source)
-    if report is not None:
-        return ReportData.read(report).rows
-    stores = open_stores(source if isinstance(source, RunStore) else [Path(source)])
-    return load_runs(stores, protocol, trials=True).rows
+def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRow], str]:
+    """The rows of results or of a report, and how they were evaluated, in words."""
+    if not isinstance(source, RunStore):
+        path = Path(source).expanduser()
+        for file in (path, path / REPORT_FILE):
+            if file.is_file():
+                rows = ReportData.read(file).rows
+                return rows, rows[0].protocol_id if rows else ""
+    return load_runs(open_stores(source), protocol, trials=True).rows, protocol.describe()
 
 
-def _report_file(source: Path | str | RunStore) -> Path | None:
-    """The data of a report; None for a results folder."""
-    if isinstance(source, RunStore):
-        return None
-    path = Path(source).expanduser()
-    return next((file for file in (path, path / REPORT_FILE) if file.is_file()), None)
-
-
-def _name(source: Path | str | RunStore) -> str:
-    return str(source.root if isinstance(source, RunStore) else source)
-
-
-Side = dict[str, dict[str, list[RunRow]]]
-"""Variant key to column id to the runs."""
 Paired = tuple[str, Cell, Cell]
 """A sequence, with `SEEN` behind it if a side's network was trained on it, and one tracker's runs on both sides."""
 
 
-def make_side(rows: Sequence[RunRow]) -> Side:
-    """Rows by variant and column."""
-    variants = grouped(rows, lambda row: row.variant_key)
-    return {key: grouped(of_key, lambda row: row.column_id) for key, of_key in variants.items()}
+def _by_column(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
+    return grouped(rows, lambda row: row.column_id)
 
 
-def pair_variants(a: Side, b: Side) -> list[tuple[str, str]]:
+def pair_variants(a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]]) -> list[tuple[str, str]]:
     """Variants of A and B that share a column: equal ones, then those that differ least, each at most once."""
-    pairs = [(key, key) for key in a if key in b]
     candidates = []
-    for one, other in product((key for key in a if key not in b), (key for key in b if key not in a)):
-        first, second = _first(a, one), _first(b, other)
-        if (first.tracker.id, first.kind) == (second.tracker.id, second.kind) and set(a[one]) & set(b[other]):
-            candidates.append((len(_differences(first, second)), one, other))
-    for _, one, other in sorted(candidates):
-        if all(one != pair[0] and other != pair[1] for pair in pairs):
+    for one, other in product(a, b):
+        first, second = a[one][0], b[other][0]
+        paired_otherwise = one != other and (one in b or other in a)
+        if (first.tracker.id, first.kind) == (second.tracker.id, second.kind) and not paired_otherwise:
+            candidates.append((one != other, len(_differences(first, second)), one, other))
+    pairs: list[tuple[str, str]] = []
+    for *_, one, other in sorted(candidates, key=itemgetter(0, 1)):
+        unused = all(one != pair[0] and other != pair[1] for pair in pairs)
+        if unused and _by_column(a[one]).keys() & _by_column(b[other]).keys():
             pairs.append((one, other))
-    return [(one, other) for one, other in pairs if set(a[one]) & set(b[other])]
-
-
-def _first(side: Side, key: str) -> RunRow:
-    return next(iter(side[key].values()))[0]
+    return pairs
 
 
 def _differences(first: RunRow, second: RunRow) -> list[str]:
@@ -169,38 +152,16 @@ def _differences(first: RunRow, second: RunRow) -> list[str]:
     return words
 
 
-def _labels(pairs: Sequence[tuple[str, str]], a: Side, b: Side) -> dict[tuple[str, str], str]:
-    """The label of A's variant, with that of B's where they differ."""
-    sides = [side[key] for one, other in pairs for side, key in ((a, one), (b, other))]
-    names = make_labels([row for columns in sides for rows in columns.values() for row in rows])
-    return {(one, other): names[one] if one == other else f"{names[one]} → {names[other]}" for one, other in pairs}
-
-
-def pair_errors(
-    a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]], columns: Mapping[str, str]
-) -> list[Paired]:
-    """Both sides on every sequence that both have and have scores on: of the repeats that both have, if any."""
-    paired = []
-    for column in set(a) & set(b):
-        repeats = {row.repeat_key for row in a[column]} & {row.repeat_key for row in b[column]}
-        cells = [
-            make_cell([row for row in side if row.repeat_key in repeats] or side) for side in (a[column], b[column])
-        ]
-        if cells[0].scores and cells[1].scores:
-            name = columns[column] + f" {SEEN}" * (cells[0].in_training or cells[1].in_training)
-            paired.append((name, cells[0], cells[1]))
-    return sorted(paired, key=itemgetter(0))
+def paired_cells(a: Sequence[RunRow], b: Sequence[RunRow]) -> tuple[Cell, Cell]:
+    """The cells of both sides in one column: of the repeats that both have, or of all where they share none."""
+    repeats = {row.repeat_key for row in a} & {row.repeat_key for row in b}
+    cell_a, cell_b = (make_cell([row for row in side if row.repeat_key in repeats] or side) for side in (a, b))
+    return cell_a, cell_b
 
 
 def ratio_of(_: str, a: Cell, b: Cell) -> float:
     """B's median error over A's."""
     return max(b.median or 0.0, FLOOR_M) / max(a.median or 0.0, FLOOR_M)
-
-
-def _unpaired(rows: Sequence[RunRow], side: Side, other: Side, pairs: Sequence[tuple[str, str]]) -> int:
-    """How many rows of one side take part in no pair; pairs name the variant of this side first."""
-    used = {(one, column) for one, another in pairs for column in set(side[one]) & set(other[another])}
-    return sum((row.variant_key, row.column_id) not in used for row in rows)
 
 
 def _table(

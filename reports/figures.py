@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import html
+import textwrap
 from collections.abc import Sequence
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.reports.model.board import Board
-from dynslam_bench.reports.model.statistics import Interval
-from dynslam_bench.reports.tables.errors import LOST_MARK, STATISTICS, has_lost, medians
-from dynslam_bench.reports.tables.leaderboard import CACHED_MARK, timed
+from dynslam_bench.reports.model.statistics import FLOOR_M
+from dynslam_bench.reports.tables.leaderboard import CACHED_MARK, LOST_MARK, STATISTICS, has_lost, medians, timed
 
 # How the report's figures look: colours, axes, layout, and numbers and names made fit for the page.
 
@@ -35,7 +34,7 @@ def colours(board: Board) -> dict[str, str]:
 
 def layout_of(height: int, **more: Any) -> dict[str, Any]:
     """A layout with the report's fonts and margins; keywords override its parts."""
-    base: dict[str, Any] = {
+    return {
         "height": height,
         "font": {"family": "Inter, system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 13},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -45,13 +44,13 @@ def layout_of(height: int, **more: Any) -> dict[str, Any]:
         "legend": {"x": 1.02, "y": 1, "xanchor": "left", "yanchor": "top", "font": {"size": 12}, "tracegroupgap": 0},
         "hoverlabel": {"bgcolor": "white"},
         "showlegend": True,
+        **more,
     }
-    return base | more
 
 
 def axis(title: str, type: str = "linear") -> dict[str, Any]:
     """A linear (or other) axis with a title."""
-    described: dict[str, Any] = {
+    return {
         "title": {"text": title, "standoff": 12, "font": {"size": 13}},
         "gridcolor": GRID,
         "zeroline": False,
@@ -61,7 +60,6 @@ def axis(title: str, type: str = "linear") -> dict[str, Any]:
         "automargin": True,
         "type": type,
     }
-    return described
 
 
 def log_axis(title: str, values: Sequence[float]) -> dict[str, Any]:
@@ -88,10 +86,10 @@ def log_axis(title: str, values: Sequence[float]) -> dict[str, Any]:
 
 def guide(x: float | None = None, y: float | None = None) -> dict[str, Any]:
     """A dashed line across the figure at one value."""
-    style = {"type": "line", "layer": "below", "line": {"color": "#9ca3af", "width": 1, "dash": "dash"}}
-    if x is not None:
-        return style | {"x0": x, "x1": x, "xref": "x", "y0": 0, "y1": 1, "yref": "paper"}
-    return style | {"y0": y, "y1": y, "yref": "y", "x0": 0, "x1": 1, "xref": "paper"}
+    place: dict[str, Any] = {"x0": x, "x1": x, "xref": "x", "y0": 0, "y1": 1, "yref": "paper"}
+    if x is None:
+        place = {"y0": y, "y1": y, "yref": "y", "x0": 0, "x1": 1, "xref": "paper"}
+    return {"type": "line", "layer": "below", "line": {"color": "#9ca3af", "width": 1, "dash": "dash"}} | place
 
 
 def significant(value: float | None, digits: int = 5) -> float | None:
@@ -109,19 +107,15 @@ def safe(text: str) -> str:
     return html.escape(text, quote=False)
 
 
-def wrapped(text: str, width: int = 34) -> str:
-    """A label broken into lines at blanks."""
-    lines = [""]
-    for word in text.split():
-        if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
-            lines.append(word)
-        else:
-            lines[-1] = f"{lines[-1]} {word}".strip()
-    return "<br>".join(safe(line) for line in lines)
+def wrapped(text: str) -> str:
+    """A label broken into lines of 34 characters at blanks."""
+    lines = textwrap.wrap(text, 34, break_long_words=False, break_on_hyphens=False)
+    return "<br>".join(map(safe, lines))
 
 
 # The report's figures as plotly-like specifications (plain data and layout), drawn by the page itself.
 
+P = TypeVar("P", bound=tuple[Any, ...])
 MOST_POINTS = 400
 """Points of one tracker in figures that have one for every run; of more runs as many, from the best to the worst."""
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "pentagon", "hexagon", "star")
@@ -158,15 +152,17 @@ def ratio_figure(board: Board) -> Figure | None:
         "hovertemplate": "%{y}<br>ratio %{x:.3f}<extra></extra>",
     }
     reach = [value for s in standings for value in (s.ratio.value, s.ratio.low, s.ratio.high)]
-    layout = layout_of(
-        height=110 + 34 * len(standings),
-        xaxis=log_axis(f"ATE ratio to {safe(board.reference_name)} (left is better)", [*reach, 1.0]),
-        yaxis={"autorange": "reversed", "automargin": True, "gridcolor": GRID, "ticks": ""},
-        shapes=[guide(x=1.0)],
-        margin={"l": 20, "r": 30, "t": 40, "b": 60},
-        showlegend=False,
-    )
-    return {"data": [trace], "layout": layout}
+    return {
+        "data": [trace],
+        "layout": layout_of(
+            height=110 + 34 * len(standings),
+            xaxis=log_axis(f"ATE ratio to {safe(board.reference_name)} (left is better)", [*reach, 1.0]),
+            yaxis={"autorange": "reversed", "automargin": True, "gridcolor": GRID, "ticks": ""},
+            shapes=[guide(x=1.0)],
+            margin={"l": 20, "r": 30, "t": 40, "b": 60},
+            showlegend=False,
+        ),
+    }
 
 
 def speed_figure(board: Board) -> Figure | None:
@@ -183,7 +179,8 @@ def speed_figure(board: Board) -> Figure | None:
     if not points:
         return None
     traces: list[dict[str, Any]] = []
-    front = _pareto([(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked])
+    ranked = {(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked}
+    front = sorted(p for p in ranked if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in ranked))
     if len(front) > 1:
         traces.append(
             {
@@ -197,8 +194,7 @@ def speed_figure(board: Board) -> Figure | None:
             }
         )
     for index, (key, speed, ratio, mark) in enumerate(points):
-        ranked = key in board.ranked
-        symbol = _SYMBOLS[index // len(COLOURS) % len(_SYMBOLS)]
+        symbol = _SYMBOLS[index // len(COLOURS) % len(_SYMBOLS)] + "-open" * (key not in board.ranked)
         traces.append(
             {
                 "type": "scatter",
@@ -206,7 +202,7 @@ def speed_figure(board: Board) -> Figure | None:
                 "x": [significant(speed)],
                 "y": [significant(ratio.value)],
                 "name": wrapped(board.labels[key] + mark),
-                "marker": {"size": 13, "color": palette[key], "symbol": symbol if ranked else f"{symbol}-open"},
+                "marker": {"size": 13, "color": palette[key], "symbol": symbol},
                 "error_y": {
                     "type": "data",
                     "symmetric": False,
@@ -219,21 +215,20 @@ def speed_figure(board: Board) -> Figure | None:
                 "hovertemplate": "%{fullData.name}<br>%{x:.2f} × real time<br>ratio %{y:.3f}<extra></extra>",
             }
         )
-    return {"data": traces, "layout": _speed_layout([(speed, ratio) for _, speed, ratio, _ in points])}
-
-
-def _speed_layout(points: Sequence[tuple[float, Interval]]) -> dict[str, Any]:
-    ends = [end for _, ratio in points for end in (ratio.value, ratio.low, ratio.high)]
     note = {"x": 0, "xref": "x", "y": 1, "yref": "paper", "text": "real time", "showarrow": False}
     note |= {"xanchor": "left", "yanchor": "top", "xshift": 5, "font": {"size": 11, "color": "#6b7280"}}
     speeds = "× real time: frame interval over mean frame time (right is better)"
-    return layout_of(
-        height=max(460, 120 + 21 * len(points)),
-        xaxis=log_axis(speeds, [1.0, *(speed for speed, _ in points)]),
-        yaxis=log_axis("ATE ratio (down is better)", [1.0, *ends]),
-        shapes=[guide(x=1.0), guide(y=1.0)],
-        annotations=[note],
-    )
+    ends = [end for _, _, ratio, _ in points for end in (ratio.value, ratio.low, ratio.high)]
+    return {
+        "data": traces,
+        "layout": layout_of(
+            height=max(460, 120 + 21 * len(points)),
+            xaxis=log_axis(speeds, [1.0, *(speed for _, speed, _, _ in points)]),
+            yaxis=log_axis("ATE ratio (down is better)", [1.0, *ends]),
+            shapes=[guide(x=1.0), guide(y=1.0)],
+            annotations=[note],
+        ),
+    }
 
 
 def repeat_figure(board: Board) -> Figure | None:
@@ -242,26 +237,21 @@ def repeat_figure(board: Board) -> Figure | None:
     traces: list[dict[str, Any]] = []
     everything = [0.9, 1.1]
     for key in board.trackers:
-        values: list[float] = []
-        notes: list[str] = []
+        points = []
         for sequence in board.sequences:
-            cell = board.cells[key].get(sequence)
-            if cell is None or len(cell.succeeded) < 2:
-                continue
-            scores = [row.score_m or 0.0 for row in cell.succeeded]
-            base = max(median(scores), 1e-6)
-            values += [max(score, 1e-6) / base for score in scores]
-            notes += [f"{safe(sequence)}, {row.repeat}" for row in cell.succeeded]
-        if values:
-            everything += values
-            shown = _spread(values)
-            values, notes = [values[at] for at in shown], [notes[at] for at in shown]
+            runs = board.cells[key][sequence].succeeded if sequence in board.cells[key] else ()
+            if len(runs) > 1:
+                base = max(median(row.score_m or 0.0 for row in runs), FLOOR_M)
+                points += [(max(row.score_m or 0.0, FLOOR_M) / base, f"{safe(sequence)}, {row.repeat}") for row in runs]
+        if points:
+            everything += [ratio for ratio, _ in points]
+            points = _drawn(points)
             traces.append(
                 {
                     "type": "box",
-                    "x": rounded(values),
+                    "x": rounded([ratio for ratio, _ in points]),
                     "name": wrapped(board.labels[key]),
-                    "text": notes,
+                    "text": [text for _, text in points],
                     "orientation": "h",
                     "boxpoints": "all",
                     "jitter": 0.5,
@@ -274,15 +264,17 @@ def repeat_figure(board: Board) -> Figure | None:
             )
     if not traces:
         return None
-    layout = layout_of(
-        height=110 + 34 * len(traces),
-        xaxis=log_axis("ATE over the median of the same tracker on the same sequence", everything),
-        yaxis={"autorange": "reversed", "automargin": True, "gridcolor": GRID},
-        shapes=[guide(x=1.0)],
-        margin={"l": 20, "r": 30, "t": 40, "b": 60},
-        showlegend=False,
-    )
-    return {"data": traces, "layout": layout}
+    return {
+        "data": traces,
+        "layout": layout_of(
+            height=110 + 34 * len(traces),
+            xaxis=log_axis("ATE over the median of the same tracker on the same sequence", everything),
+            yaxis={"autorange": "reversed", "automargin": True, "gridcolor": GRID},
+            shapes=[guide(x=1.0)],
+            margin={"l": 20, "r": 30, "t": 40, "b": 60},
+            showlegend=False,
+        ),
+    }
 
 
 def mask_figure(board: Board) -> Figure | None:
@@ -291,50 +283,43 @@ def mask_figure(board: Board) -> Figure | None:
     traces: list[dict[str, Any]] = []
     everything: list[float] = []
     for key in board.trackers:
-        rows = [
-            row for row in board.runs(key) if row.mask_iou is not None and row.score_m is not None and not row.failed
-        ]
-        if rows:
-            rows = [rows[at] for at in _spread([row.score_m or 0.0 for row in rows])]
-            everything += [1000 * max(float(row.score_m or 0.0), 1e-6) for row in rows]
+        points = []
+        for row in board.runs(key):
+            if row.mask_iou is not None and row.score_m is not None and not row.failed:
+                words = f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}"
+                points.append((1000 * max(row.score_m, FLOOR_M), row.mask_iou, words))
+        if points:
+            points = _drawn(points)
+            everything += [error_mm for error_mm, _, _ in points]
             traces.append(
                 {
                     "type": "scatter",
                     "mode": "markers",
                     "name": wrapped(board.labels[key]),
-                    "x": rounded([float(row.mask_iou or 0.0) for row in rows]),
-                    "y": rounded([1000 * max(float(row.score_m or 0.0), 1e-6) for row in rows]),
-                    "text": [
-                        f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}"
-                        for row in rows
-                    ],
+                    "x": rounded([iou for _, iou, _ in points]),
+                    "y": rounded([error_mm for error_mm, _, _ in points]),
+                    "text": [words for _, _, words in points],
                     "marker": {"size": 9, "opacity": 0.85, "color": palette[key]},
                     "hovertemplate": "%{text}<br>IoU %{x:.3f}<br>ATE %{y:.3g} mm<extra>%{fullData.name}</extra>",
                 }
             )
     if not traces:
         return None
-    layout = layout_of(
-        height=max(420, 120 + 21 * len(traces)),
-        xaxis=axis("overlap (IoU) of the dynamic mask with the exact one") | {"range": [-0.02, 1.02]},
-        yaxis=log_axis("ATE (mm)", everything),
-    )
-    return {"data": traces, "layout": layout}
+    return {
+        "data": traces,
+        "layout": layout_of(
+            height=max(420, 120 + 21 * len(traces)),
+            xaxis=axis("overlap (IoU) of the dynamic mask with the exact one") | {"range": [-0.02, 1.02]},
+            yaxis=log_axis("ATE (mm)", everything),
+        ),
+    }
 
 
-def _spread(values: Sequence[float]) -> list[int]:
-    """Which of some values are drawn: all of up to `MOST_POINTS`; of more, from the smallest to the largest."""
-    if len(values) <= MOST_POINTS:
-        return list(range(len(values)))
-    order = np.argsort(values, kind="stable")
-    shown = order[np.linspace(0, len(values) - 1, MOST_POINTS).round().astype(int)]
-    return sorted(int(at) for at in shown)
-
-
-def _pareto(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Points (speed, error) that no other beats in both, from slow to fast."""
-    front = [p for p in points if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in points)]
-    return sorted(set(front))
+def _drawn(points: Sequence[P]) -> list[P]:
+    """At most `MOST_POINTS` points; of more every second, third, ... from the smallest to the largest first number."""
+    step = max(1, -(-len(points) // MOST_POINTS))
+    order = sorted(range(len(points)), key=lambda at: points[at][0])[::step]
+    return [points[at] for at in sorted(order)]
 
 
 # The paper's Figures 9 to 12, drawn of our own runs: bars of the absolute error, one figure a statistic.
@@ -351,9 +336,9 @@ def bar_figure(board: Board, statistic: str) -> Figure | None:
         statistic: ``mean``, ``median``, ``rmse`` or ``std``.
     """
     palette = colours(board)
-    errors = medians(board, lambda row: row.metrics.get(f"ate_{statistic}_m"), board.trackers)
+    errors = medians(board, lambda row: row.metrics.get(f"ate_{statistic}_m"))
     traces = []
-    for key in dict.fromkeys(key for key, _ in errors):
+    for key in [key for key in board.trackers if any(key == measured for measured, _ in errors)]:
         names = [name for name in board.sequences if (key, name) in errors]
         traces.append(
             {
@@ -370,45 +355,12 @@ def bar_figure(board: Board, statistic: str) -> Figure | None:
         )
     if not traces:
         return None
-    layout = layout_of(
-        height=max(380, 110 + 19 * len(traces)),
-        barmode="group",
-        xaxis=axis("sequence", type="category"),
-        yaxis=axis(f"absolute pose error, {STATISTICS[statistic]} (mm)") | {"rangemode": "tozero"},
-    )
-    return {"data": traces, "layout": layout}
-
-
-# Series along a trajectory, made fit to be drawn.
-
-_MOST_POINTS = 500
-
-
-def broken(
-    stamps: NDArray[np.float64], values: NDArray[np.float64], most: int = _MOST_POINTS
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Thin a series and put NaN where the time between two poses exceeds twice the median interval.
-
-    Args:
-        stamps: Seconds ``[N]``.
-        values: ``[N, K]``.
-        most: About how many points to keep.
-
-    Returns:
-        Stamps ``[M]`` and values ``[M, K]`` with NaN rows in the gaps.
-    """
-    if len(stamps) < 3:
-        return stamps, values
-    intervals = np.diff(stamps)
-    piece = np.concatenate([[0], np.cumsum(intervals > 2 * np.median(intervals))])
-    step = max(1, -(-len(stamps) // most))
-    keep = np.arange(len(stamps)) % step == 0
-    edge = np.diff(piece) > 0
-    keep |= np.append(edge, True) | np.append(True, edge)  # the ends of every piece stay
-    kept = np.flatnonzero(keep)
-    breaks = np.flatnonzero(np.diff(piece[kept]) > 0) + 1
-    middle = (stamps[kept][breaks - 1] + stamps[kept][breaks]) / 2
-    return (
-        np.insert(stamps[kept], breaks, middle),
-        np.insert(values[kept], breaks, np.nan, axis=0),
-    )
+    return {
+        "data": traces,
+        "layout": layout_of(
+            height=max(380, 110 + 19 * len(traces)),
+            barmode="group",
+            xaxis=axis("sequence", type="category"),
+            yaxis=axis(f"absolute pose error, {STATISTICS[statistic]} (mm)") | {"rangemode": "tozero"},
+        ),
+    }

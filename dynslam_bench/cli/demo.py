@@ -162,7 +162,7 @@ def demo_board(store: RunStore) -> Board:
 def leaderboard_text(board: Board) -> str:
     """The leaderboard and the errors by sequence, as aligned text."""
     from dynslam_bench.evaluation import get_protocol
-    from dynslam_bench.reports.tables.errors import per_sequence
+    from dynslam_bench.reports.tables.leaderboard import per_sequence
     from dynslam_bench.reports.tables.leaderboard import leaderboard
 
     protocol = get_protocol(PROTOCOL)

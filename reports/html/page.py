@@ -22,9 +22,9 @@ from dynslam_bench.reports.figures import Figure
 from dynslam_bench.reports.tables.table import Table
 
 _STYLES = ("report.css", "figures.css")
-_CHARTS = ("scales.js", "marks.js", "chart.js", "hover.js", "store.js", "page.js")
+_CHARTS = ("scales.js", "traces.js", "chart.js", "hover.js", "store.js", "page.js")
 _EXPLORE = ("explore.js", "explore_figures.js", "tracks.js")
-_RUN = ("run.js", "run_figures.js", "space.js", "looks.js")
+_RUN = ("run.js", "run_figures.js", "view3d.js", "annotations.js")
 
 
 @dataclass
@@ -33,18 +33,15 @@ class Block:
 
     Attributes:
         kind: Which of the other attributes count.
-        title: Heading above it.
+        title: Heading above it, or what is seen of it when it is closed.
         table: For ``table``.
         figure: Id of the figure, for ``figure``.
         chart: Its specification.
-        caption: Below the figure.
+        caption: Below the figure, or behind the title of ``tracks``.
         text: For ``code``.
         entries: For ``list``.
-        summary: For ``tracks``: what is seen when it is closed.
-        small: Behind the summary.
-        open: Whether it is open at first.
         tracks: For ``tracks``: the runs to draw, each with its name and colour and whether it is shown at first.
-        folded: Whether a table or list is closed at first, behind its title.
+        folded: Whether a table, a list or tracks are closed at first, behind their title.
     """
 
     kind: Literal["table", "figure", "code", "list", "caption", "tracks", "explore"]
@@ -55,9 +52,6 @@ class Block:
     caption: str = ""
     text: str = ""
     entries: list[str] = field(default_factory=list)
-    summary: str = ""
-    small: str = ""
-    open: bool = False
     tracks: list[dict[str, Any]] = field(default_factory=list)
     folded: bool = False
 
@@ -81,9 +75,9 @@ class Section:
     blocks: list[Block] = field(default_factory=list)
 
 
-def folded(table: Table | None) -> list[Block]:
-    """A block that shows a table behind its own title, closed at first; none for no table."""
-    return [] if table is None else [Block("table", table.title, table, folded=True)]
+def table_blocks(*tables: Table | None, folded: bool = False) -> list[Block]:
+    """Blocks that show the tables that there are; folded ones are closed at first, behind their titles."""
+    return [Block("table", t.title if folded else "", t, folded=folded) for t in tables if t is not None]
 
 
 def figure_blocks(name: str, chart: Figure | None, caption: str = "") -> list[Block]:

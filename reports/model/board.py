@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
@@ -18,8 +19,9 @@ from dynslam_bench.evaluation.prepare import common_frames
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores, run_jobs
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
-from dynslam_bench.reports.model.row import RunRow, grouped
+from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
+from dynslam_bench.runs.run_index import part_words
 from dynslam_bench.runs.store import RunStore
 
 if TYPE_CHECKING:
@@ -34,6 +36,8 @@ _GROUPS = {"static": "static", "low-dynamic": "low dynamic", "high-dynamic": "hi
 """Tag of a sequence to the name of its group, in their order."""
 _NAMES = (("walking", "high dynamic"), ("sitting", "low dynamic"))
 _OTHER = "other"
+_MOST_MISSING = 8
+"""Trackers whose missing cells are named."""
 
 
 @dataclass
@@ -59,7 +63,7 @@ class Board:
         reference_name: How to call the reference in captions.
         asked_reference: The tracker id that was asked for as the reference; empty for none.
         standings: Standing of every variant with a score on the common sequences, in order.
-        ranked: Variant keys that take part in the ranking.
+        ranked: Variant keys that take part in the ranking, from the best to the worst.
         incomplete: Variant keys of rankable trackers that are not ranked since they lack sequences.
         no_better: Variant keys of trackers that are not ranked since they are no better than a static camera: the
             geometric mean of their errors over its on the common sequences is 1 or more.
@@ -125,9 +129,14 @@ class Board:
         pairs = [(self.cells[key][name].median or 0.0, self.static_camera[name]) for name in self.common]
         return geometric_mean([max(error, FLOOR_M) / max(static, FLOOR_M) for error, static in pairs])
 
-    def ranked_order(self) -> list[str]:
-        """Ranked trackers from the best to the worst."""
-        return [key for key in self.trackers if key in self.ranked]
+    def scored(self, key: str) -> list[str]:
+        """The sequences on which a tracker has a score."""
+        return [name for name in self.sequences if name in self.cells[key] and self.cells[key][name].scores]
+
+    def typical_runs(self, sequence: str) -> dict[str, RunRow]:
+        """Of each tracker that succeeded on a sequence the run that stands for it, see `Cell.typical`."""
+        cells = {key: self.cells[key][sequence] for key in self.trackers if sequence in self.cells[key]}
+        return {key: cell.typical for key, cell in cells.items() if cell.succeeded}
 
     def frame(self) -> pd.DataFrame:
         """All rows as a pandas frame; see `rows_frame` for its columns and units."""
@@ -136,10 +145,6 @@ class Board:
     def competes(self, key: str, name: str) -> bool:
         """Whether a tracker's number on a sequence may rank: no network that it uses was trained there."""
         return self.rank_seen or not self.cells[key][name].in_training
-
-    def lacking(self, key: str) -> list[str]:
-        """The sequences on which a tracker was not run."""
-        return [name for name in self.sequences if name not in self.cells[key]]
 
     def reference_median(self, sequence: str) -> float | None:
         """The reference's median error on a sequence; None where it was not run."""
@@ -154,9 +159,8 @@ class Board:
 
     def separators(self) -> set[int]:
         """Rows of a table of all trackers above which a line is drawn: the unranked, and those that never succeeded."""
-        unranked = sum(key in self.ranked for key in self.trackers)
         failed = len(self.trackers) - sum(key in self.hopeless for key in self.trackers)
-        return {at for at in (unranked, failed) if 0 < at < len(self.trackers)}
+        return {at for at in (len(self.ranked), failed) if 0 < at < len(self.trackers)}
 
 
 def make_board(
@@ -187,17 +191,22 @@ def make_board(
     for key in board.labels:
         cells = grouped(board.runs(key), board.sequence)
         board.cells[key] = {name: make_cell(runs) for name, runs in cells.items()}
-    board.final_only = [key for key in board.labels if all(row.only_final for row in board.runs(key))]
+    board.final_only = [key for key in board.labels if all(map(_is_final_only, board.runs(key)))]
     shown = [key for key in board.labels if key not in board.final_only]
-    scored = [key for key in shown if _scored(board, key)]
+    scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
     _choose_reference(board, scored, reference or DEFAULT_REFERENCE)
-    if board.common:
-        board.standings = rank(board, scored, board.ranked)
+    board.standings = rank(board, scored, board.ranked)
     placed = [standing.key for standing in board.standings]
     placed += sorted((key for key in shown if key not in placed), key=board.labels.__getitem__)
     board.trackers = sorted(placed, key=lambda key: key in board.hopeless)
+    board.ranked = [key for key in board.trackers if key in board.ranked]
     return board
+
+
+def _is_final_only(row: RunRow) -> bool:
+    """Whether an import has nothing of the trajectory that the protocol asks for."""
+    return row.imported and not row.metrics and row.final_ate_m is not None
 
 
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
@@ -206,7 +215,7 @@ def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None
     for key in scored:
         row = board.first(key)
         plain = row.is_current and not row.imported and not row.realtime and "map" not in row.variant
-        if row.tracker.id == tracker and plain and set(board.common) <= set(_scored(board, key)):
+        if row.tracker.id == tracker and plain and set(board.common) <= set(board.scored(key)):
             candidates.append(key)
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
@@ -249,12 +258,13 @@ def _order_sequences(board: Board) -> None:
             board.static_camera[name] = median(errors)
         else:
             board.unscored.append(name)
-        board.groups[name] = _group(rows[0])
+        tagged = [group for tag, group in _GROUPS.items() if tag in rows[0].sequence.tags]
+        named = [group for part, group in _NAMES if part in rows[0].sequence.id]
+        board.groups[name] = [*tagged, *named, _OTHER][0]
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
-    order = list(_GROUPS.values())
-    place = {name: order.index(group) if group in order else len(order) for name, group in board.groups.items()}
-    board.sequences = sorted(board.static_camera, key=lambda name: (place[name], name))
+    order = [*_GROUPS.values(), _OTHER, ""]
+    board.sequences = sorted(board.static_camera, key=lambda name: (order.index(board.groups[name]), name))
     board.short = shortened(board.sequences)
 
 
@@ -267,11 +277,9 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     trained (`Board.competes`).
     """
     rankable = [key for key in scored if board.is_rankable(key)]
-    if not all(board.first(key).realtime for key in rankable):  # real-time runs are ranked among themselves only
-        rankable = [key for key in rankable if not board.first(key).realtime]
-    rankable = [key for key in rankable if any(cell.success for cell in board.cells[key].values())]
-    has = {key: {name for name in _scored(board, key) if board.competes(key, name)} for key in rankable}
-    rankable = [key for key in rankable if has[key]]
+    rankable = [key for key in rankable if not board.first(key).realtime] or rankable  # never beside real-time runs
+    has = {key: {name for name in board.scored(key) if board.competes(key, name)} for key in rankable}
+    rankable = [key for key in rankable if has[key] and any(cell.success for cell in board.cells[key].values())]
     competing = sorted(rankable, key=lambda key: (-len(has[key]), key))
     if board.on == "all":
         competing = [key for key in competing if has[key] == set(board.sequences)]
@@ -280,29 +288,16 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     competing = competing[: max(several, key=lambda n: (several[n], n), default=0)]
     shared = set.intersection(*(has[key] for key in competing)) if competing else set(board.sequences)
     board.common = [name for name in board.sequences if name in shared]
-    board.hopeless = [key for key in scored if not _succeeded(board, key)]
-    ended = [key for key in scored if key in competing and key not in board.hopeless]
-    board.no_better = [key for key in ended if board.static_ratio(key) >= 1 - 1e-9]
-    board.ranked = [key for key in ended if key not in board.no_better]
     board.incomplete = [key for key in rankable if key not in competing]
-
-
-def _succeeded(board: Board, key: str) -> bool:
-    """Whether any run on the common sequences did; on its others, if it was run on none of those."""
-    cells = board.cells[key]
-    names = [name for name in board.common if name in cells] or list(cells)
-    return any(cells[name].success for name in names)
-
-
-def _scored(board: Board, key: str) -> list[str]:
-    """The sequences on which a tracker has a score."""
-    return [name for name in board.sequences if name in board.cells[key] and board.cells[key][name].scores]
-
-
-def _group(row: RunRow) -> str:
-    tagged = [name for tag, name in _GROUPS.items() if tag in row.sequence.tags]
-    named = [name for part, name in _NAMES if part in row.sequence.id]
-    return next(iter([*tagged, *named]), _OTHER)
+    for key in scored:
+        cells = board.cells[key]
+        judged = [name for name in board.common if name in cells] or list(cells)
+        if not any(cells[name].success for name in judged):
+            board.hopeless.append(key)
+        elif key in competing and board.static_ratio(key) >= 1 - 1e-9:
+            board.no_better.append(key)
+        elif key in competing:
+            board.ranked.append(key)
 
 
 @dataclass(frozen=True)
@@ -364,18 +359,16 @@ class Cell:
         endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))
         return endings[0] if len(endings) == 1 else f"{self.failed} failed: {'; '.join(endings)}" if endings else ""
 
-    @property
-    def epipolar_skipped(self) -> float | None:
-        """Mean share of the tracked frames on which the fundamental matrix was not used; None without such a test."""
-        return mean_skipped(self.rows)
-
 
 def make_cell(rows: Sequence[RunRow]) -> Cell:
     """Order the runs of a cell and find the copies among them."""
     ordered = sorted(rows, key=lambda row: row.repeat_key)
     kept: list[RunRow] = []
     for group in grouped(ordered, lambda row: (row.offset, row.sequence.noise, row.imported)).values():
-        results = {_result(row) for row in group}
+        results = {
+            (row.status, row.n_processed, row.coverage, row.score_m, row.final_ate_m, *sorted(row.metrics.items()))
+            for row in group
+        }
         kept += group[:1] if len(results) == 1 else group
     return Cell(tuple(ordered), tuple(kept))
 
@@ -386,19 +379,74 @@ def mean_skipped(rows: Sequence[RunRow]) -> float | None:
     return sum(shares) / len(shares) if shares else None
 
 
-def _result(row: RunRow) -> object:
-    """Everything that two copies have in common."""
-    return row.status, row.n_processed, row.coverage, row.score_m, row.final_ate_m, tuple(sorted(row.metrics.items()))
+# -- the cells that are missing, and the commands that fill them
 
 
-_TEXTS = ["run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"]
-_TEXTS += ["repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"]
-_KINDS = dict.fromkeys(_TEXTS, "string")
-_KINDS |= dict.fromkeys(["seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"], "Int64")
-_KINDS |= dict.fromkeys(["ranked", "failed", "cached", "seen_in_training"], "boolean")
-_NUMBERS = ["coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"]
-_NUMBERS += ["real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"]
-_KINDS |= dict.fromkeys(_NUMBERS, "Float64")
+def lacking(board: Board) -> dict[str, list[str]]:
+    """The sequences on which each tracker that could be ranked was not run."""
+    rankable = [key for key in board.trackers if board.is_rankable(key)]
+    lacking = {key: [name for name in board.sequences if name not in board.cells[key]] for key in rankable}
+    return {key: names for key, names in lacking.items() if names}
+
+
+def missing_note(board: Board) -> str:
+    """One paragraph: what the ranking stands on, and what is missing for more; empty where nothing is."""
+    missing = lacking(board)
+    if not missing:
+        return ""
+    common, total = len(board.common), len(board.sequences)
+    left = ", ".join(board.labels[key] for key in board.incomplete)
+    why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
+    cells = []
+    for key, names in list(missing.items())[:_MOST_MISSING]:
+        others = f" and {len(names) - 4} more" if len(names) > 4 else ""
+        cells.append(f"{board.labels[key]} on {', '.join(names[:4])}{others}")
+    if len(missing) > _MOST_MISSING:
+        cells.append(f"and {len(missing) - _MOST_MISSING} more trackers")
+    sentences = {
+        f"The ranking stands on the {common} of {total} sequences that all ranked trackers have.": (
+            board.on == "common" and board.ranked and common < total
+        ),
+        f"Not ranked, since they {why}: {left}.": left,
+        f"Missing cells: {'; '.join(cells)}. The commands that fill them stand at the end of this section.": True,
+    }
+    return " ".join(sentence for sentence, holds in sentences.items() if holds)
+
+
+def missing_commands(board: Board) -> list[str]:
+    """Commands that make the runs of the missing cells of all that can be run here."""
+    commands: list[str] = []
+    plainest = sorted(board.rows, key=lambda row: (row.sequence.noise is not None, row.offset))
+    by_sequence = grouped(plainest, board.sequence)
+    for key, names in lacking(board).items():
+        if board.first(key).imported:
+            continue
+        seeds = sorted({run.seed for run in board.runs(key)})
+        offsets = sorted({run.offset for run in board.runs(key)})
+        repeats = ["--seed", *map(str, seeds)] if seeds != [0] else []
+        repeats += ["--offset", *map(str, offsets)] if offsets != [0] else []
+        others = grouped((by_sequence[name][0] for name in names), lambda row: tuple(part_options(row)))
+        for part, rows in others.items():
+            places = [row.place or row.sequence.id for row in rows]
+            commands.append(command_with(board.first(key), [*places, *part, *repeats]))
+    return commands
+
+
+# -- the rows as a frame
+
+_COLUMNS = {
+    "string": (
+        *("run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"),
+        *("repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"),
+    ),
+    "Int64": ("seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"),
+    "boolean": ("ranked", "failed", "cached", "seen_in_training"),
+    "Float64": (
+        *("coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"),
+        *("real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"),
+    ),
+}
+"""Type of a column to the names."""
 
 
 def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
@@ -428,8 +476,8 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
     import pandas as pd
 
     ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
-    metrics = sorted({name for row in rows for name in row.metrics} - set(_NUMBERS))
-    kinds = _KINDS | dict.fromkeys(metrics, "Float64")
+    metrics = sorted({name for row in rows for name in row.metrics} - set(_COLUMNS["Float64"]))
+    kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(metrics, "Float64")
     lines = []
     for row in ordered:
         values: dict[str, Any] = {
@@ -439,7 +487,7 @@ def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mappi
             "settings": "; ".join(assignments(row.variant)),
             "provenance": row.tracker.provenance,
             "sequence": columns[row.column_id],
-            "frames": row.frame_words,
+            "frames": part_words(row),
             "split": row.sequence.split,
             "study": row.trial_of,
             "noise": row.sequence.noise,
@@ -511,69 +559,50 @@ def common_errors(
 
     Of more than `MOST_COMPARED` runs on a sequence these are the runs of each tracker around its median error.
     """
-    jobs = [(around_medians(successful(board, sequence)), protocol) for sequence in board.sequences]
-    answers = run_jobs(pool, common_of, jobs, lambda _: None)
+    jobs = [(compared_runs(board, sequence), protocol) for sequence in board.sequences]
+    answers = run_jobs(pool, _common_of, jobs)
     errors: dict[tuple[str, str], float] = {}
     frames: dict[str, str] = {}
-    for sequence, (rows, _), (of_run, count) in zip(board.sequences, jobs, answers, strict=True):
-        if count is None:
-            continue
-        compared = [row for row in rows if row.run_id in of_run]
-        frames[sequence] = f"{count} of {max(row.n_frames for row in compared)}"
-        for key, rows_of_key in grouped(compared, lambda row: row.variant_key).items():
-            values = [error for row in rows_of_key if (error := of_run[row.run_id]) is not None]
-            if values:
-                errors[key, sequence] = median(values)
+    for sequence, (medians, words) in zip(board.sequences, answers, strict=True):
+        errors |= {(key, sequence): error for key, error in medians.items()}
+        if words:
+            frames[sequence] = words
     return errors, frames
 
 
-def common_of(rows: Sequence[RunRow], protocol: Protocol) -> tuple[dict[str, float | None], int | None]:
-    """ATE of runs on one sequence on the frames that all of them tracked, by run, and how many those are.
-
-    Returns:
-        Of every run with a trajectory its error, None where it cannot be taken; nothing, and None, for the runs of a
-        single tracker.
-    """
+def _common_of(rows: Sequence[RunRow], protocol: Protocol) -> tuple[dict[str, float], str]:
+    """Median ATE by variant on the frames that all runs tracked, and how many those are; nothing for one variant."""
     pairs = [(row, row.estimate(protocol.trajectory)) for row in rows]
     tracked = [(row, trajectory) for row, trajectory in pairs if trajectory is not None]
     if len({row.variant_key for row, _ in tracked}) < 2:
-        return {}, None
+        return {}, ""
     reduced = common_frames([trajectory for _, trajectory in tracked])
-    errors: dict[str, float | None] = {}
+    errors: dict[str, list[float]] = {}
     for (row, whole), trajectory in zip(tracked, reduced, strict=True):
-        if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # the error is that of the row
-            errors[row.run_id] = row.metrics["ate_rmse_m"]
-            continue
-        truth = row.ground_truth()
-        try:
-            errors[row.run_id] = None if truth is None else ate_rmse_m(trajectory, truth, protocol)
-        except DynslamError:
-            errors[row.run_id] = None
-    return errors, len(reduced[0])
+        with suppress(DynslamError):
+            truth = row.ground_truth()
+            if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # the error is that of the row
+                errors.setdefault(row.variant_key, []).append(row.metrics["ate_rmse_m"])
+            elif truth is not None:
+                errors.setdefault(row.variant_key, []).append(ate_rmse_m(trajectory, truth, protocol))
+    words = f"{len(reduced[0])} of {max(row.n_frames for row, _ in tracked)}"
+    return {key: median(values) for key, values in errors.items()}, words
 
 
-def representatives(board: Board, sequence: str) -> dict[str, RunRow]:
-    """Of each tracker the successful run on a sequence whose error is the (lower) median one."""
-    by_key = _by_error(successful(board, sequence))
-    return {key: by_key[key][(len(by_key[key]) - 1) // 2] for key in board.trackers if key in by_key}
+def compared_runs(board: Board, sequence: str) -> list[RunRow]:
+    """The runs on a sequence that ended and could be evaluated, copies left out.
 
-
-def around_medians(rows: Sequence[RunRow]) -> Sequence[RunRow]:
-    """All of few runs on a sequence; of many, as many of each tracker: those around its (lower) median error."""
-    if len(rows) <= MOST_COMPARED:
-        return rows
-    by_key = _by_error(rows)
-    most = max(MOST_COMPARED // len(by_key), 1)
-    starts = {key: max((len(ordered) - most) // 2, 0) for key, ordered in by_key.items()}
-    return [row for key, ordered in by_key.items() for row in ordered[starts[key] : starts[key] + most]]
-
-
-def _by_error(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
-    """Runs by tracker, from the smallest to the largest error."""
-    return grouped(sorted(rows, key=lambda row: row.metrics["ate_rmse_m"]), lambda row: row.variant_key)
-
-
-def successful(board: Board, sequence: str) -> list[RunRow]:
-    """The runs on a sequence that ended and could be evaluated, copies left out."""
-    rows = [row for cells in board.cells.values() if sequence in cells for row in cells[sequence].kept]
-    return [row for row in rows if not row.failed and "ate_rmse_m" in row.metrics]
+    Of more than `MOST_COMPARED` as many of each tracker: those around its (lower) median error.
+    """
+    kept = [row for cells in board.cells.values() if sequence in cells for row in cells[sequence].kept]
+    evaluated = [row for row in kept if not row.failed and "ate_rmse_m" in row.metrics]
+    if len(evaluated) <= MOST_COMPARED:
+        return evaluated
+    ordered = sorted(evaluated, key=lambda row: row.metrics["ate_rmse_m"])
+    chosen = []
+    by_tracker = grouped(ordered, lambda row: row.variant_key)
+    most = max(MOST_COMPARED // len(by_tracker), 1)
+    for runs in by_tracker.values():
+        first = max((len(runs) - most) // 2, 0)
+        chosen += runs[first : first + most]
+    return chosen

@@ -11,10 +11,11 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import starmap
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from types import ModuleType
@@ -73,41 +74,30 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def run_jobs(
-    pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]], on_answer: Callable[[T], None]
-) -> list[T]:
+def run_jobs(pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]) -> Iterator[T]:
     """Call a function once a job, in worker processes or here.
 
     Args:
         pool: The workers; None to call it here.
         function: A function of a module.
         jobs: Its arguments.
-        on_answer: Called with every answer as it arrives.
 
-    Returns:
-        The answers in the order of the jobs.
+    Yields:
+        The answers in the order of the jobs, each as soon as it is there.
 
     Raises:
         DynslamError: A job cannot be done.
         InfrastructureError: A worker has died.
     """
     if pool is None:
-        answers = []
-        for job in jobs:
-            answers.append(function(*job))
-            on_answer(answers[-1])
-        return answers
+        yield from starmap(function, jobs)
+        return
     with _without_main():
-        futures = [pool.submit(function, *job) for job in jobs]
+        answers = pool.map(function, *zip(*jobs, strict=True))
     try:
-        for future in as_completed(futures):
-            on_answer(future.result())
+        yield from answers
     except BrokenProcessPool as error:
         raise InfrastructureError(f"a worker process of the report ended early: {error}") from error
-    finally:
-        for future in futures:
-            future.cancel()
-    return [future.result() for future in futures]
 
 
 @contextmanager
@@ -124,55 +114,48 @@ def _without_main() -> Iterator[None]:
 # -- rows of unchanged runs
 
 
-class RowCache:
-    """Rows of a store's runs under a protocol, kept in the store's index: an unchanged run is not read again.
+Scored = tuple[list[tuple[RunRow, str]], list[str]]
+"""Rows with the states of their run's files, and the folders without a valid record, with reasons."""
 
-    Args:
-        store: The store.
-        protocol: How errors are computed.
-    """
 
-    def __init__(self, store: RunStore, protocol: Protocol) -> None:
-        self.store, self.protocol = store, protocol
-        self._name = f"report {protocol.digest()}"
-        self._version = digest([dynslam_bench.__version__, package_digest(_CODE)])
+def _place(protocol: Protocol) -> tuple[str, str]:
+    """Under which name and version a store's index holds the rows of a protocol."""
+    return f"report {protocol.digest()}", digest([dynslam_bench.__version__, package_digest(_CODE)])
 
-    def read(self) -> dict[str, RunRow]:
-        """The rows that hold, by run id; damaged rows, and rows of other runs, count as missing."""
-        rows = {}
-        for run_id, text in self.store.index.read(
-            self._name, self._version, self.store.ids(), check_links=True
-        ).items():
-            with suppress(ValidationError):
-                row = RunRow.model_validate_json(text)
-                if (row.run_id, row.protocol_digest) == (run_id, self.protocol.digest()):
-                    rows[run_id] = row.stored_in(self.store)
-        return rows
 
-    def take(self, run_ids: Sequence[str]) -> tuple[list[tuple[RunRow, str]], list[str]]:
-        """Read some runs and score them.
+def _unchanged_rows(store: RunStore, protocol: Protocol) -> dict[str, RunRow]:
+    """The rows of unchanged runs, by run id; damaged rows, and rows of other runs, count as missing."""
+    rows = {}
+    for run_id, text in store.index.read(*_place(protocol), store.ids(), check_links=True).items():
+        with suppress(ValidationError):
+            row = RunRow.model_validate_json(text)
+            if (row.run_id, row.protocol_digest) == (run_id, protocol.digest()):
+                row.store = store
+                rows[run_id] = row
+    return rows
 
-        Returns:
-            The rows with the states of their files, and the folders without a valid record, with reasons.
-        """
-        rows = []
-        unreadable = []
-        for run_id in run_ids:
-            try:
-                record, state = self.store.read_with_state(run_id)
-                rows.append((make_row(self.store, record, self.protocol), state))
-            except DynslamError as error:
-                unreadable.append(f"{self.store.folder(run_id)}: {error}")
-        return rows, unreadable
 
-    def add(self, rows: Iterable[tuple[RunRow, str]]) -> None:
-        """Keep rows for later reports, as far as the store can be written."""
-        entries = []
-        for row, state in rows:
-            with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
-                entries.append((row.run_id, state, row.model_dump_json(exclude_defaults=True)))
-        if entries:
-            self.store.index.write(self._name, self._version, entries)
+def _score_runs(store: RunStore, protocol: Protocol, run_ids: Sequence[str]) -> Scored:
+    """Read some runs and score them."""
+    rows = []
+    unreadable = []
+    for run_id in run_ids:
+        try:
+            record, state = store.read_with_state(run_id)
+            rows.append((make_row(store, record, protocol), state))
+        except DynslamError as error:
+            unreadable.append(f"{store.folder(run_id)}: {error}")
+    return rows, unreadable
+
+
+def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow, str]]) -> None:
+    """Keep rows for later reports, as far as the store can be written."""
+    entries = []
+    for row, state in rows:
+        with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
+            entries.append((row.run_id, state, row.model_dump_json(exclude_defaults=True)))
+    if entries:
+        store.index.write(*_place(protocol), entries)
 
 
 # -- runs that count
@@ -223,7 +206,9 @@ def load_runs(
     """
     on_progress(0, None, "looking for what has changed")
     loaded = Loaded()
-    everything = _all_rows([RowCache(store, protocol) for store in stores], loaded, on_progress, pool)
+    everything = []
+    for store in stores:
+        everything += _all_rows(store, protocol, loaded, on_progress, pool)
     ended = [row for row in everything if row.status != "stopped"]
     scaled = [row for row in ended if protocol.finds_scale or row.tracker.sensors != "rgb"]
     rows = [row for row in scaled if trials or not row.trial_of]
@@ -247,32 +232,23 @@ def load_runs(
 
 
 def _all_rows(
-    caches: Sequence[RowCache], loaded: Loaded, on_progress: OnProgress, pool: Executor | None
+    store: RunStore, protocol: Protocol, loaded: Loaded, on_progress: OnProgress, pool: Executor | None
 ) -> list[RunRow]:
-    """The rows of all runs of some stores: those that hold, and those that are read now."""
-    kept = [cache.read() for cache in caches]
-    jobs = []
+    """The rows of all runs of a store: those of unchanged runs, and those that are read now."""
+    rows = _unchanged_rows(store, protocol)
+    unread = [run_id for run_id in store.ids() if run_id not in rows]
     size = 1 if pool is None else JOB
-    for cache, rows in zip(caches, kept, strict=True):
-        unread = [run_id for run_id in cache.store.ids() if run_id not in rows]
-        jobs += [(cache, unread[first : first + size]) for first in range(0, len(unread), size)]
-    total, done = sum(len(run_ids) for _, run_ids in jobs), 0
-
-    def on_answer(answer: tuple[list[tuple[RunRow, str]], list[str]]) -> None:
-        nonlocal done
-        rows, unreadable = answer
-        done += len(rows) + len(unreadable)
-        on_progress(done, total, f"scoring {rows[-1][0].tracker.id} on {rows[-1][0].sequence.id}" if rows else "")
-
-    taken: dict[int, list[tuple[RunRow, str]]] = {id(cache): [] for cache in caches}
-    for (cache, _), (new_rows, unreadable) in zip(jobs, run_jobs(pool, RowCache.take, jobs, on_answer), strict=True):
-        taken[id(cache)] += new_rows
+    jobs = [(store, protocol, unread[first : first + size]) for first in range(0, len(unread), size)]
+    scored: list[tuple[RunRow, str]] = []
+    done = 0
+    for new_rows, unreadable in run_jobs(pool, _score_runs, jobs):
+        scored += new_rows
         loaded.unreadable += unreadable
-    everything = []
-    for cache, rows in zip(caches, kept, strict=True):
-        cache.add(taken[id(cache)])
-        everything += [*rows.values(), *(row for row, _ in taken[id(cache)])]
-    return everything
+        done += len(new_rows) + len(unreadable)
+        last = f"scoring {scored[-1][0].tracker.id} on {scored[-1][0].sequence.id}" if new_rows else ""
+        on_progress(done, len(unread), last)
+    _keep_rows(store, protocol, scored)
+    return [*rows.values(), *(row for row, _ in scored)]
 
 
 def without_scale_words(count: int, protocol: Protocol) -> str:
@@ -339,15 +315,15 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
     """
     if isinstance(runs, RunStore):
         return [runs]
-    paths = [Path(runs)] if isinstance(runs, str | Path) else [Path(path) for path in runs]
-    if not paths:
-        raise ReportError("no results folder was given", "for example results")
+    folders = [Path(runs)] if isinstance(runs, str | Path) else [Path(path) for path in runs]
     stores = []
-    for folder in (path.expanduser() for path in paths):
-        if not folder.is_dir():
-            raise ReportError(f"there is no results folder {folder}", "make runs first, or name their folder")
-        root = folder.parent if folder.name == "runs" and not (folder / "runs").is_dir() else folder
+    for folder in folders:
+        root = folder.expanduser()
+        if not root.is_dir():
+            raise ReportError(f"there is no results folder {root}", "make runs first, or name their folder")
+        if root.name == "runs" and not (root / "runs").is_dir():
+            root = root.parent
         if not (root / "runs").is_dir():
-            raise ReportError(f"{folder} holds no runs: it has no folder 'runs'", "name the folder given as --results")
+            raise ReportError(f"{root} holds no runs: it has no folder 'runs'", "name the folder given as --results")
         stores.append(RunStore(root))
     return stores

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from dynslam_bench.core.toml import label_text, setting_text
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
+from dynslam_bench.runs.run_index import part_words
 
 
 def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
@@ -59,7 +59,8 @@ def _name(row: RunRow) -> str:
     """Sequence without its noise, and part of it."""
     base, _, query = row.sequence.id.partition("?")
     kept = "&".join(word for word in query.split("&") if word and not word.startswith("noise="))
-    return base + (f"?{kept}" if kept else "") + (f" [{row.frame_words}]" if row.frame_words else "")
+    part = part_words(row)
+    return base + (f"?{kept}" if kept else "") + (f" [{part}]" if part else "")
 
 
 def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
@@ -72,17 +73,15 @@ def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
         for length in range(1, max(map(len, places.values())) + 1):
             tails = {column: "/".join(parts[-length:]) for column, parts in places.items()}
             if len(set(tails.values())) == len(set(places.values())):
-                part = _split(name)[2]
-                names = {column: tail + part for column, tail in tails.items()}
+                names = {column: tail + _split(name)[2] for column, tail in tails.items()}
                 break
-    marks: tuple[Callable[[str, RunRow], str], ...] = (
-        lambda _, row: _camera_words(row),
-        lambda _, row: f"content {row.sequence.content[:6]}" if row.sequence.content else "",
-        lambda column, _: f"frames {column[:6]}",
-        lambda column, _: column,
-    )
-    for mark in marks:
-        words = {column: mark(column, row) for column, row in group.items()}
+    contents = {column: row.sequence.content[:6] for column, row in group.items()}
+    for words in (
+        {column: _camera_words(row) for column, row in group.items()},
+        {column: f"content {content}" if content else "" for column, content in contents.items()},
+        {column: f"frames {column[:6]}" for column in group},
+        {column: column for column in group},
+    ):
         if len(set(names.values())) < len(names) and len(set(words.values())) > 1:
             names = {column: f"{name} ({words[column]})" if words[column] else name for column, name in names.items()}
     return names
@@ -91,13 +90,10 @@ def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
 def _camera_words(row: RunRow) -> str:
     """The camera in a few words, empty if the record does not name it."""
     camera = row.identity.get("camera")
-    if not isinstance(camera, dict) or not {"width", "height", "fx", "fy"} <= camera.keys():
+    values = [camera.get(name) for name in ("width", "height", "fx", "fy")] if isinstance(camera, dict) else [None]
+    if not all(isinstance(value, int | float) for value in values):
         return ""
-    width, height, fx, fy = (
-        f"{value:g}" if isinstance(value, int | float) else str(value)
-        for value in (camera[name] for name in ("width", "height", "fx", "fy"))
-    )
-    return f"camera {width}x{height}, f {fx} {fy}"
+    return "camera {:g}x{:g}, f {:g} {:g}".format(*values)
 
 
 ALWAYS = ("map", "backend.map.localisation_only")
@@ -117,32 +113,25 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     variants = {key: of_key[0] for key, of_key in grouped(rows, lambda row: row.variant_key).items()}
     by_tracker = grouped(variants.values(), lambda row: row.tracker.id)
     by_label = grouped(variants.values(), lambda row: row.label)
-    shown = {tracker: {*ALWAYS, *_differing(others)} for tracker, others in by_tracker.items()}
-    asked = {tracker: {name for row in others for name in row.variant} for tracker, others in by_tracker.items()}
-    for tracker, names in asked.items():  # what this tracker alone was asked for
-        shown[tracker] |= names.difference(OF_ALL, *(others for other, others in asked.items() if other != tracker))
-    texts = _short_texts(value for row in variants.values() for value in row.variant.values())
+    named = {tracker: {name for row in others for name in row.variant} for tracker, others in by_tracker.items()}
+    shown = {}
+    for tracker, others in by_tracker.items():
+        elsewhere = set().union(*(names for other, names in named.items() if other != tracker))
+        differing = {name for name in named[tracker] if len({str(row.variant.get(name)) for row in others}) > 1}
+        shown[tracker] = {*ALWAYS, *differing, *(named[tracker] - OF_ALL - elsewhere)}
+    texts = {setting_text(value) for row in variants.values() for value in row.variant.values()}
+    counts = Counter(map(label_text, texts))
     labels = {}
     for key, row in variants.items():
         tracker = row.tracker.id
-        settings = {name: value for name, value in sorted(row.variant.items()) if name in shown[tracker]}
-        parts = [f"{name}={texts[setting_text(value)]}" for name, value in settings.items()]
+        parts = []
+        for name, value in sorted(row.variant.items()):
+            text = setting_text(value)
+            if name in shown[tracker]:  # the short form of a value, unless two values have the same
+                parts.append(f"{name}={label_text(text) if counts[label_text(text)] == 1 else text}")
         parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
         if row.imported and not all(other.imported for other in by_tracker[tracker]):
             parts.append("imported")
         name = f"{row.label} <{tracker}>" if len({other.tracker.id for other in by_label[row.label]}) > 1 else row.label
         labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
     return labels
-
-
-def _short_texts(values: Iterable[Any]) -> dict[str, str]:
-    """Values as texts, each with its short form; whole where two values have the same short form."""
-    short = {text: label_text(text) for text in map(setting_text, values)}
-    counts = Counter(short.values())
-    return {text: label if counts[label] == 1 else text for text, label in short.items()}
-
-
-def _differing(variants: Sequence[RunRow]) -> list[str]:
-    """The settings that set the variants of one tracker apart."""
-    names = sorted({name for row in variants for name in row.variant})
-    return [name for name in names if len({str(row.variant.get(name)) for row in variants}) > 1]

@@ -5,28 +5,30 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Hashable, Iterable
+from contextlib import suppress
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import ConfigDict, Field
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import write_lines
 from dynslam_bench.core.reading import TABLE_BYTES
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.core.toml import setting_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
 from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
-from dynslam_bench.runs.run_index import part_words
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
 K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
 Which = Literal["online", "final"]
 """Which of a run's two trajectories."""
 SEEN = "§"
@@ -60,7 +62,10 @@ class RunRow(RunRecord):
         split_by: Parts of `program` in which the runs of this tracker and variant differ: each program has a line of
             its own.
         is_current: Whether its identity is verified, and no newer program has made runs of this tracker and variant.
+        store: Where its files lie; not written.
     """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
 
     protocol_id: str
     protocol_digest: str
@@ -75,37 +80,24 @@ class RunRow(RunRecord):
     hints: list[str] = Field(default_factory=list)
     split_by: dict[str, str] = Field(default_factory=dict)
     is_current: bool = True
-    _store: RunStore = PrivateAttr(default_factory=RunStore)
-
-    def stored_in(self, store: RunStore) -> RunRow:
-        """The same row, which reads its files from a store."""
-        self._store = store
-        return self
+    store: RunStore = Field(default_factory=RunStore, exclude=True, repr=False)
 
     @property
     def folder(self) -> Path:
         """Folder of the run's files."""
-        return self._store.folder(self.run_id)
-
-    def whole_record(self) -> RunRecord:
-        """The record with all its settings and stage times.
-
-        Raises:
-            DynslamError: It is damaged, or no longer there.
-        """
-        return self._store.read_whole(self.run_id)
+        return self.store.folder(self.run_id)
 
     def estimate(self, which: Which) -> Trajectory | None:
         """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
         try:
-            return self._store.trajectory(self.run_id, which)
+            return self.store.trajectory(self.run_id, which)
         except DynslamError:
             return None
 
     def ground_truth(self) -> Trajectory | None:
         """The ground truth of its part of the sequence; None if there is none, or it is damaged."""
         try:
-            return self._store.ground_truth(self.sequence.part)
+            return self.store.ground_truth(self.sequence.part)
         except DynslamError:
             return None
 
@@ -121,23 +113,13 @@ class RunRow(RunRecord):
 
     @property
     def origin(self) -> str:
-        """The same in words."""
+        """Whether it was run here or is imported, in words."""
         return "imported" if self.imported else "run here"
-
-    @property
-    def only_final(self) -> bool:
-        """Whether an import has nothing of the trajectory that the protocol asks for."""
-        return self.imported and not self.metrics and self.final_ate_m is not None
 
     @property
     def ranked(self) -> bool:
         """Whether it may rank: its tracker's spec lets it, and it began without a map."""
         return self.tracker.ranked and self.start_map is None
-
-    @property
-    def frame_words(self) -> str:
-        """Part of the sequence in words, empty for all of it."""
-        return part_words(self)
 
     @property
     def column_id(self) -> str:
@@ -224,20 +206,19 @@ class RunRow(RunRecord):
     @property
     def machine_words(self) -> str:
         """Computer and versions in words."""
-        parts = []
-        if self.machine is not None:
-            machine = self.machine
-            parts.append(f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}")
-            parts += [machine.gpu] if machine.gpu else []
-        parts += [f"{name} {version}" for name, version in self.versions.items()]
-        if self.git is not None:
-            parts.append(f"git {self.git.revision[:10]}{' (changed)' if self.git.dirty else ''}")
+        machine, git = self.machine, self.git
+        parts = [f"{name} {version}" for name, version in self.versions.items()]
+        if machine is not None:
+            hardware = f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}"
+            parts = [hardware, *filter(None, [machine.gpu]), *parts]
+        if git is not None:
+            parts.append(f"git {git.revision[:10]}{' (changed)' if git.dirty else ''}")
         return "; ".join(parts)
 
 
-def grouped(rows: Iterable[RunRow], key: Callable[[RunRow], K]) -> dict[K, list[RunRow]]:
-    """Rows by a key, in their order."""
-    groups: dict[K, list[RunRow]] = {}
+def grouped(rows: Iterable[V], key: Callable[[V], K]) -> dict[K, list[V]]:
+    """Rows, or other things, by a key, in their order."""
+    groups: dict[K, list[V]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)
     return groups
@@ -280,71 +261,70 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     """The row of one stored run, scored under a protocol."""
     scored = score(store, record, protocol)
     evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    alignment = None if evaluation is None else evaluation.alignment
-    static_m = static_camera_error(store, record, protocol, evaluation)
+    static_m = _static_camera_error(store, record, protocol, evaluation)
     trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
     diagnostics = [] if evaluation is None else evaluation.diagnostics
+    alignment = None if evaluation is None else evaluation.alignment
     scores: dict[str, Any] = dict(
         settings={name: record.settings[name] for name in record.overrides if name in record.settings},
         identity={name: value for name, value in record.identity.items() if name != "settings"},
         timings={name: time for name, time in record.timings.items() if name == "total"},
         protocol_id=scored.protocol_id,
         protocol_digest=scored.protocol_digest,
+        trajectory=protocol.trajectory,
         metrics={} if evaluation is None else evaluation.metrics,
         final_metrics={} if scored.final is None else scored.final.metrics,
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
-        hold_last_pose_ate_m=hold_last_pose_error(store, record, protocol, evaluation, static_m),
+        hold_last_pose_ate_m=_hold_last_pose_error(store, record, protocol, evaluation, static_m),
         static_camera_ate_rmse_m=static_m,
         seen_in_training=seen_in_training(record.segmentation, record.sequence.id),
         notes=[*(f"hint: {hint}" for hint in scored.hints), *trial, *record.notes, *diagnostics],
         hints=scored.hints,
+        store=store,
     )
-    return RunRow(**(dict(record) | scores | _outcome(record, scored, protocol))).stored_in(store)
+    return RunRow(**(dict(record) | scores | _outcome(record, scored, protocol, evaluation)))
 
 
-def _outcome(record: RunRecord, scored: MetricRecord, protocol: Protocol) -> dict[str, Any]:
-    """Whose errors a row holds, how the run ended and what it covered, where that differs from the record."""
-    only_final = record.kind == "imported" and scored.online is None and scored.final is not None
-    which = "final" if only_final else protocol.trajectory
-    outcome: dict[str, Any] = {"trajectory": which}
-    evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    failed = record.failed or record.status == "lost"
-    if record.sequence.ground_truth and evaluation is None and not failed and which == protocol.trajectory:
-        reason = record.reason or scored.reasons.get(which, "it cannot be evaluated")
-        return outcome | {"not_evaluated": True, "reason": reason}
-    if record.kind == "imported" or which == "online" or scored.final is None or scored.final.n_tracked is None:
-        return outcome
-    n_tracked = scored.final.n_tracked
-    if scored.final.coverage is not None:
-        outcome |= {"n_tracked": n_tracked, "coverage": scored.final.coverage}
-    due = record.n_frames - record.n_dropped
-    if record.failed or not n_tracked:
-        return outcome
-    if n_tracked < LOST_COVERAGE * due:
-        reason = f"the final trajectory has poses of {n_tracked} of {due} frames"
-        return outcome | {"status": "lost", "reason": reason}
-    if n_tracked >= due:  # frames that were lost online were found later
-        return outcome | {"status": "ok", "reason": ""}
+def _outcome(
+    record: RunRecord, scored: MetricRecord, protocol: Protocol, evaluation: Evaluation | None
+) -> dict[str, Any]:
+    """Fields of a row that differ from the record's: which trajectory is scored, how the run ended, its coverage."""
+    if record.kind == "imported" and scored.online is None and scored.final is not None:
+        return {"trajectory": "final"}
+    if evaluation is None:
+        if record.failed or record.status == "lost" or not record.sequence.ground_truth:
+            return {}
+        reason = record.reason or scored.reasons.get(protocol.trajectory, "it cannot be evaluated")
+        return {"not_evaluated": True, "reason": reason}
+    n_tracked, frames_due = evaluation.n_tracked, record.n_frames - record.n_dropped
+    if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:
+        return {}
+    outcome: dict[str, Any] = {}
+    if evaluation.coverage is not None:
+        outcome = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
+    if n_tracked and not record.failed and n_tracked < LOST_COVERAGE * frames_due:
+        outcome["status"] = "lost"
+        outcome["reason"] = f"the final trajectory has poses of {n_tracked} of {frames_due} frames"
+    elif n_tracked and not record.failed and n_tracked >= frames_due:  # frames lost online were found later
+        outcome |= {"status": "ok", "reason": ""}
     return outcome
 
 
-def static_camera_error(
+def _static_camera_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> float | None:
     """What a static camera scores under the protocol's alignment; None without ground truth."""
-    if evaluation is not None and "static_camera_ate_rmse_m" in evaluation.metrics:
+    if evaluation is not None:
         return evaluation.metrics["static_camera_ate_rmse_m"]
-    try:
+    with suppress(DynslamError):
         truth = store.ground_truth(record.sequence.part)
-        if truth is None:
-            return None
-        errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
-    except DynslamError:
-        return None
-    return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+        if truth is not None:
+            errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
+            return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+    return None
 
 
-def hold_last_pose_error(
+def _hold_last_pose_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None, static_m: float | None
 ) -> float | None:
     """The ATE with every lost frame held at the last tracked pose; None without evaluation.
@@ -356,15 +336,12 @@ def hold_last_pose_error(
     error = evaluation.metrics["ate_rmse_m"]
     if evaluation.coverage == 1.0:
         return error
-    at_least = error if record.coverage >= 1.0 else max(error, static_m or 0.0)
-    try:
+    with suppress(DynslamError):
         trajectory = store.trajectory(record.run_id, protocol.trajectory)
         truth = store.ground_truth(record.sequence.part)
-        if trajectory is None or truth is None:
-            return at_least
-        return ate_rmse_m(trajectory, truth, protocol, held_at=store.timestamps(record.sequence.part))
-    except DynslamError:
-        return at_least
+        if trajectory is not None and truth is not None:
+            return ate_rmse_m(trajectory, truth, protocol, held_at=store.timestamps(record.sequence.part))
+    return error if record.coverage >= 1.0 else max(error, static_m or 0.0)
 
 
 def command_line(command: list[str]) -> str:
@@ -373,3 +350,38 @@ def command_line(command: list[str]) -> str:
         return ""
     head = Path(command[0]).name
     return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *command[1:]])
+
+
+def run_command(row: RunRow) -> str:
+    """The command that makes a run again; empty for an imported trajectory."""
+    if row.imported:
+        return ""
+    words = [row.place or row.sequence.id, *part_options(row)]
+    words += ["--seed", str(row.seed)] if row.seed else []
+    words += ["--offset", str(row.offset)] if row.offset else []
+    return command_with(row, words)
+
+
+def command_with(row: RunRow, words: Iterable[str]) -> str:
+    """The command ``run`` with the tracker and the settings of a run; `words` name sequences, part and repeats."""
+    options: dict[str, list[str]] = {
+        "threads": ["--threads", str(row.threads)] if row.threads != 1 else [],
+        "device": ["--device", row.device] if row.device not in ("cpu", "") else [],
+        "map": ["--map", row.start_map.file if row.start_map else ""],
+        "realtime": ["--realtime"],
+        "drop_share": ["--drop", str(row.drop_share)],
+    }
+    settings: list[str] = []
+    for name, value in row.variant.items():
+        if name.startswith("degrade."):
+            settings += ["--degrade", f"{name.removeprefix('degrade.')}={value}"]
+        else:
+            settings += options.get(name, ["--set", f"{name}={setting_text(value)}"])
+    return shlex.join(["dynslam-bench", "run", row.tracker.given or row.tracker.id, *words, *settings])
+
+
+def part_options(row: RunRow) -> list[str]:
+    """Its part of the sequence as options of the command line."""
+    start, stop = row.frames or (0, None)
+    frames = ["--frames", f"{start}:{'' if stop is None else stop}"] if row.frames is not None else []
+    return frames + (["--stride", str(row.stride)] if row.stride != 1 else [])

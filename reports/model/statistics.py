@@ -84,13 +84,10 @@ def standings(cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Se
     tested = {key: p for key, p in p_values.items() if p is not None}
     corrected = holm(tested) if attainable_p(len(names), len(tested)) <= 0.05 else {}
     ranked_logs = {key: logs[key] for key in ranked}
-    ranks: dict[str, int] = {}
-    mean_ranks: dict[str, float] = {}
-    if ranked_logs:
-        means = [round(float(np.mean(log)), 12) for log in ranked_logs.values()]
-        ranks = dict(zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True))
-        by_sequence = scipy.stats.rankdata(np.stack(list(ranked_logs.values())), method="average", axis=0)
-        mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
+    means = [round(float(np.mean(log)), 12) for log in ranked_logs.values()]
+    ranks = dict(zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True))
+    by_sequence = scipy.stats.rankdata(np.reshape([*ranked_logs.values()], (-1, len(names))), axis=0)
+    mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
     groups = rank_groups(ranked_logs)
     unordered = [
         Standing(
@@ -167,11 +164,8 @@ def rank_groups(logs: Mapping[str, Array]) -> dict[str, tuple[int, int]]:
 
 def paired_p_value(log_a: Array, log_b: Array) -> float | None:
     """Two-sided Wilcoxon signed-rank test of paired logarithms; None for no pair that differs."""
-    difference = (log_a - log_b)[np.isfinite(log_a) & np.isfinite(log_b)]
-    difference = difference[difference != 0]
-    if not len(difference):
-        return None
-    return float(scipy.stats.wilcoxon(difference).pvalue)
+    difference = (log_a - log_b)[log_a != log_b]
+    return float(scipy.stats.wilcoxon(difference).pvalue) if len(difference) else None
 
 
 def attainable_p(sequences: int, tests: int = 1) -> float:
@@ -200,31 +194,21 @@ def power_note(standings: Sequence[Standing], sequences: int, fewest_repeats: in
     if not sequences:
         return "No sequence has ground truth, so nothing can be compared."
     groups = [s.group for s in standings if s.group is not None]
-    parts = []
     count = f"{sequences} sequence{'s' if sequences != 1 else ''}"
-    if sequences < FEWEST:
-        parts.append(
-            f"With {count} no two trackers are called different (below {FEWEST} there are no intervals): read the "
-            "order as a description of these sequences, not as evidence about others."
-        )
-    elif len(groups) > 1:
-        total = len(groups) * (len(groups) - 1) // 2
-        apart = sum(len(groups) - (last - first + 1) for first, last in groups) // 2
-        parts.append(
-            f"{count}, {len(groups)} ranked trackers: {apart} of {total} pairs can be told apart (paired t tests of "
-            "the log errors over sequences, Holm)."
-        )
-    if attainable_p(sequences, len(groups)) > 0.05:
-        parts.append(
-            f"The smallest p that a signed-rank test can reach is {attainable_p(sequences, len(groups)):.3g}, so none "
-            "is shown."
-        )
-    if 0 < fewest_repeats < 3:
-        parts.append(
-            f"Some cells hold only {fewest_repeats} run{'s' if fewest_repeats != 1 else ''} that count: the spread "
-            "from run to run is unknown there."
-        )
-    return " ".join(parts) or f"{count}, {len(groups)} ranked trackers, at least {fewest_repeats} runs a cell."
+    pairs = len(groups) * (len(groups) - 1) // 2
+    apart = sum(len(groups) - (last - first + 1) for first, last in groups) // 2
+    smallest_p = attainable_p(sequences, len(groups))
+    sentences = {
+        f"With {count} no two trackers are called different (below {FEWEST} there are no intervals): read the order "
+        "as a description of these sequences, not as evidence about others.": sequences < FEWEST,
+        f"{count}, {len(groups)} ranked trackers: {apart} of {pairs} pairs can be told apart (paired t tests of "
+        "the log errors over sequences, Holm).": sequences >= FEWEST and pairs,
+        f"The smallest p that a signed-rank test can reach is {smallest_p:.3g}, so none is shown.": smallest_p > 0.05,
+        f"Some cells hold only {fewest_repeats} run{'s' if fewest_repeats != 1 else ''} that count: the spread "
+        "from run to run is unknown there.": 0 < fewest_repeats < 3,
+    }
+    shown = [sentence for sentence, holds in sentences.items() if holds]
+    return " ".join(shown) or f"{count}, {len(groups)} ranked trackers, at least {fewest_repeats} runs a cell."
 
 
 def _log_medians(cell: Mapping[str, Sequence[float]], names: Sequence[str]) -> Array:

@@ -1,17 +1,20 @@
-"""The leaderboard, its sensitivity to the rules, tables of the runs, and the cells that several tables share."""
+"""The tables of a board: the leaderboard, errors by sequence, tables of the runs, and the paper's Tables 1 to 3."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import zip_longest
 from statistics import median
 
 import numpy as np
 
 from dynslam_bench.core.toml import label_text
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import MOST_COMPARED, Board, Cell, mean_skipped, rank
+from dynslam_bench.reports.model.board import MOST_COMPARED, STATIC_CAMERA, Board, Cell, mean_skipped, rank
+from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (
@@ -24,11 +27,11 @@ from dynslam_bench.reports.tables.table import (
     number,
     numbers,
     percent,
+    significant_text,
     texts,
 )
 
-Marks = dict[tuple[str, str], Emphasis]
-"""Variant key and sequence to the emphasis of their cell."""
+# -- the leaderboard, and cells that several tables share
 
 _PROVENANCE = {
     "own": "put together in this project: no one paper or program describes the whole",
@@ -50,16 +53,8 @@ SEEN_NOTE = (
 
 def leaderboard(board: Board, protocol: Protocol) -> Table:
     """Ranking with what the data leave open, success, coverage, speed and provenance."""
-    epipolar = any(row.epipolar_skipped is not None for row in board.rows)
     standings = {standing.key: standing for standing in board.standings}
-    rows = []
-    for key in board.trackers:
-        runs = board.runs(key)
-        share = mean_skipped(runs)
-        *measures, origin, provenance = _run_cells(runs)
-        if epipolar:
-            measures.append(TableCell() if share is None else TableCell(percent(share), value=share))
-        rows.append([*_standing_cells(board, key, standings.get(key)), *measures, origin, provenance])
+    epipolar = any(row.epipolar_skipped is not None for row in board.rows)
     columns = [
         Column(
             name,
@@ -70,9 +65,13 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         for name, meaning in _MEANINGS.items()
         if epipolar or name != "F skipped"
     ]
+    rows = []
+    for key in board.trackers:
+        cells = _leaderboard_cells(board, key, standings.get(key))
+        rows.append([cells.get(column.name, TableCell()) for column in columns])
     caption = _caption(board, protocol, epipolar)
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
-    brief += ", with 95 % intervals" * any(_has_interval(standing.ratio) for standing in board.standings)
+    brief += ", with 95 % intervals" * any(math.isfinite(standing.ratio.low) for standing in board.standings)
     muted = board.unranked_rows(board.trackers)
     return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators(), brief)
 
@@ -116,7 +115,13 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "in the map of an earlier one or by an older program, real-time runs beside others, trackers that lack "
         "sequences, never succeeded, or are no better than a static camera.",
     ]
-    worse, hinted = _no_better_than_static(board), _hinted(board.rows)
+    counts = {key: sum(board.no_better_than_static(key, name) for name in board.sequences) for key in board.trackers}
+    worse = "; ".join(
+        f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
+        for key, count in counts.items()
+        if count
+    )
+    hinted = _hinted(board.rows)
     rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
     remarks = {
         f"No better than a static camera, although their runs ended: {worse}.": worse,
@@ -137,59 +142,51 @@ def _hinted(rows: Iterable[RunRow]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.most_common())
 
 
-def _no_better_than_static(board: Board) -> str:
-    """Trackers with how many sequences they are no better on than a static camera; empty if none is."""
-    counts = {key: sum(board.no_better_than_static(key, name) for name in board.sequences) for key in board.trackers}
-    return "; ".join(
-        f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
-        for key, count in counts.items()
-        if count
-    )
-
-
-def _standing_cells(board: Board, key: str, standing: Standing | None) -> list[TableCell]:
+def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dict[str, TableCell]:
+    """The cells of a tracker by the names of their columns; what is not known is left out."""
     runs = board.runs(key)
-    good = sum(not row.failed for row in runs)
-    success = TableCell(f"{good}/{len(runs)}", value=good / len(runs))
+    ended = [row for row in runs if not row.failed]
+    coverage = float(np.mean([row.coverage for row in runs]))
     hinted = _hinted(runs)
-    name = TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=board.first(key).tracker.id)
+    masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
+    tracker = runs[0].tracker
+    cells = {
+        "#": TableCell("–"),
+        "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
+        "tracker": TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id),
+        "coverage": TableCell(f"{100 * coverage:.1f} %", value=coverage),
+        "× real time": speed_cell(ended),
+        "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
+        "rows": TableCell(tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items())),
+        "provenance": TableCell(
+            _NAMES.get(tracker.provenance, tracker.provenance),
+            f"{masks} masks" if masks else "",
+            tip=_PROVENANCE.get(tracker.provenance, ""),
+        ),
+    }
+    skipped = mean_skipped(runs)
+    if skipped is not None:
+        cells["F skipped"] = TableCell(percent(skipped), value=skipped)
     if key in board.hopeless:
-        return [TableCell("–"), success, name, TableCell("nothing succeeded", emphasis="failed"), *[TableCell()] * 3]
+        return cells | {"ATE ratio": TableCell("nothing succeeded", emphasis="failed")}
     if standing is None:
-        return [TableCell("–"), success, name, *[TableCell()] * 4]
-    ratio = interval_cell(standing.ratio, ".2f", _mark(board, standing))
+        return cells
+    # bold for those that may be first, unless that is most of them: then it would say nothing
+    first = [other.key for other in board.standings if other.group is not None and other.group[0] == 1]
+    best = key in first and 2 * len(first) <= len(board.ranked)
+    ratio = interval_cell(standing.ratio, ".2f", "best" if best else "")
     if standing.sequences < len(board.common):
         text = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
         ratio = TableCell(ratio.text, text, ratio.value)
     better = f"P {standing.better:.2f}" if standing.sequences >= FEWEST else ""
     wins = TableCell(f"{standing.wins} of {standing.sequences}", better, standing.wins)
-    if key == board.reference:
-        wins = TableCell("reference")
-    mean_rank, p = number(standing.mean_rank, ".2f"), number(standing.p_value, ".3f")
-    rank = TableCell("–", "no better than a static camera") if key in board.no_better else rank_cell(standing)
-    return [rank, success, name, ratio, mean_rank, wins, p]
-
-
-def _mark(board: Board, standing: Standing) -> Emphasis:
-    """Bold for those that may be first, unless that is most of them: then it would say nothing."""
-    first = [s for s in board.standings if s.group is not None and s.group[0] == 1]
-    return "best" if standing in first and 2 * len(first) <= len(board.ranked) else ""
-
-
-def _run_cells(runs: Sequence[RunRow]) -> list[TableCell]:
-    coverage = float(np.mean([row.coverage for row in runs]))
-    ended = [row for row in runs if not row.failed]
-    origins = " + ".join(f"{count} {origin}" for origin, count in Counter(row.origin for row in runs).items())
-    provenance = runs[0].tracker.provenance
-    masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
-    masks_words = f"{masks} masks" if masks else ""
-    return [
-        TableCell(f"{100 * coverage:.1f} %", value=coverage),
-        speed_cell(ended),
-        number(middle(row.peak_memory_mb for row in ended), ".0f"),
-        TableCell(tag=origins),
-        TableCell(_NAMES.get(provenance, provenance), masks_words, tip=_PROVENANCE.get(provenance, "")),
-    ]
+    return cells | {
+        "#": TableCell("–", "no better than a static camera") if key in board.no_better else rank_cell(standing),
+        "ATE ratio": ratio,
+        "mean rank": number(standing.mean_rank, ".2f"),
+        "wins": TableCell("reference") if key == board.reference else wins,
+        "p": number(standing.p_value, ".3f"),
+    }
 
 
 def timed(runs: Sequence[RunRow]) -> list[RunRow]:
@@ -219,23 +216,8 @@ def rank_cell(standing: Standing) -> TableCell:
 
 def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:
     """A value with its interval, if it has one."""
-    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if _has_interval(interval) else ""
+    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if math.isfinite(interval.low) else ""
     return TableCell(f"{interval.value:{digits}}", small, interval.value, emphasis)
-
-
-def _has_interval(interval: Interval) -> bool:
-    return math.isfinite(interval.low) and math.isfinite(interval.high)
-
-
-def skipped_words(cell: Cell) -> str:
-    """On which share of the frames the fundamental matrix was not used, e.g. ``F skipped 98 %``; empty for none."""
-    share = cell.epipolar_skipped
-    return "" if share is None else f"F skipped {percent(share)}"
-
-
-def sequence_columns(board: Board) -> list[Column]:
-    """One column for every sequence, grouped."""
-    return [Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences]
 
 
 def middle(values: Iterable[float | None]) -> float | None:
@@ -248,25 +230,103 @@ def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' if count != 1 else ''}"
 
 
-def best_marks(board: Board, values: Mapping[tuple[str, str], float], keys: Mapping[str, Sequence[str]]) -> Marks:
-    """Best and second best of every sequence; less is better.
+# -- numbers by tracker and sequence
+
+Value = Callable[[RunRow], float | None]
+"""A number of a run; None where it has none."""
+DOUBT = "‡"
+"""Behind a number that says nothing of its tracker."""
+
+
+def metric_table(
+    board: Board,
+    value: Value,
+    name: str,
+    title: str,
+    caption: str,
+    *,
+    unit: str = "RMSE, mm",
+    text: Callable[[float], str] = mm,
+    larger_is_better: bool = False,
+    doubt: Callable[[Cell], str] = lambda cell: "",
+) -> Table | None:
+    """Median of any number of the runs that succeeded, by tracker and sequence; None if no run has it.
 
     Args:
         board: The board.
-        values: ``(variant, sequence)`` to a number; what has none takes no part.
-        keys: Sequence to the variants that compete there.
+        value: The number of a run.
+        name: Id of the table.
+        title: Heading.
+        caption: How to read it.
+        unit: What the numbers are, in a word or two.
+        text: How the number is written; metres become millimetres by default.
+        larger_is_better: Which end is bold.
+        doubt: Why the number of a cell says nothing, empty if it does; such a cell carries `DOUBT` and is never bold.
     """
-    marks: Marks = {}
-    for name in board.sequences:
-        emphasis = emphasise([values.get((key, name)) for key in keys[name]])
-        marks |= {(key, name): mark for key, mark in zip(keys[name], emphasis, strict=True)}
-    return marks
+    values = medians(board, value)
+    if not values:
+        return None
+    doubts = {(key, sequence): doubt(board.cells[key][sequence]) for key, sequence in values}
+    sign = -1.0 if larger_is_better else 1.0
+    marks = column_marks(board, {place: sign * number for place, number in values.items() if not doubts[place]})
+
+    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
+        words = text(values[place]) + DOUBT * bool(doubts[place]) + SEEN * cell.in_training
+        mark: Emphasis = "muted" if doubts[place] else marks.get(place, "")
+        tip = doubts[place] or (SEEN_NOTE if cell.in_training else cell.ending)
+        return TableCell(words, skipped_words(cell), values[place], mark, tip=tip)
+
+    return _sequence_table(board, {"": values}, shown, name, title, caption, f"{title} ({unit})")
 
 
-def common_frames_table(
-    board: Board, common: Mapping[tuple[str, str], float], frames: Mapping[str, str]
-) -> Table | None:
-    """ATE on the frames that all evaluated runs of a sequence tracked.
+Values = Mapping[tuple[str, str], float]
+"""``(variant key, sequence)`` to a number."""
+
+
+def _sequence_table(
+    board: Board,
+    measures: Mapping[str, Values],
+    shown: Callable[[Cell, tuple[str, str], str], TableCell],
+    name: str,
+    title: str,
+    caption: str,
+    brief: str,
+) -> Table:
+    """A row a tracker that has any of the numbers, a column a sequence and kind of number.
+
+    Args:
+        board: The board.
+        measures: The numbers of each kind; ``""`` for the only one.
+        shown: The cell of a number, from its runs, its place and its kind.
+        name: Id of the table.
+        title: Heading.
+        caption: How to read it.
+        brief: Caption where there is little room.
+    """
+    measured = {key for values in measures.values() for key, _ in values}
+    keys = [key for key in (*board.trackers, *board.final_only) if key in measured]
+    rows = []
+    for key in keys:
+        cells = [TableCell(board.labels[key])]
+        for place in ((key, sequence) for sequence in board.sequences):
+            runs = board.cells[key].get(place[1])
+            for kind, values in measures.items():
+                if runs is not None and not runs.success:
+                    cells.append(TableCell(emphasis="failed", tip=runs.ending))
+                elif runs is None or place not in values:
+                    cells.append(TableCell())
+                else:
+                    cells.append(shown(runs, place, kind))
+        rows.append(cells)
+    muted = board.unranked_rows(keys)
+    ranked = len(keys) - len(muted)
+    separators = {ranked} if 0 < ranked < len(rows) else set()
+    columns = [*texts("tracker"), *sequence_columns(board, list(measures))]
+    return Table(name, title, caption, columns, rows, muted, separators, brief)
+
+
+def common_frames_table(board: Board, common: Values, frames: Mapping[str, str]) -> Table | None:
+    """ATE on the frames that all evaluated runs of a sequence tracked; None where there are none.
 
     Args:
         board: The board.
@@ -275,24 +335,7 @@ def common_frames_table(
     """
     if not common:
         return None
-    competing = {
-        name: [key for key in board.ranked if (key, name) in common and board.competes(key, name)]
-        for name in board.sequences
-    }
-    marks = best_marks(board, common, competing)
-    rows = []
-    for key in board.trackers:
-        cells = [TableCell(board.labels[key])]
-        for name in board.sequences:
-            error = common.get((key, name))
-            if error is None:
-                cells.append(TableCell())
-            else:
-                cell = board.cells[key][name]
-                mark = marks.get((key, name), "")
-                cells.append(TableCell(mm(error) + SEEN * cell.in_training, skipped_words(cell), error, mark))
-        rows.append(cells)
-    rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
+    marks = column_marks(board, common)
     caption = (
         "Median ATE (RMSE, millimetres) on those frames only that every successful run of the sequence tracked: a "
         "tracker gains nothing here by losing the hard frames. Failed runs take no part."
@@ -303,11 +346,238 @@ def common_frames_table(
             f" Of more than {MOST_COMPARED} runs on a sequence, these are the runs of every tracker around its median "
             "error, as many of each."
         )
-    columns = [*texts("tracker"), *sequence_columns(board)]
-    last = len(board.trackers)
-    muted = board.unranked_rows(board.trackers) | {last}
+
+    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
+        words = mm(common[place]) + SEEN * cell.in_training
+        return TableCell(words, skipped_words(cell), common[place], marks.get(place, ""))
+
     brief = "Absolute trajectory error on the common frames (RMSE, mm)"
-    return Table("common_frames", "Error on the common frames", caption, columns, rows, muted, {last}, brief)
+    table = _sequence_table(board, {"": common}, shown, "common_frames", "Error on the common frames", caption, brief)
+    table.muted_rows |= {len(table.rows)}
+    table.separators |= {len(table.rows)}
+    table.rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
+    return table
+
+
+def medians(board: Board, value: Value) -> dict[tuple[str, str], float]:
+    """Median of a number over the runs that count and succeeded, by tracker and sequence."""
+    of_cell = {}
+    for key, cells in board.cells.items():
+        for name, cell in cells.items():
+            middle_value = middle(value(row) for row in cell.kept if not row.failed)
+            if middle_value is not None and name in board.sequences:
+                of_cell[key, name] = middle_value
+    return of_cell
+
+
+def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis]:
+    """Best and second best of every column among the ranked trackers whose runs there compete and all succeeded.
+
+    Args:
+        board: The board.
+        values: A number a cell, less is better; a cell that has none takes no part.
+    """
+    marks: dict[tuple[str, str], Emphasis] = {}
+    for name in board.sequences:
+        keys = [key for key in board.ranked if name in board.cells[key] and not board.cells[key][name].failed]
+        places = [(key, name) for key in keys if board.competes(key, name)]
+        marks |= zip(places, emphasise([values.get(place) for place in places]), strict=True)
+    return marks
+
+
+def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
+    """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
+    sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
+    usual = sizes.most_common(1)[0][0] if sizes else 1
+    medians = {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
+    marks = column_marks(board, medians)
+    rows = []
+    for key in board.trackers:
+        cells = [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
+        rows.append([TableCell(board.labels[key], tag="imported" * board.first(key).imported), *cells])
+    rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
+    separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
+    lines: dict[tuple[str, str], dict[str, ReportedCell]] = {}
+    for published in reported:
+        lines.setdefault((published.system, published.tag), {}).setdefault(published.sequence, published)
+    for (name, tag), line in lines.items():
+        printed = [line.get(sequence) for sequence in board.sequences]
+        cells = [TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell() for p in printed]
+        rows.append([TableCell(name, tag=tag), *cells])
+    muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
+    first = board.sequences[0]
+    names = "" if board.short[first] == first else f"'{board.short[first]}' stands for {first}, and so on. "
+    caption = (
+        f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
+        "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
+        "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a static "
+        "camera, or worse; a cell with a failure takes no part in bold and green, and is hatched where "
+        f"nothing succeeded. Colour: ratio to {board.reference_name}, from green (a quarter or less) to red (four "
+        f"times or more). Bold best, italic second among ranked trackers. {names}{protocol.describe()}."
+    )
+    if reported:
+        caption += (
+            " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only, "
+            "and lost frames are left out of most. Rows marked 'claimed by the paper' are the implemented paper's own, "
+            "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
+            "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
+        )
+    columns = [*texts("tracker"), *sequence_columns(board)]
+    if any(row.seen_in_training for row in board.rows):
+        columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
+        for key, row in zip_longest(board.trackers, rows):
+            cells_of = board.cells.get(key, {})
+            trained = [name for name in board.sequences if name in cells_of and cells_of[name].in_training]
+            row.append(TableCell(", ".join(board.short[name] for name in trained)))
+        caption += f" {SEEN_NOTE}"
+    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
+    return Table(
+        "per_sequence", "Absolute trajectory error by sequence (mm)", caption, columns, rows, muted, separators, brief
+    )
+
+
+def final_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the final trajectories, of the trackers that have one."""
+    return metric_table(
+        board,
+        lambda row: row.final_ate_m,
+        "final_trajectory",
+        "Error of the final trajectory",
+        "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
+        f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
+    )
+
+
+def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Errors of the tracked frames only."""
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ate_rmse_m"),
+        "lost_frames_excluded",
+        "Error without the lost frames",
+        "Median ATE (RMSE, millimetres) of the tracked frames only, of the runs that succeeded: the sensitivity to "
+        f"lost frames, not what ranks. {protocol.describe()}.",
+    )
+
+
+def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
+    """One table for each relative error of the protocol and each of its parts."""
+    tables = []
+    for spec in protocol.rpe:
+        for part, unit, name in (("trans", "m", "translation"), ("rot", "deg", "rotation")):
+            metric = spec.metric(part)
+            per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 or spec.rate else ""
+            table = metric_table(
+                board,
+                lambda row, metric=metric: row.metrics.get(metric),  # type: ignore[misc]
+                f"rpe_{spec.key}_{part}",
+                f"Relative pose error over {spec.describe()}: {name}",
+                f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
+                f"they tracked. {protocol.describe()}.",
+                unit=f"RMSE, {'mm' if unit == 'm' else '°'}{per}",
+                text=mm if unit == "m" else significant_text,
+            )
+            if table is not None:
+                tables.append(table)
+    return tables
+
+
+def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
+    """Absolute rotational error, marked where it is an error of the alignment rather than of the tracker."""
+    caption = (
+        "Absolute rotational error (RMSE in °), median over the runs that succeeded, after the alignment of the "
+        f"positions, on the frames that they tracked. {protocol.describe()}."
+    )
+    if any(_rotation_doubt(cell) for cells in board.cells.values() for cell in cells.values()):
+        caption += (
+            f" {DOUBT} Unreliable: the path hardly determines the alignment's rotation (its standard error is above "
+            f"{RELIABLE_DEG:.0f}° in a run of the cell), so the number says nothing of the tracker and takes no part "
+            "in emphasis. Translational and relative errors are not affected."
+        )
+    return metric_table(
+        board,
+        lambda row: row.metrics.get("ape_rot_rmse_deg"),
+        "ape_rotation",
+        "Absolute rotational error",
+        caption,
+        unit="RMSE, °",
+        text=significant_text,
+        doubt=_rotation_doubt,
+    )
+
+
+def mask_quality(board: Board) -> Table | None:
+    """Overlap of the trackers' masks with the exact ones, of the trackers that have masks."""
+    return metric_table(
+        board,
+        lambda row: row.mask_iou,
+        "mask_iou",
+        "Mask quality",
+        "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
+        unit="IoU",
+        text=significant_text,
+        larger_is_better=True,
+    )
+
+
+def _rotation_doubt(cell: Cell) -> str:
+    """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
+    uncertain = [row for row in cell.kept if not row.failed and not row.rotation_reliable]
+    largest = max((row.rotation_uncertainty_deg or 0.0 for row in uncertain), default=0.0)
+    return f"unreliable: the alignment's rotation is known to ±{largest:.0f}° only" if uncertain else ""
+
+
+def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
+    cell = board.cells[key].get(sequence)
+    if cell is None or cell.median is None:
+        return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
+    coverage = f"coverage {100 * float(np.mean([row.coverage for row in cell.rows])):.1f} %"
+    link = run_link(cell.typical)
+    count = "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
+    if not cell.success:
+        tip = f"counts as {mm(cell.median)} mm, {coverage}"
+        return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
+    notes = [
+        _spread(cell),
+        count,
+        skipped_words(cell),
+        "no better than a static camera" * board.no_better_than_static(key, sequence),
+        f"{cell.success}/{len(cell.rows)} succeeded" if cell.failed else "",
+    ]
+    base = board.reference_median(sequence)
+    colour, tip = None, coverage
+    if base is not None and cell.in_training:
+        tip = SEEN_NOTE
+    elif base is not None:
+        ratio = cell.median / max(base, FLOOR_M)
+        colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
+        tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
+    shown = mm(cell.median) + SEEN * cell.in_training
+    return TableCell(shown, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
+
+
+def _spread(cell: Cell) -> str:
+    """Half the interquartile range in mm, or that there is none."""
+    if len(cell.scores) > 1:
+        low, high = np.percentile(cell.scores, [25, 75])
+        return f"±{significant_text(500.0 * float(high - low), 2)}"
+    return "deterministic" if cell.deterministic else ""
+
+
+def _static_camera_cell(board: Board, sequence: str) -> TableCell:
+    value, base = board.static_camera[sequence], board.reference_median(sequence)
+    if base is None:
+        return TableCell(mm(value), value=value)
+    ratio = value / max(base, FLOOR_M)
+    return TableCell(mm(value), value=value, shade=shade(ratio), tip=f"{ratio:.2f} × the reference")
+
+
+def shade(ratio: float) -> float:
+    """-1 at a quarter of the reference's error or less, 0 at the same, 1 at four times or more."""
+    return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
+
+
+# -- the rules, and the runs
 
 
 def failure_rule_table(board: Board) -> Table | None:
@@ -319,17 +589,15 @@ def failure_rule_table(board: Board) -> Table | None:
         "lost frames left out": _tracked_error,
         "failures left out too": lambda row: None if row.failed else _tracked_error(row),
     }
-    by_rule = [{s.key: s for s in rank(board, board.ranked, board.ranked, rule)} for rule in rules.values()]
     columns = [*texts("tracker"), *(column for name in rules for column in numbers("#", "ATE ratio", group=name))]
-    rows = []
-    for key in board.ranked_order():
-        cells = [TableCell(board.labels[key])]
-        for standings in by_rule:
+    rows = [[TableCell(board.labels[key])] for key in board.ranked]
+    for rule in rules.values():
+        standings = {standing.key: standing for standing in rank(board, board.ranked, board.ranked, rule)}
+        for key, cells in zip(board.ranked, rows, strict=True):
             if key in standings:
                 cells += [rank_cell(standings[key]), interval_cell(standings[key].ratio, ".2f")]
             else:
                 cells += [TableCell(), TableCell()]
-        rows.append(cells)
     caption = (
         "The same runs under three rules. Lost frames held: the report's rule, a lost frame counts as not having moved "
         "since the last tracked one. Lost frames left out: the error of the tracked frames only, which is what most "
@@ -355,10 +623,6 @@ def failures(board: Board) -> Table | None:
     failed = [row for row in board.rows if row.failed]
     if not failed:
         return None
-
-    def order(row: RunRow) -> tuple[object, ...]:
-        return board.labels[row.variant_key], board.sequence(row), row.repeat_key
-
     columns = [*texts("tracker", "sequence", "repeat", "ended"), Column("coverage"), *texts("reason", "run")]
     rows = [
         [
@@ -370,7 +634,7 @@ def failures(board: Board) -> Table | None:
             TableCell(row.reason),
             TableCell(row.run_id, link=run_link(row)),
         ]
-        for row in sorted(failed, key=order)
+        for row in sorted(failed, key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key))
     ]
     caption = "Runs that crashed, took too long or too much, broke their contract, were lost, or cannot be evaluated."
     return Table("failures", "Failures", caption, columns, rows)
@@ -401,16 +665,18 @@ def repeatability(board: Board) -> Table | None:
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
     """How far the runs of a tracker lie apart; empty if it has no cell with several."""
     cells = {name: board.cells[key][name] for name in board.sequences if name in board.cells[key]}
-    scores = {name: [row.score_m or 0.0 for row in cell.succeeded] for name, cell in cells.items()}
-    several = {name: errors for name, errors in scores.items() if len(errors) > 1}
     copies = sum(cell.deterministic and cell.success > 1 for cell in cells.values())
+    several = {name: cell for name, cell in cells.items() if len(cell.succeeded) > 1}
     counts = [TableCell(board.labels[key]), number(len(several)), number(copies)]
     if not several:
         return [*counts, *[TableCell()] * 4] if copies else []
-    spreads = {name: max(errors) / max(min(errors), FLOOR_M) for name, errors in several.items()}
-    where, worst = max(spreads.items(), key=lambda item: (item[1], item[0]))
-    size = f"{median(len(errors) for errors in several.values()):g}"
-    ratios = [number(median(spreads.values()), ".2f"), number(worst, ".2f")]
+    spreads = {}
+    for name, cell in several.items():
+        errors = [row.score_m or 0.0 for row in cell.succeeded]
+        spreads[name] = max(errors) / max(min(errors), FLOOR_M)
+    where = max(spreads, key=lambda name: (spreads[name], name))
+    size = f"{median(len(cell.succeeded) for cell in several.values()):g}"
+    ratios = [number(median(spreads.values()), ".2f"), number(spreads[where], ".2f")]
     return [*counts, TableCell(size), *ratios, TableCell(where)]
 
 
@@ -421,3 +687,137 @@ def machines(board: Board) -> Table:
     rows = [[number(count), TableCell(name)] for name, count in counts.most_common()]
     caption = "Times of different machines are not comparable."
     return Table("machines", "Machines and versions", caption, columns, rows)
+
+
+# -- the implemented paper's Tables 1 to 3, made of our own runs
+
+SUBJECT = "emfoa-oft"
+"""Tracker whose improvement over the others is shown, where it was run."""
+STATISTICS = {"rmse": "RMSE", "mean": "mean", "median": "median", "std": "SD"}
+LOST_MARK = "¶"
+LOST_NOTE = f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
+
+
+def subject_of(board: Board) -> str | None:
+    """The tracker that is compared with the others: `SUBJECT` as it is by default, else the best ranked one."""
+    own = [key for key in board.trackers if board.first(key).tracker.id == SUBJECT and key not in board.hopeless]
+    best = board.ranked[0] if board.ranked else None
+    return min(own, key=lambda key: len(board.first(key).variant), default=best)
+
+
+def absolute_table(board: Board, protocol: Protocol) -> Table | None:
+    """Table 1: RMSE, mean, median and standard deviation of the absolute error; None if no run has it."""
+    return _statistics_table(
+        board, {name: f"ate_{name}_m" for name in STATISTICS}, "paper_ape", "Absolute pose error, four statistics",
+        f"As the paper's Table 1. {protocol.describe()}.", "Absolute pose error (mm)",
+    )  # fmt: skip
+
+
+def relative_table(board: Board, protocol: Protocol) -> Table | None:
+    """Table 2: the same of the protocol's first relative error; None if it has none."""
+    if not protocol.rpe:
+        return None
+    spec = protocol.rpe[0]
+    return _statistics_table(
+        board,
+        {name: f"rpe_{spec.key}_trans_{name}_m" for name in STATISTICS},
+        "paper_rpe",
+        "Relative pose error, four statistics",
+        f"As the paper's Table 2, over {spec.describe()}. {protocol.describe()}.",
+        f"Relative pose error over {spec.describe()} (mm)",
+    )
+
+
+def time_table(board: Board) -> Table | None:
+    """Table 3: accuracy, error and time of a frame; None if nothing was scored."""
+    columns: dict[str, Value] = {
+        "accuracy (%)": lambda row: None if (share := _share(row)) is None else 100 - share,
+        "error (%)": _share,
+        "time (ms)": lambda row: None if _share(row) is None else row.frame_ms,
+    }
+    measures = {name: medians(board, value) for name, value in columns.items()}
+    if not measures["error (%)"]:
+        return None
+    caption = (
+        "As the paper's Table 3. Error: the median ATE, lost frames held, in percent of that of a static camera"
+        "; accuracy: what is left of 100 %, negative for a tracker that is worse than that. (The paper does "
+        "not define its own; its numbers are 100 times one minus the standard deviation in metres.) Time: median of a "
+        "frame, segmentation included, decoding excluded. Runs that succeeded."
+    )
+
+    def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
+        return number(measures[kind][place], ".1f")
+
+    brief = "Error in percent of a static camera, accuracy, and time of a frame"
+    return _sequence_table(board, measures, shown, "paper_accuracy", "Accuracy, error and time", caption, brief)
+
+
+def _share(row: RunRow) -> float | None:
+    """A run's error in percent of that of a static camera."""
+    static_m = row.static_camera_ate_rmse_m
+    return None if not static_m or row.hold_last_pose_ate_m is None else 100 * row.hold_last_pose_ate_m / static_m
+
+
+def _statistics_table(
+    board: Board, metrics: Mapping[str, str], name: str, title: str, source: str, brief: str
+) -> Table | None:
+    errors = {
+        kind: medians(board, lambda row, metric=metric: row.metrics.get(metric))  # type: ignore[misc]
+        for kind, metric in metrics.items()
+    }
+    if not errors["rmse"]:
+        return None
+    marks = {kind: column_marks(board, values) for kind, values in errors.items()}
+
+    def shown(cell: Cell, place: tuple[str, str], kind: str) -> TableCell:
+        error = errors[kind][place]
+        words = mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell)
+        return TableCell(words, value=error, emphasis=marks[kind].get(place, ""))
+
+    caption = f"{source} Millimetres (metres in the CSV), median over the runs that succeeded."
+    table = _sequence_table(board, errors, shown, name, title, caption, brief)
+    if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
+        table.caption += f" {LOST_NOTE}"
+    keys = {key for key, _ in errors["rmse"]}
+    subject = subject_of(board)
+    others = [key for key in board.ranked if key in keys and key != subject]
+    if subject not in keys or not others:
+        return table
+    table.caption += (
+        f" Below the line: by how many percent the error of {board.labels[subject]} is smaller than that of "
+        "the other tracker."
+    )
+    table.separators |= {len(table.rows)}
+    for other in others:
+        cells = [TableCell(f"improvement on {board.labels[other]}")]
+        for sequence in board.sequences:
+            for values in errors.values():
+                ours, theirs = values.get((subject, sequence)), values.get((other, sequence))
+                gain = None if ours is None or not theirs else 100 * (theirs - ours) / theirs
+                cells.append(number(gain, ".1f", " %"))
+        table.rows.append(cells)
+    return table
+
+
+def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]:
+    """One column for every sequence, grouped; of several kinds of numbers one for each of them."""
+    if len(kinds) == 1:
+        return [
+            Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences
+        ]
+    return [
+        Column(STATISTICS.get(kind, kind), board.short[name], full=f"{name}: {STATISTICS.get(kind, kind)}")
+        for name in board.sequences
+        for kind in kinds
+    ]
+
+
+def skipped_words(cell: Cell) -> str:
+    """On which share of the frames the fundamental matrix was not used, e.g. ``F skipped 98 %``; empty for none."""
+    share = mean_skipped(cell.rows)
+    return "" if share is None else f"F skipped {percent(share)}"
+
+
+def has_lost(cell: Cell | None) -> bool:
+    """Whether frames were lost in a run that succeeded: the errors of the cell are of the tracked ones only."""
+    return cell is not None and any(row.coverage < 1 for row in cell.kept if not row.failed)

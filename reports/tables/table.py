@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from math import ceil
 from typing import Literal
@@ -107,9 +107,9 @@ class Table:
     title: str
     caption: str
     columns: Sequence[Column]
-    rows: Sequence[Sequence[TableCell]]
-    muted_rows: Collection[int] = ()
-    separators: Collection[int] = ()
+    rows: list[list[TableCell]]
+    muted_rows: set[int] = field(default_factory=set)
+    separators: set[int] = field(default_factory=set)
     brief: str = ""
 
     def frame(self) -> pd.DataFrame:
@@ -127,13 +127,11 @@ class Table:
         Columns in which nothing is written are left out, and rows behind `MOST_ROWS`, which the caption says.
         """
         kept = [at for at in range(len(self.columns)) if not self.rows or any(_words(row[at]) for row in self.rows)]
-        if len(kept) == len(self.columns) and len(self.rows) <= MOST_ROWS:
-            return self
-        columns, rows = [self.columns[at] for at in kept], [[row[at] for at in kept] for row in self.rows[:MOST_ROWS]]
         caption = self.caption
-        if len(rows) < len(self.rows):
-            caption += f" These are the first {len(rows)} of {len(self.rows)} rows; all stand in csv/{self.id}.csv."
-        return Table(self.id, self.title, caption, columns, rows, self.muted_rows, self.separators, self.brief)
+        if len(self.rows) > MOST_ROWS:
+            caption += f" These are the first {MOST_ROWS} of {len(self.rows)} rows; all stand in csv/{self.id}.csv."
+        rows = [[row[at] for at in kept] for row in self.rows[:MOST_ROWS]]
+        return replace(self, caption=caption, columns=[self.columns[at] for at in kept], rows=rows)
 
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
@@ -269,16 +267,16 @@ def to_latex(table: Table, protocol: str = "") -> str:
         protocol: Name of the protocol that its numbers were taken under, for the caption.
     """
     table = table.displayed()
-    parts = [part for columns in _blocks(table) for part in _parts(table, columns)]
-    floats: list[list[str]] = [[]]
-    used = 0
-    for text, lines in parts:
-        if floats[-1] and used + lines > MOST_LINES:
-            floats.append([])
-            used = 0
-        floats[-1].append(text)
-        used += lines
-    return "\n".join(_float(table, blocks, number, protocol) for number, blocks in enumerate(floats))
+    floats: list[list[str]] = []
+    used = MOST_LINES
+    for columns in _blocks(table):
+        for text, lines in _tabulars(table, columns):
+            if used + lines > MOST_LINES:
+                floats.append([])
+                used = 0
+            floats[-1].append(text)
+            used += lines
+    return "\n".join(_float(table, tabulars, number, protocol) for number, tabulars in enumerate(floats))
 
 
 def escape_latex(text: str) -> str:
@@ -358,32 +356,29 @@ def _plain(cell: TableCell) -> str:
     return f"{text} {cell.small}" if cell.small.startswith("[") else text
 
 
-def _parts(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
-    """Columns as one tabular, or as several where they have too many lines; each with its height in lines."""
+def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
+    """Columns as one tabular, or as several where they have too many rows; each with its height in lines."""
     chosen = [table.columns[at] for at in columns]
     wide = _width_pt(table, columns[0]) > _NAMES_PT
     kinds = (f"p{{{_NAMES_PT:.0f}pt}}" if wide else "l") + "".join("r" if c.numeric else "l" for c in chosen[1:])
     head = [_groups(chosen)] if any(column.group for column in chosen) else []
     head.append(" & ".join(_stacked(column.name) for column in chosen) + " \\\\")
-    top = len(head) + max(len(_heading(column.name)) for column in chosen) + 1
-    bodies: list[list[str]] = []
-    used = MOST_LINES
-    heights: list[int] = []
-    for position, row in enumerate(table.rows):
-        lines = ceil(1.2 * _text_pt(_plain(row[columns[0]])) / _NAMES_PT) if wide else 1
-        if used + lines > MOST_LINES:
-            bodies.append([])
-            heights.append(top)
-            used = top
-        if position in table.separators and bodies[-1]:
-            bodies[-1].append("\\midrule")
-        first, *others = (_cell(row[at]) for at in columns)
-        bodies[-1].append(" & ".join([f"\\raggedright {first}" if wide else first, *others]) + " \\\\")
-        heights[-1] += lines
-        used += lines
-    begin = [f"\\begin{{tabular}}{{@{{}}{kinds}@{{}}}}", "\\toprule", *head, "\\midrule"]
-    end = ["\\bottomrule", "\\end{tabular}"]
-    return [("\n".join([*begin, *body, *end]), height) for body, height in zip(bodies, heights, strict=True)]
+    head_lines = len(head) + max(len(_heading(column.name)) for column in chosen) + 1
+    names = [_plain(row[columns[0]]) for row in table.rows]
+    lines = [ceil(1.2 * _text_pt(name) / _NAMES_PT) if wide else 1 for name in names]
+    fitting = (MOST_LINES - head_lines) // max(lines, default=1)
+    parts = []
+    for first in range(0, len(table.rows), fitting):
+        body: list[str] = []
+        for position, row in enumerate(table.rows[first : first + fitting], first):
+            if position in table.separators and body:
+                body.append("\\midrule")
+            name, *others = (_cell(row[at]) for at in columns)
+            body.append(" & ".join([f"\\raggedright {name}" if wide else name, *others]) + " \\\\")
+        height = head_lines + sum(lines[first : first + fitting])
+        begin = [f"\\begin{{tabular}}{{@{{}}{kinds}@{{}}}}", "\\toprule", *head, "\\midrule"]
+        parts.append(("\n".join([*begin, *body, "\\bottomrule", "\\end{tabular}"]), height))
+    return parts
 
 
 def _stacked(name: str) -> str:

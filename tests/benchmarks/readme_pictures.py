@@ -23,23 +23,19 @@ from reports_browser import Browser  # noqa: E402
 from dynslam_bench.reports import build_report  # noqa: E402
 from dynslam_bench.runs import RunStore  # noqa: E402
 
-QUALITY = 82
-
 
 def framed(browser: Browser, selector: str, target: Path, most: int = 0) -> None:
     """One element of the page as WebP; at most so many pixels high."""
     box = browser.run(
         f"(() => {{ const box = one({selector!r}).getBoundingClientRect();"
-        " return [box.x + scrollX, box.y + scrollY, box.width, box.height]; })()"
+        " return [box.x + scrollX, box.y + scrollY, box.width, box.height].map(Math.round); })()"
     )
-    with tempfile.TemporaryDirectory() as folder:
-        browser.picture(Path(folder) / "page.png")
-        image = cv2.imread(str(Path(folder) / "page.png"))
-    x, y, width, height = (round(value) for value in box)
-    cut = image[y : y + min(height, most or height), x : x + width]
     target.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(target), cut, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
-    print(f"{target}: {cut.shape[1]} x {cut.shape[0]}, {target.stat().st_size / 1000:.0f} kB")
+    browser.picture(target.with_suffix(".png"))
+    image = cv2.imread(str(target.with_suffix(".png")))
+    target.with_suffix(".png").unlink()
+    x, y, width, height = box
+    cv2.imwrite(str(target), image[y : y + min(height, most or height), x : x + width], [cv2.IMWRITE_WEBP_QUALITY, 82])
 
 
 def main() -> None:
@@ -61,7 +57,7 @@ def main() -> None:
         report = build_report(store, Path(folder) / "report", picture_seconds=60)
         browser.open(report.run, 1100, anchor=f"#{store.ids()[0]}")
         browser.until("one('.thumb canvas')", tries=200)
-        browser.run(f"slide(all('#looks input[type=range]')[0], {options.frame})") if options.frame >= 0 else None
+        browser.run(f"slide(all('#annotations input[type=range]')[0], {options.frame})") if options.frame >= 0 else None
         browser.settle()
         framed(browser, "#s-track .grid-2", options.output / "culling.webp")
         browser.close()

@@ -18,6 +18,7 @@ import shutil
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -26,15 +27,11 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "reports")]
 
 from reports_browser import EXECUTABLE, Browser  # noqa: E402
-from reports_fake_store import add_run  # noqa: E402
+from reports_fake_store import add_frames, add_run  # noqa: E402
 
-from dynslam_bench.contracts.tracker import TrackResult  # noqa: E402
-from dynslam_bench.envs.episode import FrameOutcome  # noqa: E402
-from dynslam_bench.evaluation.online import OnlineSample  # noqa: E402
 from dynslam_bench.reports import build_report  # noqa: E402
-from dynslam_bench.runs.artifacts import SnapshotWriter  # noqa: E402
-from dynslam_bench.runs.frames import FrameRow, write_csv  # noqa: E402
-from dynslam_bench.runs.store import RUN_FILE, RunStore  # noqa: E402
+from dynslam_bench.runs.record import IDENTITY_SCHEME  # noqa: E402
+from dynslam_bench.runs.store import RunStore  # noqa: E402
 
 STAGES = "segmentation features culling_box_depth culling_reseeding tracking mapping bundle_adjustment".split()
 STATS = [*"keypoints culled matches inliers mask_fraction".split(), *(f"figure_{k}" for k in range(16))]
@@ -44,51 +41,25 @@ PAINT = "(performance.getEntriesByName('first-contentful-paint')[0] ?? {}).start
 LOAD = "performance.getEntriesByType('navigation')[0].loadEventEnd"
 
 
-def write_pattern(folder: Path, frames: int, seed: int) -> None:
-    """``frames.csv`` and ``snapshots.npz`` as a run leaves them."""
-    folder.mkdir(parents=True)
-    rng, rows, writer = np.random.default_rng(seed), [], SnapshotWriter(folder, frames)
-    for at in range(frames):
-        stats = dict(zip(STATS, rng.uniform(0, 1500, len(STATS)).tolist(), strict=True))
-        stats["mask_fraction"] = 0.5 * at / frames
-        times = dict.fromkeys(("read", "total", *STAGES), 0.0)
-        times = {name: value for name, value in zip(times, rng.gamma(2, 0.02, len(times)).tolist(), strict=True)}
-        error = OnlineSample(
-            trans_m=0.01 + at * 1e-4, rot_deg=0.1, frame_trans_m=float(rng.gamma(2, 1e-3)), frame_rot_deg=0.05
-        )
-        outcome = FrameOutcome(at, 1000.01 + at / 30, "ok", np.eye(4), stats, times, error, -0.001)
-        rows.append(FrameRow.of(outcome, 0.8, 0.5 * at / frames))
-        mask = np.zeros((480, 640), bool)
-        mask[:, 200 + at % 200 : 400 + at % 200] = True
-        points = rng.uniform((0, 0), (640, 480), (1500, 2)).astype(np.float32)
-        writer.add(outcome, (480, 640, 3), TrackResult(np.eye(4), "ok", stats, times, mask, points, points[:, 0] > 200))
-    writer.write()
-    write_csv(folder / "frames.csv", rows)
-
-
 def fill(root: Path, trackers: int, sequences: int, repeats: int, frames: int) -> RunStore:
     """A results folder of so many runs."""
-    store, patterns = RunStore(root / "results"), root / "patterns"
+    store = RunStore(root / "results")
     for number in range(sequences):
-        write_pattern(patterns / str(number), frames, number)
-    qualities = np.geomspace(0.005, 0.2, trackers)
-    for number in range(sequences):
-        for at, quality in enumerate(qualities):
-            for seed in range(repeats):
-                broken = (at + number + seed) % 37 == 0
-                run_id = add_run(
-                    store, f"tracker-{at:02d}", f"synthetic/sequence_{number:02d}", seed,
-                    error=float(quality * (1 + 0.1 * seed)), n=frames, final_error=float(0.9 * quality),
-                    status="crashed" if broken else "ok", reason="RuntimeError: no map" if broken else "",
-                    lost=range(50, 60) if at % 4 == 0 else (), tags=("high-dynamic",) if number % 2 else ("static",),
-                    mask_iou=0.8,
-                )  # fmt: skip
-                for name in ("frames.csv", "snapshots.npz"):
-                    shutil.copyfile(patterns / str(number) / name, store.folder(run_id) / name)
-                record = store.read_whole(run_id)
-                asked = record.identity | {"settings": SETTINGS}
-                record = record.model_copy(update={"settings": SETTINGS, "identity": asked})
-                (store.folder(run_id) / RUN_FILE).write_text(record.to_json())
+        pattern = root / "patterns" / str(number)
+        pattern.mkdir(parents=True)
+        add_frames(pattern, frames, features=1500, size=(480, 640), stages=STAGES, stats=STATS, seed=number)
+        for at, seed in product(range(trackers), range(repeats)):
+            quality = float(np.geomspace(0.005, 0.2, trackers)[at])
+            broken = (at + number + seed) % 37 == 0
+            run_id = add_run(
+                store, f"tracker-{at:02d}", f"synthetic/sequence_{number:02d}", seed,
+                error=quality * (1 + 0.1 * seed), n=frames, final_error=0.9 * quality,
+                status="crashed" if broken else "ok", reason="RuntimeError: no map" if broken else "",
+                lost=range(50, 60) if at % 4 == 0 else (), tags=("high-dynamic",) if number % 2 else ("static",),
+                mask_iou=0.8, settings=SETTINGS, identity={"scheme": IDENTITY_SCHEME, "settings": SETTINGS},
+            )  # fmt: skip
+            for file in pattern.iterdir():
+                shutil.copyfile(file, store.folder(run_id) / file.name)
     return store
 
 
@@ -111,18 +82,17 @@ def opened(page: Path, folder: Path) -> str:
     if EXECUTABLE is None:
         return "no browser is installed"
     browser = Browser(folder)
-    paints, loads = [], []
+    times = []
     for _ in range(5):
         browser.open(page)
         browser.until(f"{PAINT} && {LOAD}")  # the first paint may be noted after the load event
-        paints.append(browser.run(PAINT))
-        loads.append(browser.run(LOAD))
+        times.append(browser.run(f"[{PAINT}, {LOAD}]"))
     fetched = {url.removeprefix("file://") for url in browser.fetched if url.startswith("file://")}
     size = sum(Path(path).stat().st_size for path in fetched) / 1e6
-    faults = browser.faults
     browser.close()
-    paint, load = np.median(paints), np.median(loads)
-    return f"first paint after {paint:.0f} ms, loaded after {load:.0f} ms, {size:.2f} MB loaded first, faults {faults}"
+    paint, load = np.median(times, axis=0)
+    loaded = f"first paint after {paint:.0f} ms, loaded after {load:.0f} ms, {size:.2f} MB loaded first"
+    return f"{loaded}, faults {browser.faults}"
 
 
 def main() -> None:
@@ -137,8 +107,7 @@ def main() -> None:
         store = RunStore(root / "results")
         if not store.runs.is_dir():
             fill(root, options.trackers, options.sequences, options.repeats, options.frames)
-        for known in ("metrics", "index"):
-            shutil.rmtree(store.root / known, ignore_errors=True)
+        store.index.path.unlink(missing_ok=True)
         print(f"{len(store.ids())} runs", flush=True)
         output = Path(folder) / "report"
         for name in ("first", "again"):

@@ -4,12 +4,17 @@ import hashlib
 
 import numpy as np
 
+from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.fingerprint import Machine
 from dynslam_bench.core.records import digest
+from dynslam_bench.envs.episode import FrameOutcome
+from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import from_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import format_tum
+from dynslam_bench.runs.artifacts import SnapshotWriter
+from dynslam_bench.runs.frames import FrameRow, write_csv
 from dynslam_bench.runs.record import IDENTITY_SCHEME, RunRecord, SequenceInfo, StageTime, TrackerInfo
 from dynslam_bench.runs.store import RunStore
 
@@ -134,6 +139,37 @@ def add_run(
         (work / "log.txt").write_text("a log\n")
         store.publish(work, record)
     return run_id
+
+
+def add_frames(
+    folder,
+    count,
+    *,
+    exact=True,
+    masks=True,
+    features=50,
+    size=(48, 64),
+    stages=("features",),
+    stats=("keypoints",),
+    seed=0,
+):
+    """Frames and snapshots as a run would leave them: the error grows with the share of dynamic pixels."""
+    rows, writer, rng = [], SnapshotWriter(folder, count), np.random.default_rng(seed)
+    for at in range(count):
+        share = at / count
+        error = OnlineSample(trans_m=0.01, rot_deg=0.1, frame_trans_m=0.001 * (1 + 9 * share), frame_rot_deg=0.1)
+        numbers = dict(zip(stats, rng.uniform(0, 1500, len(stats)).tolist(), strict=True))
+        numbers |= {"keypoints": float(features), "culled": 0.4 * features, "mask_fraction": masks * share}
+        times = {"read": 0.001, "total": 0.02, "processor": 0.03} | dict.fromkeys(stages, 0.01)
+        outcome = FrameOutcome(at, 1000.01 + at / 30, "ok", np.eye(4), numbers, times, error, -0.001)
+        rows.append(FrameRow.of(outcome, 0.5, share if exact else None))
+        points = rng.uniform(0, size, (features, 2)).astype(np.float32)[:, ::-1]
+        mask = np.zeros(size, bool)
+        mask[:, : int(size[1] * share)] = True
+        kept = np.arange(features) >= 0.4 * features
+        writer.add(outcome, (*size, 3), TrackResult(np.eye(4), "ok", numbers, times, mask, points, kept))
+    writer.write()
+    write_csv(folder / "frames.csv", rows)
 
 
 def fill(root, trackers=None, sequences=None, seeds=(0, 1, 2)):

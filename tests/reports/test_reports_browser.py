@@ -1,22 +1,15 @@
 """The report in a real browser: nothing is fetched, nothing faults, everything fits and can be read."""
 
-import json
-import re
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from reports_browser import Browser, needs_browser
-from reports_fake_store import add_run, fill
+from reports_fake_store import add_frames, add_run, fill
+from reports_rows import page_data
 
-from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.envs.arguments import open_frames
-from dynslam_bench.envs.episode import FrameOutcome
-from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.reports import build_report
-from dynslam_bench.runs.artifacts import SnapshotWriter
-from dynslam_bench.runs.frames import FrameRow, write_csv
 from dynslam_bench.sequences.view import part_of
 
 sys.path.append(str(Path(__file__).parents[1] / "envs"))
@@ -24,24 +17,6 @@ from envs_toys import write_folder
 
 pytestmark = needs_browser
 WIDTHS = (1400, 768, 360)
-
-
-def add_frames(folder, count, *, exact=True, masks=True):
-    """Frames and snapshots as a run would leave them: the error grows with the share of dynamic pixels."""
-    rows, writer, rng = [], SnapshotWriter(folder, count), np.random.default_rng(0)
-    for at in range(count):
-        share = at / count
-        error = OnlineSample(trans_m=0.01, rot_deg=0.1, frame_trans_m=0.001 * (1 + 9 * share), frame_rot_deg=0.1)
-        stats = {"keypoints": 50.0, "culled": 20.0, "mask_fraction": masks * share}
-        times = {"read": 0.001, "total": 0.02, "processor": 0.03, "features": 0.01}
-        outcome = FrameOutcome(at, 1000.01 + at / 30, "ok", np.eye(4), stats, times, error, -0.001)
-        rows.append(FrameRow.of(outcome, 0.5, share if exact else None))
-        points, kept = rng.uniform(0, 48, (50, 2)).astype(np.float32), np.arange(50) >= 20
-        mask = np.zeros((48, 64), bool)
-        mask[:, : int(64 * share)] = True
-        writer.add(outcome, (48, 64, 3), TrackResult(np.eye(4), "ok", stats, times, mask, points, kept))
-    writer.write()
-    write_csv(folder / "frames.csv", rows)
 
 
 @pytest.fixture(scope="module")
@@ -70,11 +45,10 @@ def browser(tmp_path_factory):
 
 
 def run_of(report, label, sequence):
-    text = (report.html.parent / "data" / "explore.js").read_text()
-    known = json.loads(re.fullmatch(r'keep\("explore",(.*)\);\n', text, re.DOTALL)[1])
-    tracker = next(at for at, each in enumerate(known["trackers"]) if each["label"].startswith(label))
-    column = next(at for at, each in enumerate(known["sequences"]) if each["name"].startswith(sequence))
-    return next(run[0] for run in known["runs"] if run[1:3] == [tracker, column])
+    explore = page_data(report.html.parent, "explore")
+    tracker = next(at for at, each in enumerate(explore["trackers"]) if each["label"].startswith(label))
+    column = next(at for at, each in enumerate(explore["sequences"]) if each["name"].startswith(sequence))
+    return next(run[0] for run in explore["runs"] if run[1:3] == [tracker, column])
 
 
 def see_everything(browser):

@@ -7,9 +7,7 @@ from reports_fake_store import add_run
 
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import ReportError
-from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.runs.store import RunStore
 
 
@@ -49,28 +47,23 @@ def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
     assert "--on all" in (tmp_path / "all" / "index.html").read_text()
     code, _, error = cli("report", "results", "--on", "some")
     assert (code, error) == (1, "error: --on is 'common' or 'all', got 'some'\n")
-    code, _, error = cli("report", "results", "--reference", "our")
-    assert code == 1
-    assert "no run of the reference 'our' (did you mean 'ours'" in error
 
 
 def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
-    store = RunStore(tmp_path / "r")
+    trial = {"error": 0.001, "overrides": {"features": 500}, "study": "mine"}
+    store, only = RunStore(tmp_path / "r"), RunStore(tmp_path / "only")
     add_run(store, "orb-slam2", "s/a", study="mine")
-    add_run(store, "orb-slam2", "s/a", error=0.001, overrides={"features": 500}, study="mine")
-    with pytest.raises(ReportError, match="all 1 runs that studies made"):
-        only = RunStore(tmp_path / "only")
-        add_run(only, "orb-slam2", "s/a", overrides={"features": 500}, study="mine")
-        load_runs([only], get_protocol("tum-rgbd/v1"))
-    paths = build_report(store, tmp_path / "report", picture_seconds=0)
-    text = paths.markdown.read_text()
-    assert paths.trials == 1 and "Left out: 1 runs that studies made with settings of their own" in text
-    assert "features=500" not in text and "--trials" not in paths.html.read_text().split("The commands that")[1]
-    shown = build_report(store, tmp_path / "shown", picture_seconds=0, trials=True)
-    assert shown.trials == 0 and "features=500" in shown.markdown.read_text()
-    assert "Left out" not in shown.markdown.read_text()
-    assert "trial of the study &#39;mine&#39;" in shown.html.read_text()
-    assert "--trials" in shown.html.read_text().split("The commands that")[1]
+    for some in (store, only):
+        add_run(some, "orb-slam2", "s/a", **trial)
+    with pytest.raises(ReportError, match="--trials"):
+        build_report(only, tmp_path / "none")
+    for trials in (False, True):
+        paths = build_report(store, tmp_path / str(trials), picture_seconds=0, trials=trials)
+        text, page = paths.markdown.read_text(), paths.html.read_text()
+        assert paths.trials == (not trials) and ("Left out: 1 runs that studies made" in text) == (not trials)
+        commands = page.split("The commands that")[1]
+        shown = "features=500" in text, "--trials" in commands, "trial of the study &#39;mine&#39;" in page
+        assert shown == (trials,) * 3
 
 
 def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
@@ -78,8 +71,6 @@ def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
         add_run(RunStore(tmp_path / place), "ours", "s/a", overrides={"x": value})
     code, out, _ = cli("report", "compare", "a", "b", "--json")
     found = strict(out)
-    assert code == 0
-    assert list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
+    assert code == 0 and list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
     assert [interval["low"] for interval in found["overall"].values()] == [None]
-    code, out, _ = cli("report", "compare", "a", "b")
-    assert "B better on" in out
+    assert "B better on" in cli("report", "compare", "a", "b")[1]

@@ -1,13 +1,14 @@
 """What one column of a table is, the same frames of the same recording, and what columns and rows are called."""
 
+import pytest
 from reports_fake_store import add_run
 from reports_rows import PROTOCOL, row, rows_of
 
 from dynslam_bench.reports import build_report, compare
-from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.board import make_board, missing_commands
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.reports.model.missing import missing_commands, run_command
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.reports.model.row import run_command
 from dynslam_bench.runs.store import RunStore
 
 
@@ -56,40 +57,37 @@ def test_names_of_columns_are_never_alike():
 
 def test_sequences_are_grouped_from_static_to_dynamic():
     tags = {"z": ["static"], "b": ["high-dynamic"], "a": ["low-dynamic"], "c": ["high-dynamic"], "d": []}
-    board = make_board([row(sequence=name, tags=found) for name, found in tags.items()])
-    assert board.sequences == ["z", "a", "b", "c", "d"]
-    assert [board.groups[s] for s in board.sequences] == [
-        "static",
-        "low dynamic",
-        "high dynamic",
-        "high dynamic",
-        "other",
-    ]
+    board = make_board([row(sequence=name, tags=names) for name, names in tags.items()])
+    groups = [(name, board.groups[name]) for name in board.sequences]
+    dynamic = [("a", "low dynamic"), ("b", "high dynamic"), ("c", "high dynamic")]
+    assert groups == [("z", "static"), *dynamic, ("d", "other")]
 
 
-def test_names_lose_what_all_share():
-    names = ["synthetic/walking_xyz?scene=0&frames=60", "synthetic/sitting_xyz?scene=0&frames=60"]
-    assert list(shortened(names).values()) == ["walking_xyz", "sitting_xyz"]
-    assert list(shortened([*names, "synthetic/sitting_xyz?scene=1"]).values()) == [
-        "walking_xyz?scene=0&frames=60",
-        "sitting_xyz?scene=0&frames=60",
-        "sitting_xyz?scene=1",
-    ]
-    rendered = [f"synthetic/walking_xyz?scene={scene}&frames=60" for scene in (100, 101)]
-    assert list(shortened(rendered).values()) == ["walking_xyz?scene=100", "walking_xyz?scene=101"]
-    assert list(shortened(["tum/fr3/a", "tum/fr1/a", "bonn/a"]).values()) == ["tum/fr3/a", "tum/fr1/a", "bonn/a"]
-    assert list(shortened(["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"]).values()) == ["a [0:9]", "b [0:9]"]
-    assert shortened(["tum/fr3/a"]) == {"tum/fr3/a": "tum/fr3/a"}
+@pytest.mark.parametrize(
+    ("names", "short"),
+    [
+        (
+            ["synthetic/walking_xyz?scene=0&frames=60", "synthetic/sitting_xyz?scene=0&frames=60"],
+            "walking_xyz sitting_xyz",
+        ),
+        (["synthetic/walking_xyz?scene=0&frames=60", "synthetic/a?scene=1"], "walking_xyz?scene=0&frames=60 a?scene=1"),
+        (["synthetic/a?scene=100&frames=60", "synthetic/a?scene=101&frames=60"], "a?scene=100 a?scene=101"),
+        (["tum/fr3/a", "tum/fr1/a", "bonn/a"], "tum/fr3/a tum/fr1/a bonn/a"),
+        (["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"], "a [0:9] b [0:9]"),
+        (["tum/fr3/a"], "tum/fr3/a"),
+    ],
+)
+def test_names_lose_what_all_share(names, short):
+    assert list(shortened(names)) == names and " ".join(shortened(names).values()) == short
 
 
 def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tmp_path):
     store = RunStore(tmp_path / "r")
     given = "/home/me/mine.py:SPEC"
-    add_run(store, "mine", "s/a", overrides={"loop": "True"}, settings={"loop": True}, given=given)
-    add_run(store, "mine", "s/b", overrides={"loop": True}, settings={"loop": True}, given=given)
-    add_run(store, "a", "s/a", overrides={"masks": "oracle"})
-    add_run(store, "a", "s/c", overrides={"masks": "oracle"})
-    add_run(store, "b", "s/a", overrides={"masks": "oracle"})
+    for name, value in (("s/a", "True"), ("s/b", True)):
+        add_run(store, "mine", name, overrides={"loop": value}, settings={"loop": True}, given=given)
+    for tracker, name in (("a", "s/a"), ("a", "s/c"), ("b", "s/a")):
+        add_run(store, tracker, name, overrides={"masks": "oracle"})
     rows = load_runs([store], PROTOCOL).rows
     assert sorted(make_board(rows).labels.values()) == ["a", "b", "mine · loop=true"]
     (mine,) = (each for each in rows if (each.tracker.id, each.sequence.id) == ("mine", "s/a"))
@@ -97,14 +95,16 @@ def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tm
     assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
 
 
-def test_labels_name_files_without_their_folders_unless_two_would_be_alike(tmp_path):
-    def labels(*sources):
-        rows = [row(tracker="mask-rcnn", variant={"segmentation.source": source}) for source in sources]
-        return sorted(make_labels(rows).values())
-
-    assert labels("onnx:/home/me/nets/yolov8n-seg.onnx", "recorded:/data/masks/", "none") == [
-        f"MASK-RCNN · segmentation.source={each}" for each in ("none", "onnx:yolov8n-seg", "recorded:masks")
-    ]
-    assert labels("onnx:/a/best.onnx", "onnx:/b/best.onnx") == [
-        f"MASK-RCNN · segmentation.source=onnx:/{folder}/best.onnx" for folder in "ab"
-    ]
+@pytest.mark.parametrize(
+    ("sources", "named"),
+    [
+        (
+            ("onnx:/home/me/nets/yolov8n-seg.onnx", "recorded:/data/masks/", "none"),
+            ("none", "onnx:yolov8n-seg", "recorded:masks"),
+        ),
+        (("onnx:/a/best.onnx", "onnx:/b/best.onnx"), ("onnx:/a/best.onnx", "onnx:/b/best.onnx")),
+    ],
+)
+def test_labels_name_files_without_their_folders_unless_two_would_be_alike(sources, named):
+    rows = [row(tracker="mask-rcnn", variant={"segmentation.source": source}) for source in sources]
+    assert sorted(make_labels(rows).values()) == [f"MASK-RCNN · segmentation.source={name}" for name in named]

@@ -1,13 +1,12 @@
 """Damaged files of a store, and failures among repeats: the report is made, and says what it left out."""
 
 import pytest
-from reports_fake_store import add_run
+from reports_fake_store import add_frames, add_run
 from reports_rows import PROTOCOL, crashed, page_data, row
-from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report
 from dynslam_bench.reports.figures import log_axis, mask_figure, repeat_figure
-from dynslam_bench.reports.html.run_page import exact_shares
+from dynslam_bench.reports.html.explore import exact_shares
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables.leaderboard import repeatability

@@ -3,8 +3,8 @@
 import pandas as pd
 import pytest
 from reports_browser import needs_browser
-from reports_fake_store import add_run, fill
-from test_reports_browser import add_frames, browser, open_page, report, run_of
+from reports_fake_store import add_frames, add_run, fill
+from test_reports_browser import browser, open_page, report, run_of
 
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs.store import RunStore
@@ -22,31 +22,37 @@ def explore(browser, report, anchor=""):
     browser.until("one('#explore-table tbody tr')")
 
 
+@pytest.fixture
+def explored(browser, report):
+    """The browser at the exploring table."""
+    explore(browser, report)
+    return browser
+
+
 def press(browser, place, text):
     browser.run(f"all('#{place} button').find((each) => each.textContent === '{text}').click()")
 
 
-def test_search_tags_and_ranked_only(browser, report):
-    explore(browser, report)
-    everybody, columns = browser.run(ROWS), browser.run(HEADS)
+def test_search_tags_and_ranked_only(explored):
+    everybody, columns = explored.run(ROWS), explored.run(HEADS)
     assert len(everybody) == 7 and len(columns) == 3 + 5
-    browser.run("$('explore-search').value = 'dyna'; $('explore-search').dispatchEvent(new Event('input'))")
-    assert browser.run(ROWS) == ["DynaSLAM N+G (our back end)"]
-    assert "q=dyna" in browser.run("location.hash")
-    browser.run("$('explore-reset').click()")
-    browser.run("$('explore-ranked').click()")
-    ranked = browser.run(ROWS)
+    explored.run("$('explore-search').value = 'dyna'; $('explore-search').dispatchEvent(new Event('input'))")
+    assert explored.run(ROWS) == ["DynaSLAM N+G (our back end)"]
+    assert "q=dyna" in explored.run("location.hash")
+    explored.run("$('explore-reset').click()")
+    explored.run("$('explore-ranked').click()")
+    ranked = explored.run(ROWS)
     assert 2 <= len(ranked) < 7 and "constant velocity" not in ranked
-    browser.run("$('explore-reset').click()")
-    assert browser.run("all('#explore-tags button').map((each) => each.textContent)") == [
+    explored.run("$('explore-reset').click()")
+    assert explored.run("all('#explore-tags button').map((each) => each.textContent)") == [
         *("all", "static", "dynamic", "high dynamic", "low dynamic"),
     ]
     for tag, kinds in (("high dynamic", {"walking"}), ("dynamic", {"walking", "sitting"}), ("static", {"toy"})):
-        press(browser, "explore-tags", tag)
-        assert {name.rpartition("/")[2].partition("_")[0] for name in browser.run(HEADS)[3:]} == kinds
-    press(browser, "explore-tags", "dynamic")
-    browser.run("$('explore-ranked').click()")
-    assert browser.run(ROWS) == ranked and len(browser.run(HEADS)) == 3 + 4
+        press(explored, "explore-tags", tag)
+        assert {name.rpartition("/")[2].partition("_")[0] for name in explored.run(HEADS)[3:]} == kinds
+    press(explored, "explore-tags", "dynamic")
+    explored.run("$('explore-ranked').click()")
+    assert explored.run(ROWS) == ranked and len(explored.run(HEADS)) == 3 + 4
 
 
 def test_the_view_is_in_the_address(browser, report):
@@ -63,7 +69,7 @@ def test_the_view_is_in_the_address(browser, report):
     assert browser.run("location.hash").startswith("#s-errors&") and "kind=rpe" in browser.run("location.hash")
 
 
-def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
+def test_every_number_can_be_chosen_and_is_that_of_the_runs(explored, report):
     """ATE, relative and rotational errors, absolute and as ratios: each against the CSV of the runs."""
     runs = pd.read_csv(report.csv["runs"])
     mine = runs[(runs["label"] == "Mask R-CNN (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
@@ -73,55 +79,46 @@ def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
       const row = all("#explore-table tbody tr").find((each) => each.cells[0].textContent.startsWith("Mask R-CNN"));
       return +row.cells[at].dataset.v;
     })()"""
-    explore(browser, report)
     for kind, column, factor in (
         ("ATE", "score_m", 1000.0),
         ("RPE", "rpe_1s_trans_rmse_m", 1000.0),
         ("Rotation", "rpe_1s_rot_rmse_deg", 1.0),
     ):
-        press(browser, "explore-kind", kind)
-        press(browser, "explore-scale", "degrees" if kind == "Rotation" else "mm")
-        assert browser.run(cell) == pytest.approx(factor * mine[column].median(), rel=1e-3)
-        press(browser, "explore-scale", "ratio")
-        assert browser.run(cell) == pytest.approx(mine[column].median() / base[column].median(), rel=1e-3)
-    press(browser, "explore-scale", "degrees")
-    browser.run("choose($('explore-metric'))")  # the absolute one
-    assert browser.run(cell) == pytest.approx(mine["ape_rot_rmse_deg"].median(), rel=1e-3)
+        press(explored, "explore-kind", kind)
+        press(explored, "explore-scale", "degrees" if kind == "Rotation" else "mm")
+        assert explored.run(cell) == pytest.approx(factor * mine[column].median(), rel=1e-3)
+        press(explored, "explore-scale", "ratio")
+        assert explored.run(cell) == pytest.approx(mine[column].median() / base[column].median(), rel=1e-3)
+    press(explored, "explore-scale", "degrees")
+    explored.run("choose($('explore-metric'))")  # the absolute one
+    assert explored.run(cell) == pytest.approx(mine["ape_rot_rmse_deg"].median(), rel=1e-3)
 
 
-def test_final_trajectories_are_a_switch(browser, report):
+def test_final_trajectories_are_a_switch(explored, report):
     final = pd.read_csv(report.csv["runs"]).set_index(["label", "sequence"])["final_ate_m"]
-    explore(browser, report)
-    online = browser.run("one('#explore-table').innerText")
-    press(browser, "explore-which", "final")
-    assert "which=final" in browser.run("location.hash") and browser.run("one('#explore-table').innerText") != online
-    shown = browser.run("all('#explore-table td[data-v] a').map((link) => +link.parentElement.dataset.v)")
+    online = explored.run("one('#explore-table').innerText")
+    press(explored, "explore-which", "final")
+    assert "which=final" in explored.run("location.hash") and explored.run("one('#explore-table').innerText") != online
+    shown = explored.run("all('#explore-table td[data-v] a').map((link) => +link.parentElement.dataset.v)")
     assert sorted(shown) == pytest.approx(sorted(1000 * final.dropna()), rel=1e-3) and len(shown) == 2
 
 
-def test_columns_are_chosen_one_by_one(browser, report):
-    explore(browser, report)
-    labels = browser.run("all('#explore-columns label').map((each) => each.textContent.trim())")
+def test_columns_are_chosen_one_by_one(explored):
+    labels = explored.run("all('#explore-columns label').map((each) => each.textContent.trim())")
     assert labels[:3] == ["rank", "ATE ratio", "success"] and "synthetic/walking_xyz" in labels
-    for label, shown in (("synthetic/walking_xyz", False), ("memory", None), ("MB", True), ("rank", False)):
-        found = f"all('#explore-columns label').find((each) => each.textContent.trim() === '{label}')"
-        if shown is None:
-            assert browser.run(f"{found} === undefined")  # a column is called as its heading
-            continue
-        browser.run(f"{found}.querySelector('input').click()")
-        assert (label in browser.run(HEADS)) == shown
-        assert browser.run("location.hash") != ""
+    for label, shown in (("synthetic/walking_xyz", False), ("MB", True), ("rank", False)):
+        explored.run(f"all('#explore-columns input')[{labels.index(label)}].click()")
+        assert (label in explored.run(HEADS)) == shown and explored.run("location.hash") != ""
 
 
-def test_numbers_are_those_of_the_table_below(browser, report):
-    explore(browser, report)
-    name = browser.run("one('#explore-table tbody tr').cells[0].textContent")
-    shown = browser.run(
+def test_numbers_are_those_of_the_table_below(explored):
+    name = explored.run("one('#explore-table tbody tr').cells[0].textContent")
+    shown = explored.run(
         "Object.fromEntries([...one('#explore-table tbody tr').cells].slice(3)"
         ".map((cell, at) => [all('#explore-table thead th')[at + 3].textContent,"
         " cell.querySelector('a')?.textContent ?? cell.textContent]))"
     )
-    below = browser.run(f"""(() => {{
+    below = explored.run(f"""(() => {{
       const table = one("#per_sequence"), heads = [...table.tHead.rows].at(-1).cells;
       const row = [...table.tBodies[0].rows].find((each) => each.cells[0].textContent.trim() === {name!r});
       const cells = [...row.cells].slice(1);
@@ -130,25 +127,23 @@ def test_numbers_are_those_of_the_table_below(browser, report):
     assert shown == below and len(shown) == 5
 
 
-def test_a_failure_is_hatched_says_how_and_is_never_best(browser, report):
-    explore(browser, report)
-    failed = browser.run(
+def test_a_failure_is_hatched_says_how_and_is_never_best(explored):
+    failed = explored.run(
         "all('#explore-table tbody small a').filter((each) => each.textContent === '✕').map((each) => each.title)"
     )
     assert failed == ["seed 1, crashed at 30/120"]
-    best = browser.run("all('#explore-table .best').map((cell) => cell.parentElement.cells[0].textContent)")
+    best = explored.run("all('#explore-table .best').map((cell) => cell.parentElement.cells[0].textContent)")
     assert best and not any("DS-SLAM" in name for name in best)
 
 
-def test_a_cell_leads_to_its_run_and_the_run_to_its_like(browser, report):
-    explore(browser, report)
-    link = browser.run("one('#explore-table td a').href")
-    browser.open(report.run, anchor="#" + link.partition("#")[2])
-    browser.until("one('.card')")
-    assert "DynaSLAM" in browser.run("document.title") and browser.faults == []
-    browser.run("choose(one('#run-choice select'))")
-    browser.until("!document.title.includes('DynaSLAM')")
-    assert browser.run("all('.card').length") >= 4 and browser.faults == []
+def test_a_cell_leads_to_its_run_and_the_run_to_its_like(explored, report):
+    link = explored.run("one('#explore-table td a').href")
+    explored.open(report.run, anchor="#" + link.partition("#")[2])
+    explored.until("one('.card')")
+    assert "DynaSLAM" in explored.run("document.title") and explored.faults == []
+    explored.run("choose(one('#run-choice select'))")
+    explored.until("!document.title.includes('DynaSLAM')")
+    assert explored.run("all('.card').length") >= 4 and explored.faults == []
 
 
 def test_a_run_shows_its_figures_settings_log_and_command(browser, report):
@@ -180,10 +175,10 @@ def test_angles_that_only_the_alignment_made_are_called_unreliable(browser, tmp_
 
 def test_the_slider_moves_image_track_and_cursor(browser, report):
     open_page(browser, report, "run", 1400)
-    state = "[one('#looks .caption').textContent, one('#over-time .cursor').outerHTML]"
+    state = "[one('#annotations .caption').textContent, one('#over-time .cursor').outerHTML]"
     browser.until("one('#over-time .cursor')")
     last = browser.run(state)
-    browser.run("slide(one('#looks input[type=range]'), 0)")
+    browser.run("slide(one('#annotations input[type=range]'), 0)")
     browser.settle()
     first = browser.run(state)
     assert "frame 0" in first[0] and "frame 39" in last[0]
@@ -195,9 +190,8 @@ def test_the_slider_moves_image_track_and_cursor(browser, report):
     assert "80%" in browser.run(compare)
 
 
-def test_error_against_dynamic_pixels_rises_as_it_was_made(browser, report):
-    explore(browser, report)
-    figure = browser.run(
+def test_error_against_dynamic_pixels_rises_as_it_was_made(explored):
+    figure = explored.run(
         "$('explore-share').chart.figure.data.filter((trace) => trace.name.startsWith('Ours')).map((trace) => trace.y)"
     )
     assert len(figure) == 1
@@ -233,16 +227,16 @@ def test_figures_name_trackers_as_they_are_called_and_only_those_that_they_show(
 
 
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
-    browser.open(report.run, anchor="#" + "0" * 16)
-    browser.until("one('main .note')")
-    assert browser.run("one('main .note').textContent") == f"There is no run {'0' * 16} in this report."
     victim = report.html.parent / "data" / f"run-{run_of(report, 'constant', 'synthetic/sitting_xyz')}.js"
-    kept = victim.read_text()
-    victim.unlink()
-    browser.open(report.run, anchor="#" + victim.stem.removeprefix("run-"))
-    browser.until("one('main .note')")
-    victim.write_text(kept)
-    assert "is missing beside this page" in browser.run("one('main .note').textContent")
+    victim.rename(victim.with_suffix(".away"))
+    for run_id, said in (
+        ("0" * 16, f"There is no run {'0' * 16} in this report."),
+        (victim.stem.removeprefix("run-"), "is missing beside this page"),
+    ):
+        browser.open(report.run, anchor=f"#{run_id}")
+        browser.until("one('main .note')")
+        assert said in browser.run("one('main .note').textContent")
+    victim.with_suffix(".away").rename(victim)
 
 
 def test_of_too_many_runs_some_have_no_page_and_that_is_said(browser, tmp_path):

@@ -9,6 +9,7 @@ from reports_fake_store import add_run
 
 from dynslam_bench.reports import build_report, compare, load_board
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s
+from dynslam_bench.reports.tables.table import to_markdown
 from dynslam_bench.runs.store import RunStore
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.trackers import TRACKERS
@@ -80,7 +81,7 @@ def test_every_format_carries_the_mark(store, tmp_path, rank_seen):
     marked = runs[runs["seen_in_training"]]
     assert set(zip(marked["tracker"], marked["sequence"], strict=True)) == {("mask-rcnn", OLD), ("dynaslam", OLD)}
     assert ("--rank-seen" in markdown + page) is rank_seen
-    assert "§" in compare(store, store).to_markdown()
+    assert "§" in to_markdown(compare(store, store).table)
 
 
 def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_path):

@@ -5,18 +5,15 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import add_run
+from reports_fake_store import add_frames, add_run
 from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
-from test_reports_browser import add_frames
 
 from dynslam_bench.reports import build_report, load_frame
-from dynslam_bench.reports.html.explore import Pages
-from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.html.explore import RunPage, error_by_share
+from dynslam_bench.reports.model.board import make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.reports.model.missing import missing_commands, missing_note
 from dynslam_bench.reports.model.published import is_excerpt
-from dynslam_bench.reports.tables.errors import per_sequence, relative_errors
-from dynslam_bench.reports.tables.leaderboard import leaderboard
+from dynslam_bench.reports.tables.leaderboard import leaderboard, per_sequence, relative_errors
 from dynslam_bench.reports.tables.table import mm, percent
 from dynslam_bench.runs.store import RunStore
 
@@ -29,19 +26,16 @@ def test_losing_frames_is_not_free(tmp_path):
     for name in ("s/a", "s/b"):
         add_run(store, "steady", name, error=0.02)
         add_run(store, "loser", name, error=0.005, lost=range(40, 95))
-    board = make_board(load_runs([store], PROTOCOL).rows)
-    assert [board.labels[key] for key in board.trackers] == ["steady", "loser"]
-    loser = next(r for r in board.rows if r.tracker.id == "loser")
-    assert loser.score_m == loser.hold_last_pose_ate_m > 5 * loser.metrics["ate_rmse_m"]
     paths = build_report(store, tmp_path / "report")
-    shown = {r["tracker"]: float(r["s/a"]) for r in rows_of(paths.csv["per_sequence"])}
-    excluded = {r["tracker"]: float(r["s/a"]) for r in rows_of(paths.csv["lost_frames_excluded"])}
-    assert shown["loser"] > shown["steady"]
-    assert excluded["loser"] < excluded["steady"]
-    rules = rows_of(paths.csv["failure_rules"])
-    assert [r["tracker"] for r in rules] == ["steady", "loser"]
-    assert float(rules[1]["lost frames held: ATE ratio"]) > float(rules[0]["lost frames held: ATE ratio"])
-    assert float(rules[1]["lost frames left out: ATE ratio"]) < float(rules[0]["lost frames left out: ATE ratio"])
+    runs = {r["tracker"]: r for r in rows_of(paths.csv["runs"])}
+    assert float(runs["loser"]["score_m"]) > 5 * float(runs["loser"]["ate_rmse_m"])
+    for table, better in (("per_sequence", "steady"), ("lost_frames_excluded", "loser")):
+        errors = {r["tracker"]: float(r["s/a"]) for r in rows_of(paths.csv[table])}
+        assert min(("steady", "loser"), key=errors.get) == better
+    steady, loser = rows_of(paths.csv["failure_rules"])
+    assert (steady["tracker"], loser["tracker"]) == ("steady", "loser")
+    for rule, better in (("lost frames held", steady), ("lost frames left out", loser)):
+        assert min((steady, loser), key=lambda r: float(r[f"{rule}: ATE ratio"])) is better
 
 
 def test_a_failure_never_scores_better_than_not_moving():
@@ -57,24 +51,19 @@ def test_a_tracker_that_never_succeeded_stands_below_all_and_is_never_emphasised
     board = make_board(rows)
     assert [board.labels[k] for k in board.trackers] == ["GOOD", "BAD", "CONTROL", "C"]
     assert [board.labels[k] for k in board.ranked] == ["GOOD", "BAD"]
-    assert [board.labels[k] for k in board.hopeless] == ["C"]
     table = leaderboard(board, PROTOCOL)
     assert table.separators == {2, 3}
     assert [cells[1].text for cells in table.rows] == ["2/2", "2/2", "2/2", "0/2"]
     assert [cell.text for cell in table.rows[3][:4]] == ["–", "0/2", "C", "nothing succeeded"]
-    errors = per_sequence(board, PROTOCOL)
-    failed = cell_of(errors, "C")
+    failed = cell_of(per_sequence(board, PROTOCOL), "C")
     assert (failed.text, failed.emphasis, failed.shade, failed.value) == ("crashed at 20/60", "failed", None, None)
-    assert cell_of(errors, "GOOD").emphasis == "best"
-    for each in relative_errors(board, PROTOCOL):
+    half = make_board([*rows, row("c", "u"), row("good", "u"), row("bad", "u")])
+    for each, partly in zip(relative_errors(board, PROTOCOL), relative_errors(half, PROTOCOL), strict=True):
         assert [cells[0].text for cells in each.rows] == ["GOOD", "BAD", "CONTROL"]
         assert cell_of(each, "GOOD").emphasis == "best"
-    half = make_board([*rows, row("c", "u"), row("good", "u"), row("bad", "u")])
-    for each in relative_errors(half, PROTOCOL):
-        assert [(cell.text, cell.emphasis) for cell in next(c for c in each.rows if c[0].text == "C")[1:3]] == [
-            ("", "failed"),
-            ("", "failed"),
-        ]
+        assert [(cell_of(partly, "C", at).text, cell_of(partly, "C", at).emphasis) for at in (1, 2)] == [
+            ("", "failed")
+        ] * 2
 
 
 def test_a_cell_with_one_failure_is_not_bold_and_not_green():
@@ -121,12 +110,9 @@ def test_missing_cells_are_named_with_the_commands_that_fill_them():
     board = make_board(uneven())
     note = missing_note(board)
     assert note.startswith("The ranking stands on the 3 of 5 sequences that all ranked trackers have.")
-    assert "Not ranked, since they lack too many of the others' sequences: NEW." in note
-    assert "B on s [0:60], v" in note
-    commands = missing_commands(board)
-    assert "dynslam-bench run b s --frames 0:60" in commands
-    assert "dynslam-bench run b v" in commands
-    assert "dynslam-bench run new s t u v" in commands
+    assert "others' sequences: NEW." in note and "B on s [0:60], v" in note
+    wanted = {"b s --frames 0:60", "b v", "new s t u v"}
+    assert {f"dynslam-bench run {words}" for words in wanted} <= set(missing_commands(board))
     assert missing_note(make_board([row("a"), row("b")])) == ""
 
 
@@ -149,38 +135,28 @@ def test_parts_get_no_published_rows(tmp_path):
     add_run(store, "orb-slam2", "tum/fr3/walking_rpy", block="whole", duration_s=30.6)
     add_run(store, "orb-slam2", "synthetic/walking_xyz", block="rendered", frames=(0, 60))
     paths = build_report(store, tmp_path / "report")
-    table = rows_of(paths.csv["per_sequence"])
-    published = [r for r in table if "reported" in r["tracker"] or "claimed" in r["tracker"]]
-    assert published
-    for line in published:
-        assert line["tum/fr3/walking_xyz [0:200]"] == line["bonn/crowd"] == ""
-        assert line["tum/fr3/walking_rpy"] != ""
-    note = "Parts of recordings, beside which no published number stands: bonn/crowd, tum/fr3/walking_xyz [0:200]."
-    assert note in paths.markdown.read_text()
-    assert is_excerpt("tum/fr3/walking_xyz", 20.0)
-    assert not is_excerpt("tum/fr3/walking_xyz", 28.5)
-    assert not is_excerpt("synthetic/walking_xyz", 2.0)
+    lines = rows_of(paths.csv["per_sequence"])
+    published = [line for line in lines if "reported" in line["tracker"] or "claimed" in line["tracker"]]
+    filled = {name for line in published for name, value in line.items() if value and name != "tracker"}
+    assert published and filled == {"tum/fr3/walking_rpy"}
+    parts = "bonn/crowd, tum/fr3/walking_xyz [0:200]."
+    assert f"beside which no published number stands: {parts}" in paths.markdown.read_text()
+    lengths = (("tum/fr3/walking_xyz", 20.0), ("tum/fr3/walking_xyz", 28.5), ("synthetic/walking_xyz", 2.0))
+    assert [is_excerpt(*length) for length in lengths] == [True, False, False]
 
 
 def test_a_final_trajectory_stands_in_no_online_table(tmp_path):
-    store = RunStore(tmp_path / "r")
+    store, only = RunStore(tmp_path / "r"), RunStore(tmp_path / "only")
     add_run(store, "orb-slam2", "s/a", error=0.05)
-    add_run(store, "dynaslam", "s/a", error=0.04)
-    add_run(store, "orb-slam3", "s/a", kind="imported", final_error=0.001, online=False)
-    paths = build_report(store, tmp_path / "report")
-    assert {r["tracker"] for r in rows_of(paths.csv["leaderboard"])} == {"orb-slam2", "dynaslam"}
-    assert "orb-slam3 imported" not in {r["tracker"] for r in rows_of(paths.csv["per_sequence"])}
-    assert not any("orb-slam3" in r["tracker"] for r in rows_of(paths.csv["rpe_1s_trans"]))
+    for some in (store, only):
+        add_run(some, "orb-slam3", "s/a", kind="imported", final_error=0.001, online=False)
+    paths, alone = build_report(store, tmp_path / "report"), build_report(only, tmp_path / "alone")
+    for name in ("leaderboard", "per_sequence", "rpe_1s_trans"):
+        assert not any("orb-slam3" in line["tracker"] for line in rows_of(paths.csv[name])), name
     (final,) = rows_of(paths.csv["final_trajectory"])
-    assert final["tracker"] == "orb-slam3"
-    assert float(final["s/a"]) < 0.005
-    assert "Only in the table of final trajectories, as nothing else is known of them: orb-slam3." in (
-        paths.markdown.read_text()
-    )
-    only = RunStore(tmp_path / "only")
-    add_run(only, "orb-slam3", "s/a", kind="imported", final_error=0.001, online=False)
-    alone = build_report(only, tmp_path / "alone")
-    assert len(rows_of(alone.csv["final_trajectory"])) == 1
+    assert final["tracker"] == "orb-slam3" and float(final["s/a"]) < 0.005
+    note = "Only in the table of final trajectories, as nothing else is known of them: orb-slam3."
+    assert note in paths.markdown.read_text() and len(rows_of(alone.csv["final_trajectory"])) == 1
 
 
 def test_imports_of_several_files_are_repeats_and_not_dropped(tmp_path):
@@ -196,19 +172,11 @@ def test_imports_of_several_files_are_repeats_and_not_dropped(tmp_path):
 
 def test_copies_are_no_repeats():
     rows = [row("copy", error=0.1, seed=i) for i in range(4)]
-    rows += [row("real", error=0.1 + 0.01 * i, seed=i) for i in range(4)]
-    board = make_board(rows)
+    board = make_board([*rows, *(row("real", error=0.1 + 0.01 * i, seed=i) for i in range(4))])
     table = per_sequence(board, PROTOCOL)
-    assert cell_of(table, "COPY").small == "deterministic"
-    assert cell_of(table, "REAL").small == "±7.5"
-    copies = (
-        board.cells[rows[0].variant_key]["s"]
-        if "s" in board.sequences
-        else next(iter(board.cells[rows[0].variant_key].values()))
-    )
-    assert len(copies.scores) == 1
-    assert len(copies.rows) == 4
-    assert "±0.0000" not in str(table.rows)
+    assert [cell_of(table, name).small for name in ("COPY", "REAL")] == ["deterministic", "±7.5"]
+    copies = board.cells[rows[0].variant_key]["s"]
+    assert (len(copies.scores), len(copies.rows)) == (1, 4)
 
 
 def test_offsets_and_noise_are_repeats_of_one_cell():
@@ -225,14 +193,11 @@ def test_offsets_and_noise_are_repeats_of_one_cell():
 
 def test_a_deterministic_trackers_offsets_keep_apart_in_the_store(tmp_path):
     store = RunStore(tmp_path / "r")
-    for offset in (0, 2):
-        for seed in (0, 1):
-            add_run(store, "a", "s/a", seed, offset=offset, block="b", copy_of=offset)
+    for offset, seed in ((0, 0), (0, 1), (2, 0), (2, 1)):
+        add_run(store, "a", "s/a", seed, offset=offset, block="b", copy_of=offset)
     loaded = load_runs([store], PROTOCOL)
-    assert (len(loaded.rows), loaded.superseded) == (4, 0)
-    board = make_board(loaded.rows)
-    (cells,) = board.cells.values()
-    assert [(len(c.rows), len(c.scores)) for c in cells.values()] == [(4, 2)]
+    ((cell,),) = (cells.values() for cells in make_board(loaded.rows).cells.values())
+    assert (loaded.superseded, len(cell.rows), len(cell.scores)) == (0, 4, 2)
 
 
 # -- what stands beside the numbers
@@ -244,16 +209,13 @@ def test_times_from_the_cache_are_marked(tmp_path):
     add_run(store, "both", "s/a", cached=True, frame_s=0.01)
     add_run(store, "both", "s/b", frame_s=0.05)
     add_run(store, "fresh", "s/a", frame_s=0.02)
-    paths = build_report(store, tmp_path / "report")
-    markdown = paths.markdown.read_text()
-    lines = {name: next(x for x in markdown.splitlines() if f"| {name} |" in x) for name in ("cached", "both", "fresh")}
-    assert "10.0 ms†" in lines["cached"]
-    assert "50.0 ms" in lines["both"]
-    assert "†" not in lines["both"] + lines["fresh"]
-    assert "† Times of features and masks come from the stage cache" in markdown
-    flags = {(r["tracker"], r["sequence"]): r["cached"] for r in rows_of(paths.csv["runs"])}
-    assert flags == {("cached", "s/a"): "True", ("both", "s/a"): "True", ("both", "s/b"): "False",
-                     ("fresh", "s/a"): "False"}  # fmt: skip
+    board = make_board(load_runs([store], PROTOCOL).rows)
+    table = leaderboard(board, PROTOCOL)
+    column = [column.name for column in table.columns].index("× real time")
+    times = {cells[2].text: cells[column].small for cells in table.rows}
+    assert times == {"cached": "10.0 ms†", "both": "50.0 ms", "fresh": "20.0 ms"} and "†" in table.caption
+    flags = {(r.tracker, r.sequence): r.cached for r in board.frame().itertuples()}
+    assert {place for place, cached in flags.items() if cached} == {("cached", "s/a"), ("both", "s/a")}
 
 
 def test_the_share_without_fundamental_matrix_stands_beside_every_number():
@@ -285,16 +247,10 @@ def test_the_page_of_a_run_stacks_stages_alone_and_claims_no_share_of_people_whe
 
 
 def test_numbers_have_three_digits_and_no_more():
-    assert [mm(v) for v in (0.2196, 0.0142, 0.009996, 0.00123, 2.5, 0.0)] == [
-        "220",
-        "14.2",
-        "10.0",
-        "1.23",
-        "2500",
-        "0",
-    ]
-    assert mm(float("nan")) == "–"
-    assert [percent(v) for v in (0, 0.5, 1, 0.999, 0.0001)] == ["0 %", "50 %", "100 %", "99.9 %", "< 0.1 %"]
+    numbers = {0.2196: "220", 0.0142: "14.2", 0.009996: "10.0", 0.00123: "1.23", 2.5: "2500", 0.0: "0"}
+    assert {value: mm(value) for value in numbers} == numbers and mm(float("nan")) == "–"
+    shares = {0: "0 %", 0.5: "50 %", 1: "100 %", 0.999: "99.9 %", 0.0001: "< 0.1 %"}
+    assert {value: percent(value) for value in shares} == shares
 
 
 def test_little_data_claims_little():
@@ -336,14 +292,10 @@ def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
     add_run(store, "a", "s/a", offset=2, block="b", skipped=0.5, overrides={"x.y": 3})
     add_run(store, "b", "s/a", status="crashed", reason="boom", block="b", noise=4)
     frame = load_frame(store)
-    assert list(frame["tracker"]) == ["a", "b"]
-    assert frame["settings"][0].startswith("x.y=3")
-    assert str(frame["noise"].dtype) == "Int64"
-    assert frame["noise"].isna().tolist() == [True, False]
-    assert frame["failed"].tolist() == [False, True]
-    assert frame["ending"][1] == "crashed at 30/120"
-    assert frame["score_m"].dtype == "Float64"
-    assert frame["ate_rmse_m"][0] == frame["score_m"][0] > 0
+    assert list(frame["tracker"]) == ["a", "b"] and frame["settings"][0].startswith("x.y=3")
+    assert str(frame["noise"].dtype) == "Int64" and frame["noise"].isna().tolist() == [True, False]
+    assert frame["failed"].tolist() == [False, True] and frame["ending"][1] == "crashed at 30/120"
+    assert str(frame["score_m"].dtype) == "Float64" and frame["ate_rmse_m"][0] == frame["score_m"][0] > 0
     assert frame["epipolar_skipped"][1] is pd.NA
     paths = build_report(store, tmp_path / "report")
     assert list(rows_of(paths.csv["runs"])[0]) == list(frame.columns)
@@ -351,14 +303,9 @@ def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
 
 def test_who_follows_people_on_few_frames_is_not_shown_as_the_better_one():
     """The exploring page's error by the share of dynamic pixels; the follower is best on most frames."""
-    pages, share = Pages(), np.full(100, 0.35)
-    for tracker, errors_mm in (("steady", np.full(100, 1.2)), ("follower", np.r_[np.full(90, 0.9), np.full(10, 40.0)])):
-        pages.add_frames(row(tracker), 1e-3 * errors_mm, share, exact=True)
-    steady, follower = (
-        [mm for mm, _ in pages.by_share(row(name).variant_key) if mm] for name in ("steady", "follower")
-    )
-    assert steady == [1.2]
-    assert follower == [pytest.approx(np.sqrt(0.9 * 0.9**2 + 0.1 * 40.0**2), rel=1e-3)]
+    share, errors_mm = np.full(100, 0.35), np.r_[np.full(90, 0.9), np.full(10, 40.0)]
+    (rmse_mm,) = (mm for mm, _ in error_by_share([RunPage("", "", False, [], share, 1e-3 * errors_mm)]) if mm)
+    assert rmse_mm == pytest.approx(np.sqrt(np.mean(errors_mm**2)), rel=1e-3)
 
 
 def test_what_is_no_better_than_not_moving_is_named():

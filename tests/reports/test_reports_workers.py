@@ -6,7 +6,6 @@ import sys
 
 import pytest
 from reports_fake_store import add_run, fill
-from reports_rows import row
 
 from dynslam_bench.core.errors import InfrastructureError, ReportError
 from dynslam_bench.reports import build_report
@@ -49,25 +48,23 @@ def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
 def test_an_error_of_a_worker_is_raised_and_a_dead_worker_is_named(two_cores):
     for kind, error in (("raise", ReportError), ("die", InfrastructureError)):
         with load.worker_pool(1) as pool, pytest.raises(error):
-            load.run_jobs(pool, refuse, [(kind,)] * 3, lambda answer: None)
+            list(load.run_jobs(pool, refuse, [(kind,)] * 3))
 
 
-def test_few_runs_need_no_workers(monkeypatch):
-    with load.worker_pool(load.MANY - 1) as pool:
-        assert pool is None
-    monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: {0}, raising=False)
-    with load.worker_pool(10_000) as pool:
+@pytest.mark.parametrize(("runs", "cores"), [(load.MANY - 1, 8), (10_000, 1)])
+def test_few_runs_and_one_core_need_no_workers(runs, cores, monkeypatch):
+    monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    with load.worker_pool(runs) as pool:
         assert pool is None
 
 
 def test_a_script_needs_no_guard(tmp_path):
-    """Workers do not run the caller's script, and a row that they get is the one that was sent."""
+    """Workers do not run the caller's script."""
     script = tmp_path / "script.py"
     script.write_text(
         "from dynslam_bench.reports.model import load\n"
         "load.MANY = 1\nload.os.sched_getaffinity = lambda _: {0, 1}\nprint('once')\n"
-        "with load.worker_pool(1) as pool:\n    print(load.run_jobs(pool, abs, [(-2,), (3,)], lambda answer: None))\n"
+        "with load.worker_pool(1) as pool:\n    print(list(load.run_jobs(pool, abs, [(-2,), (3,)])))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout == "once\n[2, 3]\n"
-    assert load.run_jobs(None, lambda sent: sent.variant_key, [(row(),)], lambda answer: None) == [row().variant_key]

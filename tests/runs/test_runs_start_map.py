@@ -13,9 +13,8 @@ from dynslam_bench.core.errors import RunError, SettingsError, TrackerError
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.missing import run_command
 from dynslam_bench.reports.model.names import make_labels
-from dynslam_bench.reports.model.row import make_row
+from dynslam_bench.reports.model.row import make_row, run_command
 from dynslam_bench.runs import RunSpec, RunStore, run_many
 from dynslam_bench.runs.artifacts import keep_map
 from dynslam_bench.runs.identity import check_unchanged, resolve, start_map_of

@@ -181,21 +181,21 @@ function guidesOf(panel, layout) {
 
 const chartIsGrouped = (panel) => panel.grouped && panel.traces.every((trace) => trace.type === "bar");
 
-function marksOf(panel, shown) {
+function shapesOf(panel, shown) {
   const { left, top, width, height, place, sx, sy } = panel, group = svg("g");
-  const clip = `clip-${marksOf.count = (marksOf.count ?? 0) + 1}`;
+  const clip = `clip-${shapesOf.count = (shapesOf.count ?? 0) + 1}`;
   group.append(svg("clipPath", { id: clip }, svg("rect", { x: left - 7, y: top - 7, width: width + 14, height: height + 14 })));
   const inner = svg("g", { "clip-path": `url(#${clip})` });
   const room = sy.kind === "category" ? height / sy.categories.length : sx.kind === "category" ? width / sx.categories.length : width / Math.max(1, ...panel.traces.map((t) => t.x?.length ?? 1));
   const visible = panel.traces.filter(shown);
   if (chartIsGrouped(panel)) visible.forEach((trace, at) => Object.assign(trace, { width: 0.8 / visible.length, shift: ((at + 0.5) / visible.length - 0.5) * 0.8 }));
   for (const trace of visible) {
-    if (trace.type === "bar") inner.append(...barMarks(trace, place, room));
-    else if (trace.type === "box") inner.append(...boxMarks(trace, place, room));
+    if (trace.type === "bar") inner.append(...barShapes(trace, place, room));
+    else if (trace.type === "box") inner.append(...boxShapes(trace, place, room));
     else {
-      if ((trace.mode ?? "lines").includes("lines")) inner.append(...lineMark(trace, place));
+      if ((trace.mode ?? "lines").includes("lines")) inner.append(...lineShapes(trace, place));
       inner.append(...errorBars(trace, place));
-      if ((trace.mode ?? "").includes("markers")) inner.append(...pointMarks(trace, place));
+      if ((trace.mode ?? "").includes("markers")) inner.append(...pointShapes(trace, place));
     }
   }
   group.append(inner);
@@ -233,7 +233,7 @@ function drawChart(element, given) {
     const drawing = svg("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img", "aria-label": element.dataset.label ?? "figure" });
     for (const panel of panels) {
       const axes = axesOf(panel);
-      drawing.append(axes, guidesOf(panel, layout), marksOf(panel, shown));
+      drawing.append(axes, guidesOf(panel, layout), shapesOf(panel, shown));
     }
     chart.panels = panels;
     chart.width = width;

@@ -1,4 +1,4 @@
-// What belongs to a figure besides its marks: the legend that shows and hides, and the values where the pointer rests.
+// What belongs to a figure besides its traces: the legend that shows and hides, and the values where the pointer rests.
 function addLegend(element, figure, hidden, keyOf, render) {
   const entries = new Map();
   for (const trace of figure.data) if (trace.showlegend !== false && trace.name && !entries.has(keyOf(trace))) entries.set(keyOf(trace), trace);

@@ -72,7 +72,7 @@ function spreadOf(run) {
 
 function trackOf(run) {
   if (!run.track.xyz) return [section("s-track", "Track", make("p", { className: "waiting", textContent: run.track.reason ?? "Nothing was tracked." }))];
-  const canvas = make("canvas", { className: "space", tabIndex: 0, ariaLabel: "The track in space, coloured by its error; arrow keys turn it" });
+  const canvas = make("canvas", { className: "view3d", tabIndex: 0, ariaLabel: "The track in a 3-D view, coloured by its error; arrow keys turn it" });
   canvas.setAttribute("role", "img");
   const most = run.track.error_mm ? Math.max(quantile(run.track.error_mm.filter((value) => value !== null).sort((a, b) => a - b), 0.98), 1e-3) : 0;
   const ramp = make("span", { className: "ramp" });
@@ -80,7 +80,7 @@ function trackOf(run) {
   const keys = run.track.error_mm ? [make("div", { className: "keys" }, "0", ramp, `${digits(most)} mm and more`, make("span", {}, "grey: true path"))] : [];
   return [section("s-track", "Track", make("div", { className: "grid-2" },
     make("div", {}, canvas, ...keys, make("p", { className: "caption", textContent: `Drag or use the arrow keys to turn it. ${run.track.alignment ? `Aligned (${run.track.alignment}).` : "No ground truth: as the tracker gave it."}` })),
-    make("div", { id: "looks" })))];
+    make("div", { id: "annotations" })))];
 }
 
 async function render(id) {
@@ -99,18 +99,18 @@ async function render(id) {
       section("s-frames", "Frames", make("div", { id: "frames" })), settingsOf(run), logOf(run));
     drawRunFigures(run, where);
     main.querySelectorAll("table").forEach((each) => each.classList.add("plain-table"));
-    await showLooks(id, run, where, startSpace(run));
+    await showAnnotations(id, run, where, startView3D(run));
     document.querySelectorAll("nav a").forEach((link) => { link.hidden = !document.querySelector(link.getAttribute("href")); });
   } catch (error) { main.replaceChildren(make("p", { className: "note", textContent: error.message })); }
 }
 
-function startSpace(run) {
-  const canvas = document.querySelector(".space");
+function startView3D(run) {
+  const canvas = document.querySelector(".view3d");
   if (!canvas) return null;
   const errors = run.track.error_mm ?? null;
-  const space = new Space(canvas, run.track.xyz, run.track.true_xyz ?? null, errors, errors ? Math.max(quantile(errors.filter((value) => value !== null).sort((a, b) => a - b), 0.98), 1e-3) : 1);
-  space.draw();
-  return space;
+  const view3d = new View3D(canvas, run.track.xyz, run.track.true_xyz ?? null, errors, errors ? Math.max(quantile(errors.filter((value) => value !== null).sort((a, b) => a - b), 0.98), 1e-3) : 1);
+  view3d.draw();
+  return view3d;
 }
 
 function startRun() {

@@ -1,4 +1,4 @@
-// A track in space, coloured by its error: dragged to turn, with the true path in grey and a marker that follows the slider.
+// A track in a 3-D view, coloured by its error: dragged to turn, with the true path in grey and a marker that follows the slider.
 const RAMP = [[38, 120, 190], [60, 170, 140], [236, 190, 70], [222, 96, 52], [160, 28, 60]];
 
 function rampColour(share) {
@@ -6,7 +6,7 @@ function rampColour(share) {
   return `rgb(${RAMP[low].map((value, channel) => Math.round(value + (RAMP[low + 1][channel] - value) * part)).join(" ")})`;
 }
 
-class Space {
+class View3D {
   /** Tracks are lists of three lists of metres; `errors` in mm colours the first, up to `most`. */
   constructor(canvas, track, truth, errors, most) {
     Object.assign(this, { canvas, track, truth, errors, most, turn: -0.6, tilt: 0.45, at: track[0].length - 1 });

@@ -1,4 +1,4 @@
-// The marks of a figure: lines, points with error bars, boxes and bars, as SVG.
+// The traces of a figure as SVG shapes: lines, points with error bars, boxes and bars.
 const SVG = "http://www.w3.org/2000/svg";
 
 function svg(name, attributes = {}, ...children) {
@@ -28,7 +28,7 @@ function pointColour(colours, at) {
   return `color-mix(in srgb, ${SEQUENCE[1]} ${Math.round(100 * share)}%, ${SEQUENCE[0]})`;
 }
 
-function lineMark(trace, place) {
+function lineShapes(trace, place) {
   let path = "", pen = false, last = null;
   const step = trace.line?.shape === "hv";
   trace.x.forEach((x, at) => {
@@ -41,13 +41,13 @@ function lineMark(trace, place) {
   });
   const dash = { dot: "2 4", dash: "6 4" }[trace.line?.dash];
   const style = `--c: ${inkOf(trace.line?.color)}`;
-  const marks = [];
+  const shapes = [];
   if (trace.fill === "tozeroy" && last) {
     const start = path.match(/M([\d.-]+)/)[1], base = place(trace.x.find((x) => x !== null), 0)?.[1];
-    marks.push(svg("path", { d: `${path}V${base}H${start}Z`, class: "area", style }));
+    shapes.push(svg("path", { d: `${path}V${base}H${start}Z`, class: "area", style }));
   }
-  marks.push(svg("path", { d: path, class: "line", style, "stroke-width": trace.line?.width ?? 1.6, "stroke-dasharray": dash }));
-  return marks;
+  shapes.push(svg("path", { d: path, class: "line", style, "stroke-width": trace.line?.width ?? 1.6, "stroke-dasharray": dash }));
+  return shapes;
 }
 
 function errorBars(trace, place) {
@@ -67,8 +67,8 @@ function errorBars(trace, place) {
   return bars;
 }
 
-function pointMarks(trace, place) {
-  const marks = [], size = trace.marker?.size ?? 8;
+function pointShapes(trace, place) {
+  const shapes = [], size = trace.marker?.size ?? 8;
   trace.x.forEach((x, at) => {
     const point = place(x, trace.y[at]);
     if (point === null) return;
@@ -76,9 +76,9 @@ function pointMarks(trace, place) {
     const shape = SHAPES[symbol.replace("-open", "")] ?? SHAPES.circle, scale = each(size, at) / 10;
     const move = `translate(${point[0].toFixed(1)} ${point[1].toFixed(1)}) scale(${scale})`;
     const style = `--c: ${pointColour(trace.marker?.color ?? trace.line?.color, at)}`;
-    marks.push(svg("path", { d: shape, transform: move, class: open ? "point open" : "point", style, opacity: trace.marker?.opacity }));
+    shapes.push(svg("path", { d: shape, transform: move, class: open ? "point open" : "point", style, opacity: trace.marker?.opacity }));
   });
-  return marks;
+  return shapes;
 }
 
 /** Share of the way through sorted numbers, by linear interpolation. */
@@ -88,8 +88,8 @@ function quantile(sorted, share) {
 }
 
 /** A box of given quartiles and whiskers, or of the points behind it, which are drawn too. */
-function boxMarks(trace, place, room) {
-  const style = `--c: ${inkOf(trace.marker?.color)}`, marks = [], across = trace.orientation === "h";
+function boxShapes(trace, place, room) {
+  const style = `--c: ${inkOf(trace.marker?.color)}`, shapes = [], across = trace.orientation === "h";
   const half = room * 0.36 * (trace.width ?? 1);
   const spot = (value) => (across ? place(value, trace.name) : place(trace.at ?? trace.name, value));
   const boxes = trace.quartiles ?? [null];
@@ -104,21 +104,21 @@ function boxMarks(trace, place, room) {
     const [low, first, middle, third, high] = spots.map((point) => point[along]);
     const bar = (p) => `M${xy(p, side - half)}L${xy(p, side + half)}`;
     const d = `M${xy(first, side - half)}L${xy(third, side - half)}L${xy(third, side + half)}L${xy(first, side + half)}Z`;
-    marks.push(svg("path", { d: `M${xy(low, side)}L${xy(first, side)}M${xy(third, side)}L${xy(high, side)}`, class: "stem", style }));
-    marks.push(svg("path", { d, class: "box", style }), svg("path", { d: bar(middle), class: "middle", style }));
+    shapes.push(svg("path", { d: `M${xy(low, side)}L${xy(first, side)}M${xy(third, side)}L${xy(high, side)}`, class: "stem", style }));
+    shapes.push(svg("path", { d, class: "box", style }), svg("path", { d: bar(middle), class: "middle", style }));
   });
   if (!trace.quartiles)
     (across ? trace.x : trace.y).forEach((value, at) => {
       const point = spot(value);
       if (point === null) return;
       point[across ? 1 : 0] += (((at * 0.618) % 1) - 0.5) * half;
-      marks.push(svg("circle", { cx: point[0].toFixed(1), cy: point[1].toFixed(1), r: 3, class: "point", style, opacity: 0.75 }));
+      shapes.push(svg("circle", { cx: point[0].toFixed(1), cy: point[1].toFixed(1), r: 3, class: "point", style, opacity: 0.75 }));
     });
-  return marks;
+  return shapes;
 }
 
 /** Bars from `base` (stacked ones) or from zero. */
-function barMarks(trace, place, room) {
+function barShapes(trace, place, room) {
   const across = trace.orientation === "h";
   return (across ? trace.y : trace.x).map((name, at) => {
     const value = (across ? trace.x : trace.y)[at], base = trace.base?.[at] ?? 0;

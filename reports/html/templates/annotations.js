@@ -14,16 +14,16 @@ const picture = (url) => {
 };
 
 /** Draw a frame: the image, the mask if `masked`, and the features that `which` names ("all", "kept" or "both"). */
-async function drawLook(canvas, look, { masked = true, which = "both" } = {}) {
-  const shape = [look.width ?? 640, look.height ?? 480], pen = canvas.getContext("2d");
-  const image = look.image ? await picture(look.image) : null, mask = masked && look.mask ? await picture(look.mask) : null;
+async function drawFrame(canvas, frame, { masked = true, which = "both" } = {}) {
+  const shape = [frame.width ?? 640, frame.height ?? 480], pen = canvas.getContext("2d");
+  const image = frame.image ? await picture(frame.image) : null, mask = masked && frame.mask ? await picture(frame.mask) : null;
   const width = (canvas.width = 960), height = (canvas.height = Math.round((960 * (image?.height ?? shape[1])) / (image?.width ?? shape[0])));
   if (image) pen.drawImage(image, 0, 0, width, height);
   if (mask) pen.drawImage(tinted(mask), 0, 0, width, height);
-  if (!look.points) return;
-  const places = Uint8Array.from(atob(look.points), (letter) => letter.charCodeAt(0));
+  if (!frame.points) return;
+  const places = Uint8Array.from(atob(frame.points), (letter) => letter.charCodeAt(0));
   for (let at = 0; at < places.length / 2; at++) {
-    const culled = at < look.culled;
+    const culled = at < frame.culled;
     if (culled && which === "kept") continue;
     pen.fillStyle = culled && which === "both" ? CULLED : KEPT;
     pen.beginPath();
@@ -53,38 +53,38 @@ const keyRow = (entries) => make("div", { className: "keys" }, ...entries.map(([
   return make("span", {}, dot, text);
 }));
 
-const words = (look) => [
-  `frame ${look.index}`, look.error_mm === null || look.error_mm === undefined ? "" : `${digits(look.error_mm)} mm off the frame before`,
-  look.points ? `${look.culled} of ${atob(look.points).length / 2} features culled` : "", look.share == null ? "" : `mask ${digits(look.share)} %`,
+const words = (frame) => [
+  `frame ${frame.index}`, frame.error_mm === null || frame.error_mm === undefined ? "" : `${digits(frame.error_mm)} mm off the frame before`,
+  frame.points ? `${frame.culled} of ${atob(frame.points).length / 2} features culled` : "", frame.share == null ? "" : `mask ${digits(frame.share)} %`,
 ].filter(Boolean).join(" · ");
 
-function viewOf(look, options) {
+function viewOf(frame, options) {
   const canvas = make("canvas"), view = make("div", { className: "view" }, canvas);
   canvas.setAttribute("role", "img");
-  canvas.setAttribute("aria-label", words(look));
-  view.style.setProperty("--shape", `${look.width ?? 4} / ${look.height ?? 3}`);
-  drawLook(canvas, look, options).catch((error) => view.replaceChildren(make("p", { className: "note", textContent: error.message })));
+  canvas.setAttribute("aria-label", words(frame));
+  view.style.setProperty("--shape", `${frame.width ?? 4} / ${frame.height ?? 3}`);
+  drawFrame(canvas, frame, options).catch((error) => view.replaceChildren(make("p", { className: "note", textContent: error.message })));
   return view;
 }
 
 /** The slider: image, mask and features of a frame; the track's marker and the figures' cursors follow it. */
-function addSlider(place, looks, run, space) {
+function addSlider(place, frames, run, view3d) {
   const canvas = make("canvas"), view = make("div", { className: "view" }, canvas), line = make("p", { className: "caption" });
-  const slider = make("input", { type: "range", min: 0, max: looks.length - 1, value: looks.length - 1, ariaLabel: "Frame" });
+  const slider = make("input", { type: "range", min: 0, max: frames.length - 1, value: frames.length - 1, ariaLabel: "Frame" });
   const veil = make("input", { type: "checkbox", checked: true });
   canvas.setAttribute("role", "img");
-  view.style.setProperty("--shape", `${looks[0].width ?? 4} / ${looks[0].height ?? 3}`);
+  view.style.setProperty("--shape", `${frames[0].width ?? 4} / ${frames[0].height ?? 3}`);
   const step = () => {
-    const look = looks[+slider.value], share = run.frames.count > 1 ? look.index / (run.frames.count - 1) : 0;
-    const t = run.frames.t[Math.min(Math.round(look.index / run.frames.step), run.frames.t.length - 1)];
-    line.textContent = `${digits(t)} s · ${words(look)}`;
+    const frame = frames[+slider.value], share = run.frames.count > 1 ? frame.index / (run.frames.count - 1) : 0;
+    const t = run.frames.t[Math.min(Math.round(frame.index / run.frames.step), run.frames.t.length - 1)];
+    line.textContent = `${digits(t)} s · ${words(frame)}`;
     canvas.setAttribute("aria-label", line.textContent);
-    drawLook(canvas, look, { masked: veil.checked }).catch((error) => { line.textContent = error.message; });
-    if (space) {
+    drawFrame(canvas, frame, { masked: veil.checked }).catch((error) => { line.textContent = error.message; });
+    if (view3d) {
       const moment = t - ((run.track.start ?? 0) - run.frames.start);
-      space.at = run.track.t.findIndex((value) => value >= moment - 1e-6);
-      if (space.at < 0) space.at = Math.round(share * (run.track.t.length - 1));
-      space.draw();
+      view3d.at = run.track.t.findIndex((value) => value >= moment - 1e-6);
+      if (view3d.at < 0) view3d.at = Math.round(share * (run.track.t.length - 1));
+      view3d.draw();
     }
     if (!FIGURES["over-time"]) return;
     FIGURES["over-time"].cursor = t;
@@ -92,7 +92,7 @@ function addSlider(place, looks, run, space) {
   };
   slider.addEventListener("input", step);
   veil.addEventListener("change", step);
-  const pointed = looks.some((look) => look.points), masked = looks.some((look) => look.mask);
+  const pointed = frames.some((frame) => frame.points), masked = frames.some((frame) => frame.mask);
   const keys = keyRow([...(pointed ? [[KEPT, "kept"], [CULLED, "culled"]] : []), ...(masked ? [[MASK, "mask"]] : [])]);
   if (masked) keys.append(make("label", { className: "check no-print" }, veil, "show the mask"));
   place.replaceChildren(view, slider, line, keys);
@@ -100,8 +100,8 @@ function addSlider(place, looks, run, space) {
 }
 
 /** Before against after: all features on the left of the divider, only the kept ones on the right. */
-function addCompare(place, look) {
-  const before = viewOf(look, { masked: false, which: "all" }), after = viewOf(look, { masked: false, which: "kept" });
+function addCompare(place, frame) {
+  const before = viewOf(frame, { masked: false, which: "all" }), after = viewOf(frame, { masked: false, which: "kept" });
   const slider = make("input", { type: "range", min: 0, max: 100, value: 50, ariaLabel: "Divider between before and after culling" });
   after.style.position = "absolute";
   after.style.inset = "0";
@@ -115,25 +115,25 @@ function addCompare(place, look) {
   const pair = make("div", {}, before, after, divider);
   pair.style.position = "relative";
   place.append(make("h3", { textContent: "Before and after culling" }), pair, slider,
-    make("p", { className: "caption", textContent: `Left of the divider all features, right of it those that were kept; ${words(look)}.` }));
+    make("p", { className: "caption", textContent: `Left of the divider all features, right of it those that were kept; ${words(frame)}.` }));
 }
 
-async function showLooks(id, run, where, space) {
-  const beside = $("looks"), below = $("frames");
+async function showAnnotations(id, run, where, view3d) {
+  const beside = $("annotations"), below = $("frames");
   if (!where.pictured) {
     const why = "There are no pictures of this run. They are drawn of the run with the median error of each cell and of failed ones, where the sequence is on the machine and there is time; imported tracks have none.";
     (beside ?? below).append(make("p", { className: "waiting", textContent: why }));
     if (beside) $("s-frames").remove();
     return;
   }
-  const { looks, stored } = await side(`looks-${id}`);
-  if (beside) addSlider(beside, looks, run, space);
-  const worst = looks.filter((look) => look.error_mm != null).sort((a, b) => b.error_mm - a.error_mm).slice(0, 4);
-  const culling = looks.filter((look) => look.culled).sort((a, b) => b.culled - a.culled)[0];
-  const thumbs = worst.map((look) => make("figure", { className: "thumb" }, viewOf(look), make("figcaption", { textContent: words(look) })));
+  const { frames, stored } = await side(`annotations-${id}`);
+  if (beside) addSlider(beside, frames, run, view3d);
+  const worst = frames.filter((frame) => frame.error_mm != null).sort((a, b) => b.error_mm - a.error_mm).slice(0, 4);
+  const culling = frames.filter((frame) => frame.culled).sort((a, b) => b.culled - a.culled)[0];
+  const thumbs = worst.map((frame) => make("figure", { className: "thumb" }, viewOf(frame), make("figcaption", { textContent: words(frame) })));
   below.append(make("h3", { textContent: "Worst frames" }), make("div", { className: "thumbs" }, ...thumbs));
   if (!stored) below.append(make("p", { className: "caption", textContent: "This run was made by an older version or its tracker shows no features: only the images are known." }));
-  if (!looks.some((look) => look.image)) below.append(make("p", { className: "caption", textContent: "The sequence is not on the machine that made this report, so there are no images." }));
+  if (!frames.some((frame) => frame.image)) below.append(make("p", { className: "caption", textContent: "The sequence is not on the machine that made this report, so there are no images." }));
   if (culling) {
     const place = make("div");
     place.style.maxWidth = "46rem";
