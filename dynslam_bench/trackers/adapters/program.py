@@ -7,17 +7,15 @@ import ctypes
 import json
 import logging
 import os
-import selectors
+import queue
 import signal
 import subprocess
 import sys
 import threading
-import time
 import weakref
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.reading import parse_json
@@ -26,7 +24,7 @@ _SET_PARENT_DEATH_SIGNAL = 1
 LOGGER = logging.getLogger(__name__)
 """Gets, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
 LONGEST_LINE = 1 << 26
-"""Bytes of the longest line that is taken from a program: a final trajectory of half a million poses."""
+"""Bytes of the longest line that is read from a program: a final trajectory of half a million poses."""
 
 
 class Program:
@@ -57,10 +55,6 @@ class Program:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
-        self._lines: dict[str, str] = {}
-        self._fresh_lines: dict[str, str] = {}  # since the last request
-        self._partial = {"out": b"", "err": b""}
-        self._answers: deque[str] = deque()
         try:
             self._process = subprocess.Popen(
                 list(command),
@@ -75,35 +69,16 @@ class Program:
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
             raise TrackerError(f"{name}: cannot start '{command[0]}': {reason}", "check its path") from error
-        assert self._process.stdin and self._process.stdout and self._process.stderr
-        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
-            os.set_blocking(stream.fileno(), False)
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._process.stdout, selectors.EVENT_READ, "out")
-        self._selector.register(self._process.stderr, selectors.EVENT_READ, "err")
         self._kill = weakref.finalize(self, _kill_group, self._process)
-
-    @property
-    def alive(self) -> bool:
-        """Whether the program runs."""
-        return self._process.poll() is None
-
-    @property
-    def last_line(self) -> str:
-        """The last line that is not blank of what it wrote as log.
-
-        Lines since the last request count before earlier ones, and standard error before standard output, which often
-        arrives late, when it is flushed at the end.
-        """
-        for channel, partial in self._partial.items():
-            self._keep_line(channel, partial.decode(errors="replace"))
-            self._partial[channel] = b""
-        lines = (self._fresh_lines, self._lines)
-        return next((kept[channel] for kept in lines for channel in ("err", "out") if channel in kept), "")
-
-    def _keep_line(self, channel: str, text: str) -> None:
-        if text.strip():
-            self._lines[channel] = self._fresh_lines[channel] = text.strip()[:300]
+        self._answers: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # None: standard output has ended
+        self._old_lines: dict[str, str] = {}
+        self._new_lines: dict[str, str] = {}  # since the last request
+        self._readers = [
+            threading.Thread(target=_read, args=(name, channel, stream, self._answers, self._new_lines), daemon=True)
+            for channel, stream in (("out", self._process.stdout), ("err", self._process.stderr))
+        ]
+        for reader in self._readers:
+            reader.start()
 
     def ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
         """Send a request and wait for its answer.
@@ -117,9 +92,19 @@ class Program:
             TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
         """
         self._refuse_surplus(doing)
-        self._fresh_lines.clear()
-        line = memoryview(json.dumps(request, allow_nan=False).encode() + b"\n")
-        text = self._exchange(line, timeout_s, doing)
+        self._old_lines.update(self._new_lines)
+        self._new_lines.clear()
+        try:
+            self._write(request)
+            text = self._answers.get(timeout=timeout_s)
+        except (OSError, ValueError):  # it has closed its input, or was killed before
+            text = None
+        except queue.Empty:
+            line_shown = f"; its last line: '{self._last_line()}'" if self._last_line() else ""
+            self.kill()
+            raise TrackerError(f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{line_shown}") from None
+        if text is None:
+            raise self._death(doing)
         try:
             answer = parse_answer(text)
         except TrackerError as error:
@@ -130,90 +115,50 @@ class Program:
         self._refuse_surplus(doing)
         return answer
 
-    def _refuse_surplus(self, doing: str) -> None:
-        """Raise on an unrequested answer: it would be taken for the next one, a pose of the wrong frame."""
-        if self.alive:
-            self._read(0.0)
-        if self._answers:
-            surplus = self._answers.popleft()
-            self.kill()
-            raise TrackerError(
-                f"{self.name} {doing}: wrote an answer that was not asked for: '{surplus[:80]}'",
-                "one line that begins with { for each request",
-            )
-
     def close(self, timeout_s: float) -> None:
         """Ask it to end, wait, and kill it if it does not; may be called more than once."""
-        if self.alive:
-            assert self._process.stdin
-            with contextlib.suppress(OSError):
-                os.write(self._process.stdin.fileno(), b'{"op": "close"}\n')
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
-            deadline = time.monotonic() + timeout_s
-            while self.alive and time.monotonic() < deadline:
-                if not self._read(0.02):
-                    time.sleep(0.005)
-            self._drain()
+        with contextlib.suppress(OSError, ValueError, subprocess.TimeoutExpired):
+            self._write({"op": "close"})
+            self._input.close()
+            self._process.wait(timeout_s)
         self.kill()
 
     def kill(self) -> None:
         """End it and everything it started, at once."""
         self._kill()
-        self._selector.close()
+        for reader in self._readers:
+            reader.join(timeout=0.5)  # a process in another session may hold the pipe open for ever
 
-    def _exchange(self, line: memoryview, timeout_s: float, doing: str) -> str:
-        """Write the request, read until there is an answer."""
-        assert self._process.stdin
-        deadline = time.monotonic() + timeout_s
-        while line or not self._answers:
-            if line:
-                try:
-                    line = line[os.write(self._process.stdin.fileno(), line) :]
-                except BlockingIOError:
-                    pass  # its input is full: read what it says, then try again
-                except (OSError, ValueError):  # it has closed its input, or was killed before
-                    raise self._death(doing) from None
-            left = deadline - time.monotonic()
-            if left <= 0:
-                line_shown = f"; its last line: '{self.last_line}'" if self.last_line else ""
-                self.kill()
-                raise TrackerError(f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{line_shown}")
-            alive = self.alive
-            open_ = self._read(min(left, 0.01 if line else 0.5))
-            if not self._answers and not (alive and open_):
-                raise self._death(doing)
-        return self._answers.popleft()
+    @property
+    def _input(self) -> IO[bytes]:
+        assert self._process.stdin is not None
+        return self._process.stdin
 
-    def _read(self, wait: float) -> bool:
-        """Read its output for up to `wait` seconds; False once its standard output has ended."""
-        if not self._selector.get_map():
-            return False
-        for key, _ in self._selector.select(wait):
-            channel = str(key.data)
-            data = os.read(key.fd, 1 << 16)
-            if not data:
-                self._selector.unregister(key.fileobj)
-            *lines, rest = (self._partial[channel] + data).split(b"\n")
-            self._partial[channel] = rest
-            if len(rest) > LONGEST_LINE:
-                self.kill()
-                raise TrackerError(f"{self.name}: wrote a line of more than {LONGEST_LINE >> 20} MB, killed")
-            for raw in lines:
-                text = raw.decode(errors="replace")
-                if channel == "out" and text.lstrip().startswith("{"):
-                    self._answers.append(text)
-                elif text.strip():
-                    self._keep_line(channel, text)
-                    LOGGER.info("[%s] %s", self.name, text)
-        return any(key.data == "out" for key in self._selector.get_map().values())
+    def _write(self, message: Mapping[str, Any]) -> None:
+        self._input.write(json.dumps(message, allow_nan=False).encode() + b"\n")
+        self._input.flush()
 
-    def _drain(self) -> None:
-        """Read the rest of its output; a grandchild may hold the pipe open for ever."""
-        for _ in range(64):
-            if not self._selector.get_map() or not self._selector.select(0.0):
-                break
-            self._read(0.0)
+    def _refuse_surplus(self, doing: str) -> None:
+        """Raise on an unrequested answer: it would be taken for the next one, a pose of the wrong frame."""
+        if self._answers.empty():
+            return
+        surplus = self._answers.get()
+        if surplus is None:
+            raise self._death(doing)
+        self.kill()
+        raise TrackerError(
+            f"{self.name} {doing}: wrote an answer that was not asked for: '{surplus[:80]}'",
+            "one line that begins with { for each request",
+        )
+
+    def _last_line(self) -> str:
+        """The last line of its log.
+
+        Lines since the last request count before earlier ones, and standard error before standard output, which often
+        arrives late, when it is flushed at the end.
+        """
+        lines = (self._new_lines.get("err"), self._new_lines.get("out"), self._old_lines.get("err"))
+        return next(filter(None, lines), self._old_lines.get("out", ""))
 
     def _death(self, doing: str) -> TrackerError:
         try:
@@ -221,11 +166,26 @@ class Program:
         except subprocess.TimeoutExpired:
             self.kill()
             return TrackerError(f"{self.name} {doing}: closed its output without an answer")
-        self._drain()
-        line = self.last_line
         self.kill()
+        line = self._last_line()
         shown = f"its last line: '{line}'" if line else "it wrote no message"
         return TrackerError(f"{self.name} {doing}: the program {_describe(code)}; {shown}")
+
+
+def _read(
+    name: str, channel: str, stream: IO[bytes], answers: queue.SimpleQueue[str | None], lines: dict[str, str]
+) -> None:
+    """Sort the lines of a program's output into answers and log until it ends; runs in a thread of its own."""
+    with stream:
+        for raw in iter(lambda: stream.readline(LONGEST_LINE), b""):
+            text = raw.decode(errors="replace").strip()
+            if channel == "out" and text.startswith("{"):
+                answers.put(text)
+            elif text:
+                lines[channel] = text[:300]
+                LOGGER.info("[%s] %s", name, text)
+    if channel == "out":
+        answers.put(None)
 
 
 def parse_answer(text: str) -> dict[str, Any]:
@@ -261,13 +221,11 @@ def _describe(code: int) -> str:
 
 
 def _kill_group(process: subprocess.Popen[bytes]) -> None:
-    """Kill the program with all that it started, and release its pipes."""
+    """Kill the program with all that it started."""
     if process.poll() is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=5.0)
-    for stream in (process.stdin, process.stdout, process.stderr):
-        if stream is not None:
-            with contextlib.suppress(OSError):
-                stream.close()
+    with contextlib.suppress(OSError):
+        process.stdin.close()
