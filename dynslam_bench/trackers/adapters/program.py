@@ -119,7 +119,7 @@ class Program:
         """Ask it to end, wait, and kill it if it does not; may be called more than once."""
         with contextlib.suppress(OSError, ValueError, subprocess.TimeoutExpired):
             self._write({"op": "close"})
-            self._input.close()
+            self._process.stdin.close()  # type: ignore[union-attr]
             self._process.wait(timeout_s)
         self.kill()
 
@@ -129,14 +129,10 @@ class Program:
         for reader in self._readers:
             reader.join(timeout=0.5)  # a process in another session may hold the pipe open for ever
 
-    @property
-    def _input(self) -> IO[bytes]:
-        assert self._process.stdin is not None
-        return self._process.stdin
-
     def _write(self, message: Mapping[str, Any]) -> None:
-        self._input.write(json.dumps(message, allow_nan=False).encode() + b"\n")
-        self._input.flush()
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(message, allow_nan=False).encode() + b"\n")
+        self._process.stdin.flush()
 
     def _refuse_surplus(self, doing: str) -> None:
         """Raise on an unrequested answer: it would be taken for the next one, a pose of the wrong frame."""
@@ -228,4 +224,5 @@ def _kill_group(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=5.0)
     with contextlib.suppress(OSError):
+        assert process.stdin is not None
         process.stdin.close()

@@ -45,11 +45,17 @@ def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[
     if not isinstance(state, str) or state not in get_args(TrackingState):
         states = ", ".join(get_args(TrackingState))
         raise TrackerError(f"{who}: answered state {str(state)[:80]!r}", f"known: {states}")
-    pose = _pose(answer.get("T_world_cam"), who)
+    value = answer.get("T_world_cam")
+    try:
+        pose = None if value is None else np.asarray(value, dtype=np.float64).reshape(4, 4)
+    except (TypeError, ValueError, OverflowError):
+        reason = f"{who}: T_world_cam is not 16 numbers: {str(value)[:80]}"
+        raise TrackerError(reason, "row by row, camera to world") from None
     if pose is None and state == "ok":
         raise TrackerError(f"{who}: answered state 'ok' without T_world_cam")
-    stats = _numbers(answer.get("stats"), "stats", who)
-    timings = _numbers(answer.get("timings"), "timings", who)
+    if pose is not None and not se3.is_pose(pose):
+        raise TrackerError(f"{who}: T_world_cam is no rigid pose: {pose.tolist()}")
+    stats, timings = (_numbers(answer.get(name), name, who) for name in ("stats", "timings"))
     timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
     return TrackResult(pose, cast(TrackingState, state), stats, timings)
 
@@ -75,20 +81,6 @@ def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
         raise TrackerError(f"{who}: {error}") from error
 
 
-def _pose(value: Any, who: str) -> NDArray[np.float64] | None:
-    if value is None:
-        return None
-    try:
-        pose = np.asarray(value, dtype=np.float64).reshape(4, 4)
-    except (TypeError, ValueError, OverflowError):
-        raise TrackerError(
-            f"{who}: T_world_cam is not 16 numbers: {str(value)[:80]}", "row by row, camera to world"
-        ) from None
-    if not se3.is_pose(pose):
-        raise TrackerError(f"{who}: T_world_cam is no rigid pose: {pose.tolist()}")
-    return pose
-
-
 def _numbers(value: Any, what: str, who: str) -> dict[str, float]:
     try:
         return {str(key): float(number) for key, number in (value or {}).items()}
@@ -112,7 +104,6 @@ class ImageExchange:
 
     def __init__(self, camera: Camera, mode: Literal["raw", "png"]) -> None:
         self.camera, self.mode = camera, mode
-        self._last: tuple[Path, ...] = ()
         colour = camera.height * camera.width * 3
         self.depth_offset = -(-colour // 16) * 16
         size = self.depth_offset + camera.height * camera.width * 4
@@ -151,19 +142,13 @@ class ImageExchange:
             np.copyto(self._rgb, frame.rgb)
             np.copyto(self._depth, frame.depth)
             return {}
-        return self._write_png(frame)
-
-    def _write_png(self, frame: Frame) -> dict[str, Any]:
+        for old in self.folder.glob("*.png"):
+            old.unlink()
         rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
         units = np.rint(np.nan_to_num(frame.depth) * self.camera.depth_factor).clip(0, 65535).astype(np.uint16)
-        fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
         for path, image in ((rgb, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)), (depth, units)):
-            if not cv2.imwrite(str(path), image, fast):
+            if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
                 raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
-        for old in self._last:
-            if old not in (rgb, depth):
-                old.unlink(missing_ok=True)
-        self._last = (rgb, depth)
         return {"rgb": str(rgb), "depth": str(depth)}
 
     def close(self) -> None:
@@ -236,7 +221,6 @@ class ProgramTracker:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
         """
         self.close()
-        seed = derive_seed(rng)
         threads = str(self.context.threads)
         limits = {name: threads for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
         self._exchange = ImageExchange(camera, self._images)
@@ -252,14 +236,14 @@ class ProgramTracker:
                 "fps": self.context.fps,
             },
             "images": self._exchange.announce(),
-            "seed": seed,
+            "seed": derive_seed(rng),
             "threads": self.context.threads,
             "device": self.context.device,
             "sequence": self.context.sequence_id,
             "options": self.options(camera, self._exchange.folder),
         }
         try:
-            self._program.ask(request, self.limits.start_timeout_s, "at reset")
+            self._ask(request, self.limits.start_timeout_s, "at reset")
         except DynslamError:
             self.close()
             raise
@@ -276,12 +260,11 @@ class ProgramTracker:
         Raises:
             TrackerError: It dies, hangs, or does not answer with a pose.
         """
-        program, exchange = self._running()
         start = time.perf_counter()
         doing = f"at frame {frame.index}"
-        images = exchange.put(frame)
+        images = {} if self._exchange is None else self._exchange.put(frame)
         request = {"op": "track", "index": frame.index, "timestamp": frame.timestamp, **images}
-        answer = program.ask(request, self.limits.frame_timeout_s, doing)
+        answer = self._ask(request, self.limits.frame_timeout_s, doing)
         if answer.get("index") != frame.index:
             raise TrackerError(
                 f"{self.name} {doing}: answered index {str(answer.get('index'))[:20]}",
@@ -298,10 +281,10 @@ class ProgramTracker:
             self._exchange.close()
             self._exchange = None
 
-    def _running(self) -> tuple[Program, ImageExchange]:
-        if self._program is None or self._exchange is None:
+    def _ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
+        if self._program is None:
             raise TrackerError(f"{self.name} was used before reset() or after close()")
-        return self._program, self._exchange
+        return self._program.ask(request, timeout_s, doing)
 
 
 class FinalizingProgramTracker(ProgramTracker):
@@ -313,8 +296,7 @@ class FinalizingProgramTracker(ProgramTracker):
         Raises:
             TrackerError: It dies, hangs, or does not answer with a trajectory.
         """
-        program, _ = self._running()
-        answer = program.ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
+        answer = self._ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
         return read_final_answer(answer, f"{self.name} at finalize")
 
 
