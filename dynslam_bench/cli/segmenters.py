@@ -149,10 +149,9 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write one of our networks as an ONNX file of fixed shapes, which lighter runtimes can serve."""
-    from dynslam_bench.segmentation.networks.onnx_export import export_network, parse_size, weights_of
+    from dynslam_bench.segmentation.networks.onnx_export import export_network, parse_size
 
-    chosen = weights_of(source, side)
-    done = export_network(chosen.path, output, size=parse_size(size), side=chosen.side)
+    done = export_network(source, output, size=parse_size(size), side=side)
     facts = {
         "file": str(done.path),
         "megabytes": round(done.megabytes, 1),

@@ -140,13 +140,13 @@ def test_matching_and_sampling():
     best = match(boxes, truth, high=0.8, low=0.1, keep_best=True).tolist()
     assert best == [0, IGNORED, NEGATIVE, 1, NEGATIVE]
     assert match(boxes, truth[:0], high=0.7, low=0.3, keep_best=True).tolist() == [NEGATIVE] * 5
-    chosen = sample(
+    positive, negative = sample(
         torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9),
         count=8,
         positive_share=0.25,
         generator=torch.Generator().manual_seed(0),
     )
-    assert len(chosen.positive) == 2 and len(chosen.negative) == 6 and int(chosen.negative.max()) < 54
+    assert len(positive) == 2 and len(negative) == 6 and int(negative.max()) < 54
 
 
 def test_mask_targets_are_the_mask_inside_the_box():

@@ -6,6 +6,7 @@ paper's section on semantic segmentation; see `CFPN`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 import torch
@@ -103,20 +104,17 @@ def resnet18_config(classes: tuple[str, ...] = ("person",), *, cfpn: bool = True
     return NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, cfpn=cfpn, classes=classes, norm="batch")
 
 
-def normal(weight: Tensor, std: float) -> None:
-    """Initialise weights with a normal distribution; nothing on torch's ``meta`` device.
+def initialise(module: nn.Module, weights: Callable[[Tensor], object]) -> None:
+    """Initialise the weights of all convolutions in a module, and their biases with zero.
 
-    A network whose shapes are only compared with a file lies on the ``meta`` device. Drawing numbers there has no
-    effect, but loads torch's compiler (1.6 s of processor, once a process).
+    Nothing on torch's ``meta`` device, on which a network lies whose shapes are only compared with a file: drawing
+    numbers there has no effect, but loads torch's compiler (1.6 s of processor, once a process).
     """
-    if not weight.is_meta:
-        nn.init.normal_(weight, std=std)
-
-
-def kaiming_normal(weight: Tensor) -> None:
-    """Initialise as He et al. 2015 for a ReLU, by the outputs; nothing on the ``meta`` device, see `normal`."""
-    if not weight.is_meta:
-        nn.init.kaiming_normal_(weight, mode="fan_out", nonlinearity="relu")
+    for conv in module.modules():
+        if isinstance(conv, nn.Conv2d) and not conv.weight.is_meta:
+            weights(conv.weight)
+            assert conv.bias is not None
+            nn.init.zeros_(conv.bias)
 
 
 class FrozenBatchNorm2d(nn.Module):
@@ -228,11 +226,7 @@ class FPN(nn.Module):
         super().__init__()
         self.inner_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(width, channels, 1)) for width in stages)
         self.layer_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1)) for _ in stages)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_uniform_(module.weight, a=1)
-                assert module.bias is not None
-                nn.init.zeros_(module.bias)
+        initialise(self, lambda weight: nn.init.kaiming_uniform_(weight, a=1))
 
     def forward(self, stages: list[Tensor]) -> list[Tensor]:
         """C2..C5 to P2..P6."""
@@ -257,12 +251,8 @@ class CFPN(nn.Module):
         super().__init__()
         self.reduce = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in stages)
         self.smooth = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in stages)
-        for reduce, smooth in zip(self.reduce, self.smooth, strict=True):
-            assert isinstance(reduce, nn.Conv2d) and isinstance(smooth, nn.Conv2d)
-            nn.init.kaiming_uniform_(reduce.weight, a=1)
-            for zero in (reduce.bias, smooth.weight, smooth.bias):
-                assert zero is not None
-                nn.init.zeros_(zero)
+        initialise(self.reduce, lambda weight: nn.init.kaiming_uniform_(weight, a=1))
+        initialise(self.smooth, nn.init.zeros_)
 
     def forward(self, stages: list[Tensor], levels: list[Tensor]) -> list[Tensor]:
         """C2..C5 and P2..P5 (a longer list is cut) to the mask branch's m2..m5."""

@@ -73,7 +73,7 @@ class MaskRCNN(nn.Module):
         proposals = self.rpn(levels, height, width, [size])[0][0]
         detections = self.roi_heads.detect(levels[:4], mask_levels, proposals, height, size, score=score, iou=iou)
         back = detections.boxes.new_tensor([image.shape[2] / size[1], image.shape[1] / size[0]]).repeat(2)
-        return Detections(detections.boxes * back, detections.labels, detections.scores, detections.masks)
+        return detections._replace(boxes=detections.boxes * back)
 
     def losses(
         self,

@@ -7,13 +7,13 @@ one vectorised call for all boxes, levels and channels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynslam_bench.segmentation.networks.backbone import NetworkConfig, kaiming_normal
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.boxes import (
     BOX_WEIGHTS,
     clip,
@@ -68,10 +68,8 @@ def roi_align(
     level = levels_of(rois, canonical, len(features))
     heights = torch.tensor([f.shape[2] for f in features], device=device)[level]
     widths = torch.tensor([f.shape[3] for f in features], device=device)[level]
-    starts = [0]
-    for feature in features:
-        starts.append(starts[-1] + batch * feature.shape[2] * feature.shape[3])
-    base = torch.tensor(starts[:-1], device=device)[level] + image * heights * widths
+    cells = torch.tensor([0, *(batch * f.shape[2] * f.shape[3] for f in features[:-1])], device=device)
+    base = cells.cumsum(dim=0)[level] + image * heights * widths
     scales = torch.tensor([level_scale(f.shape[2], image_height) for f in features], device=device)[level]
     scaled = rois.to(torch.float32) * scales[:, None]
     rows, row_weights = _axis(scaled[:, 1], scaled[:, 3], heights, size, samples)
@@ -109,8 +107,7 @@ def _axis(low: Tensor, high: Tensor, length: Tensor, size: int, samples: int) ->
     return cells.reshape(count, size, 2 * samples), weights.reshape(count, size, 2 * samples)
 
 
-@dataclass(frozen=True)
-class Detections:
+class Detections(NamedTuple):
     """Objects found in one image, in pixels of the network's input, best first.
 
     Attributes:
@@ -124,6 +121,12 @@ class Detections:
     labels: Tensor
     scores: Tensor
     masks: Tensor
+
+
+def _initialise(weight: Tensor) -> None:
+    """Initialise as He et al. 2015 for a ReLU, by the outputs; nothing on the ``meta`` device, see `initialise`."""
+    if not weight.is_meta:
+        nn.init.kaiming_normal_(weight, mode="fan_out", nonlinearity="relu")
 
 
 class TwoMLPHead(nn.Module):
@@ -159,8 +162,8 @@ class MaskPredictor(nn.Module):
         super().__init__()
         self.conv5_mask = nn.ConvTranspose2d(config.mask_channels, config.mask_channels, 2, 2)
         self.mask_fcn_logits = nn.Conv2d(config.mask_channels, len(config.classes) + 1, 1)
-        for module in (self.conv5_mask, self.mask_fcn_logits):
-            kaiming_normal(module.weight)
+        _initialise(self.conv5_mask.weight)
+        _initialise(self.mask_fcn_logits.weight)
 
     def forward(self, x: Tensor) -> Tensor:
         """``[K, C, m, m]`` to logits ``[K, n + 1, 2m, 2m]``."""
@@ -174,7 +177,7 @@ def mask_head(config: NetworkConfig) -> nn.Sequential:
     inputs = config.channels
     for _ in range(config.mask_layers):
         conv = nn.Conv2d(inputs, config.mask_channels, 3, padding=1)
-        kaiming_normal(conv.weight)
+        _initialise(conv.weight)
         layers.append(nn.Sequential(conv, nn.ReLU(inplace=True)))
         inputs = config.mask_channels
     return nn.Sequential(*layers)
@@ -262,17 +265,15 @@ class RoIHeads(nn.Module):
         for proposal, truth, label, mask in zip(proposals, truths, labels, masks, strict=True):
             candidates = torch.cat([proposal, truth])
             matched = match(candidates, truth, high=0.5, low=0.5, keep_best=False)
-            chosen = sample(matched, count=per_image, positive_share=POSITIVE_SHARE, generator=generator)
-            index = torch.cat([chosen.positive, chosen.negative])
-            roi, hits = candidates[index], matched[chosen.positive]
-            rois.append(roi)
-            classes.append(torch.cat([label[hits], label.new_zeros(len(chosen.negative))]))
-            codes.append(encode(truth[hits], candidates[chosen.positive], BOX_WEIGHTS) if len(hits) else truth[:0])
-            positives.append(candidates[chosen.positive])
-            targets.append(crop_masks(mask[hits], positives[-1], 2 * self.config.mask_pool))
+            positive, negative = sample(matched, count=per_image, positive_share=POSITIVE_SHARE, generator=generator)
+            hits, boxes = matched[positive], candidates[positive]
+            rois.append(torch.cat([boxes, candidates[negative]]))
+            classes.append(torch.cat([label[hits], label.new_zeros(len(negative))]))
+            codes.append(encode(truth[hits], boxes, BOX_WEIGHTS) if len(hits) else truth[:0])
+            positives.append(boxes)
+            targets.append(crop_masks(mask[hits], boxes, 2 * self.config.mask_pool))
         pooled = roi_align(levels, rois, image_height, BOX_POOL, canonical=self.config.canonical)
-        logits, predicted = self.box_predictor(self.box_head(pooled))
-        logits, predicted = logits.float(), predicted.float()
+        logits, predicted = (output.float() for output in self.box_predictor(self.box_head(pooled)))
         wanted = torch.cat(classes)
         foreground = torch.nonzero(wanted > 0)[:, 0]
         own = predicted.reshape(len(predicted), -1, 4)[foreground, wanted[foreground]]
@@ -281,12 +282,11 @@ class RoIHeads(nn.Module):
             "box": functional.smooth_l1_loss(own, torch.cat(codes), beta=1 / 9, reduction="sum") / max(len(wanted), 1),
         }
         target = torch.cat(targets)
+        losses["mask"] = mask_levels[0].sum() * 0
         if len(target):
             mask_logits = self.masks(mask_levels, positives, image_height).float()
             mine = mask_logits[torch.arange(len(target), device=target.device), wanted[foreground]]
             losses["mask"] = functional.binary_cross_entropy_with_logits(mine, target)
-        else:
-            losses["mask"] = mask_levels[0].sum() * 0
         return losses
 
 

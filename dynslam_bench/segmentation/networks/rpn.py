@@ -6,10 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynslam_bench.segmentation.networks.backbone import NetworkConfig, normal
+from dynslam_bench.segmentation.networks.backbone import NetworkConfig, initialise
 from dynslam_bench.segmentation.networks.boxes import (
     RPN_WEIGHTS,
-    Sampled,
     clip,
     decode,
     encode,
@@ -54,11 +53,7 @@ class RPNHead(nn.Module):
         self.conv = nn.Sequential(nn.Sequential(nn.Conv2d(config.channels, config.channels, 3, padding=1), nn.ReLU()))
         self.cls_logits = nn.Conv2d(config.channels, count, 1)
         self.bbox_pred = nn.Conv2d(config.channels, 4 * count, 1)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                normal(module.weight, std=0.01)
-                assert module.bias is not None
-                nn.init.zeros_(module.bias)
+        initialise(self, lambda weight: nn.init.normal_(weight, std=0.01))
 
     def forward(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Objectness logits ``[B, H W A]`` and codes ``[B, H W A, 4]`` of each level, in the anchors' order."""
@@ -135,12 +130,10 @@ def rpn_loss(
     total = 0
     for image, truth in enumerate(truths):
         matched = match(every, truth, high=0.7, low=0.3, keep_best=True)
-        chosen: Sampled = sample(matched, count=256, positive_share=0.5, generator=generator)
-        index = torch.cat([chosen.positive, chosen.negative])
-        label = torch.zeros(len(index), device=every.device)
-        label[: len(chosen.positive)] = 1
+        positive, negative = sample(matched, count=256, positive_share=0.5, generator=generator)
+        index = torch.cat([positive, negative])
+        label = (matched[index] >= 0).float()
         objectness.append(functional.binary_cross_entropy_with_logits(all_logits[image, index], label, reduction="sum"))
-        positive = chosen.positive
         wanted = encode(truth[matched[positive]], every[positive], RPN_WEIGHTS) if len(positive) else every[:0]
         regression.append(functional.smooth_l1_loss(all_codes[image, positive], wanted, beta=1 / 9, reduction="sum"))
         total += len(index)
