@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
+from dynslam_bench.contracts.filter import DynamicFilter
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.plugins import load_object
@@ -19,10 +20,6 @@ from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
-
-if TYPE_CHECKING:
-    from dynslam_bench.contracts.filter import DynamicFilter
-    from dynslam_bench.slam.pipeline import SlamPipeline
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Sources of masks, as `segmentation.source` names them."""
@@ -133,7 +130,7 @@ def compose(
     context: TrackerContext,
     filters: Sequence[DynamicFilter] = (),
     flow: FlowMethodSettings | None = None,
-) -> SlamPipeline:
+) -> Tracker:
     """The pipeline of a system.
 
     Args:
@@ -174,9 +171,17 @@ def compose(
             also=movable_classes(filters),
         )
         masks = None if segmenter is None else MaskScheduler(settings.segmentation, segmenter)
-    if segmenter is None:
-        _refuse_masks(filters, settings)
-    elif isinstance(segmenter.inner, CachedSegmenter):
+    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
+    if segmenter is None and needing:
+        semantic = isinstance(settings, SemanticSystemSettings)
+        raise SegmentationError(
+            f"filter '{needing[0]}' needs masks, but "
+            + ("segmentation.source is 'none'" if semantic else f"{type(settings).__name__} has no group segmentation"),
+            f"sources: {SOURCES}"
+            if semantic
+            else "derive the system's settings from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)",
+        )
+    if segmenter is not None and isinstance(segmenter.inner, CachedSegmenter):
         cached["segmentation"] = segmenter.inner
     return SlamPipeline(
         extractor=extractor,
@@ -186,21 +191,6 @@ def compose(
         backend=build_backend(settings.backend, features.scale_factor, features.levels, features.extractor),
         settings=settings,
         cached=cached,
-    )
-
-
-def _refuse_masks(filters: Sequence[DynamicFilter], settings: SystemSettings) -> None:
-    """Raise `SegmentationError` where a filter needs masks: there is no source of them."""
-    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
-    if not needing:
-        return
-    if not isinstance(settings, SemanticSystemSettings):
-        raise SegmentationError(
-            f"filter '{needing[0]}' needs masks, but {type(settings).__name__} has no group segmentation",
-            "derive the system's settings from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)",
-        )
-    raise SegmentationError(
-        f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'", f"sources: {SOURCES}"
     )
 
 
