@@ -63,7 +63,7 @@ def train(
             resume=resume,
             progress=lambda state: advance(state.done, state.total),
         )
-    facts = {"weights": str(result.best), "step": result.step, "iou": result.iou, "ended": result.stopped}
+    facts = {"weights": str(result.best), "step": result.step, "iou": result.iou}
     present(facts, lambda: write_fields(facts))
 
 

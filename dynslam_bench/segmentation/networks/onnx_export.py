@@ -21,10 +21,15 @@ from dynslam_bench.core.version import install_hint
 from dynslam_bench.segmentation.networks.boxes import BOX_WEIGHTS, RPN_WEIGHTS, clip, decode
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network
-from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.networks.roi_heads import BOX_POOL, MIN_BOX_PX, level_scale, levels_of
-from dynslam_bench.segmentation.networks.rpn import MIN_BOX_PX as MIN_PROPOSAL_PX
-from dynslam_bench.segmentation.networks.rpn import anchors_of
+from dynslam_bench.segmentation.networks.network import (
+    BOX_POOL,
+    MIN_BOX_PX,
+    MIN_PROPOSAL_PX,
+    MaskRCNN,
+    anchors_of,
+    level_scale,
+    levels_of,
+)
 from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
 
 OPSET = 18

@@ -111,7 +111,7 @@ def _check_settings(settings: TrainSettings, path: Path) -> None:
     if not isinstance(before, dict):
         raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
     for key, value in json.loads(settings.model_dump_json()).items():
-        if before.get(key, value) != value and key not in ("iterations", "patience"):
+        if before.get(key, value) != value and key != "iterations":
             raise SegmentationError(
                 f"{path.parent} holds a training run with another {key}: {before[key]!r}, now {value!r}",
                 "name another folder, or do not resume",
@@ -152,7 +152,7 @@ class TrainingRun:
     def run(
         self, sets: list[PreparedImages], validation: PreparedImages, report: Callable[[TrainProgress], None]
     ) -> TrainResult:
-        """Learn until the last step, or until the validation score stops improving."""
+        """Learn until the last step."""
         settings, total = self.settings, self.settings.iterations
         if not sum(map(len, sets)) or not len(validation):
             raise SegmentationError("there are no images to learn from or to validate on")
@@ -167,13 +167,7 @@ class TrainingRun:
                 report(TrainProgress("validation", self.step, total, self._evaluate(validation)))
             if evaluate or self.step % settings.checkpoint_every == 0:
                 self.save()
-            waited = (self.step - self.best["step"]) / settings.evaluate_every
-            if evaluate and settings.patience and waited >= settings.patience:
-                return self._result("no gain")
-        return self._result("finished")
-
-    def _result(self, stopped: str) -> TrainResult:
-        return TrainResult(self.output / "best.pt", int(self.best["step"]), self.best["iou"], stopped)
+        return TrainResult(self.output / "best.pt", int(self.best["step"]), self.best["iou"])
 
     def _learn(self, batch: list[Example]) -> dict[str, float]:
         settings = self.settings
