@@ -51,7 +51,8 @@ def _builtin() -> Iterable[SegmenterSpec]:
         SegmenterSpec("embedded", f"{networks}.mask_rcnn_segmenter:build_embedded",
                       "small CFPN Mask R-CNN trained on rendered sequences", "MIT", mask_rcnn),
         SegmenterSpec("coco", f"{networks}.mask_rcnn_segmenter:build_coco",
-                      "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights", "BSD-3-Clause (weights)", mask_rcnn),
+                      "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights", "BSD-3-Clause (weights)",
+                      mask_rcnn),
         SegmenterSpec("weights", f"{networks}.mask_rcnn_segmenter:build_weights",
                       "Mask R-CNN with weights of your own (weights:PATH)", "", mask_rcnn),
     )  # fmt: skip

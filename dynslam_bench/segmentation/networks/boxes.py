@@ -125,9 +125,7 @@ def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: b
     return result
 
 
-def sample(
-    matched: Tensor, *, count: int, positive_share: float, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+def sample(matched: Tensor, *, count: int, positive_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Indices of the positive and of the negative boxes that enter a loss, drawn at random.
 
     Args:

@@ -173,14 +173,11 @@ def compose(
         masks = None if segmenter is None else MaskScheduler(settings.segmentation, segmenter)
     needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
     if segmenter is None and needing:
-        semantic = isinstance(settings, SemanticSystemSettings)
-        raise SegmentationError(
-            f"filter '{needing[0]}' needs masks, but "
-            + ("segmentation.source is 'none'" if semantic else f"{type(settings).__name__} has no group segmentation"),
-            f"sources: {SOURCES}"
-            if semantic
-            else "derive the system's settings from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)",
-        )
+        fault, cure = "segmentation.source is 'none'", f"sources: {SOURCES}"
+        if not isinstance(settings, SemanticSystemSettings):
+            fault = f"{type(settings).__name__} has no group segmentation"
+            cure = "derive it from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)"
+        raise SegmentationError(f"filter '{needing[0]}' needs masks, but {fault}", cure)
     if segmenter is not None and isinstance(segmenter.inner, CachedSegmenter):
         cached["segmentation"] = segmenter.inner
     return SlamPipeline(
