@@ -63,7 +63,7 @@ def train(
             resume=resume,
             progress=lambda state: advance(state.done, state.total),
         )
-    facts = {"weights": str(result.best), "step": result.step, "iou": result.iou, "ended": result.stopped}
+    facts = {"weights": str(result.best), "step": result.step, "iou": result.iou}
     present(facts, lambda: write_fields(facts))
 
 
@@ -149,10 +149,9 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write one of our networks as an ONNX file of fixed shapes, which lighter runtimes can serve."""
-    from dynslam_bench.segmentation.networks.onnx_export import export_network, parse_size, weights_of
+    from dynslam_bench.segmentation.networks.onnx_export import export_network, parse_size
 
-    chosen = weights_of(source, side)
-    done = export_network(chosen.path, output, size=parse_size(size), side=chosen.side)
+    done = export_network(source, output, size=parse_size(size), side=side)
     facts = {
         "file": str(done.path),
         "megabytes": round(done.megabytes, 1),

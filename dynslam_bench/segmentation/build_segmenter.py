@@ -1,17 +1,22 @@
-"""Segmenters: the registry, the choice of a source for a sequence, and construction."""
+"""Segmenters: the registry, the choice of a source for a sequence, construction, and masks from the stage cache."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
-from functools import cached_property, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
+
+import numpy as np
 
 from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
 from dynslam_bench.contracts.sequence import Frame, MaskSource, Sequence
 from dynslam_bench.core.errors import DynslamError, SegmentationError
-from dynslam_bench.core.fingerprint import path_digest
+from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, path_digest
 from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.core.stage_cache import Arrays, StageCache
 from dynslam_bench.segmentation.networks.checkpoints import (
     COCO,
     Checkpoint,
@@ -26,23 +31,30 @@ __all__ = ["SEGMENTERS", "SegmenterContext", "SegmenterSpec"]
 
 LOWEST_CONFIDENCE = 0.1
 """Networks report detections down to this score, so that the confidence may be changed while a run lasts."""
+NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
+"""Sources whose masks depend on the colour image alone."""
+_PACKAGES = ("core", "contracts", "sequences", "segmentation")
+"""The packages whose code decides what a network finds."""
 
 
 def _builtin() -> Iterable[SegmenterSpec]:
-    here = "dynslam_bench.segmentation.build_segmenter"
+    recorded = "dynslam_bench.segmentation.recorded"
+    networks = "dynslam_bench.segmentation.networks"
     mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"
     return (
-        SegmenterSpec("oracle", f"{here}:build_oracle", "exact masks of rendered sequences"),
-        SegmenterSpec("oracle-classes", f"{here}:build_oracle",
+        SegmenterSpec("oracle", f"{recorded}:build_oracle", "exact masks of rendered sequences"),
+        SegmenterSpec("oracle-classes", f"{recorded}:build_oracle",
                       "exact masks of rendered sequences, by class alone: a perfect network"),
-        SegmenterSpec("recorded", f"{here}:build_recorded", "PNG masks from a folder (recorded:DIR)"),
-        SegmenterSpec("onnx", f"{here}:build_onnx", "YOLO-seg, semantic or torchvision networks (onnx:PATH)"),
-        SegmenterSpec("embedded", f"{here}:build_embedded", "small CFPN Mask R-CNN trained on rendered sequences",
-                      "MIT", mask_rcnn),
-        SegmenterSpec("coco", f"{here}:build_coco", "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights",
-                      "BSD-3-Clause (weights)", mask_rcnn),
-        SegmenterSpec("weights", f"{here}:build_weights", "Mask R-CNN with weights of your own (weights:PATH)",
-                      "", mask_rcnn),
+        SegmenterSpec("recorded", f"{recorded}:build_recorded", "PNG masks from a folder (recorded:DIR)"),
+        SegmenterSpec("onnx", f"{networks}.onnx_segmenter:build",
+                      "YOLO-seg, semantic or torchvision networks (onnx:PATH)"),
+        SegmenterSpec("embedded", f"{networks}.mask_rcnn_segmenter:build_embedded",
+                      "small CFPN Mask R-CNN trained on rendered sequences", "MIT", mask_rcnn),
+        SegmenterSpec("coco", f"{networks}.mask_rcnn_segmenter:build_coco",
+                      "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights", "BSD-3-Clause (weights)",
+                      mask_rcnn),
+        SegmenterSpec("weights", f"{networks}.mask_rcnn_segmenter:build_weights",
+                      "Mask R-CNN with weights of your own (weights:PATH)", "", mask_rcnn),
     )  # fmt: skip
 
 
@@ -121,14 +133,14 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
     optional = isinstance(default, SegmentationSettings) and default.source == "none"
     source = resolve_source(group, sequence.id, sequence.masks, optional=optional)
     kind, _, argument = source.partition(":")
-    path = Path(argument).expanduser()
     if kind in ("oracle", "oracle-classes"):
-        build_oracle(group, SegmenterContext(sequence.id, sequence.masks))
+        _load(kind, group, SegmenterContext(sequence.id, sequence.masks))
     elif kind == "recorded":
-        _check_recorded(path, group, sequence)
+        _check_recorded(Path(argument), group, sequence)
     elif kind in ("onnx", "weights"):
+        path = Path(argument).expanduser()
         stat = path.stat() if path.is_file() else None
-        _check_network(kind, path, group, stat and (stat.st_size, stat.st_mtime_ns))
+        _check_network(kind, argument, group, stat and (stat.st_size, stat.st_mtime_ns))
     elif kind == "embedded":
         require_embedded_weights()
     elif kind == "coco" and fetch:
@@ -153,16 +165,9 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
 
 
 @lru_cache(maxsize=16)
-def _check_network(kind: str, path: Path, settings: SegmentationSettings, stamp: tuple[int, int] | None) -> None:
+def _check_network(kind: str, argument: str, settings: SegmentationSettings, stamp: tuple[int, int] | None) -> None:
     """Load a network once a process, as long as size and time of its file (`stamp`) stay."""
-    if kind == "onnx":
-        from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
-
-        OnnxSegmenter(path, settings)
-    else:
-        from dynslam_bench.segmentation.networks.loading import load_network
-
-        load_network(path)
+    _load(kind, settings, SegmenterContext(argument=argument))
 
 
 def build_segmenter(
@@ -172,7 +177,7 @@ def build_segmenter(
     masks: MaskSource | None = None,
     device: str = "cpu",
     threads: int = 1,
-    deferred: bool = False,
+    cache: StageCache | None = None,
     also: frozenset[str] = frozenset(),
 ) -> ConfiguredSegmenter | None:
     """The segmenter that the settings ask for; None for source ``none``.
@@ -183,7 +188,8 @@ def build_segmenter(
         masks: Exact masks of the sequence, for ``oracle``.
         device: ``cpu`` or ``cuda:N``, for networks that run in torch.
         threads: Threads a network may use.
-        deferred: Load a network whose file exists only when a frame needs it: with the stage cache none may.
+        cache: Where the masks of networks are stored; selection by class and confidence comes after it, so that studies
+            over them share its entries. A network whose file exists is loaded only when a frame needs it.
         also: Further classes whose objects are returned, although they are not dynamic by themselves.
 
     Raises:
@@ -193,48 +199,109 @@ def build_segmenter(
     source = resolve_source(settings, sequence_id, masks)
     if source == "none":
         return None
-    prefix, _, argument = source.partition(":")
-    name, argument = (argument, "") if prefix == "plugin" else (prefix, argument)
+    kind, _, argument = source.partition(":")
+    name, argument = (argument, "") if kind == "plugin" else (kind, argument)
+    floor = min(LOWEST_CONFIDENCE, settings.confidence)
+    context = SegmenterContext(sequence_id, masks, device, threads, argument, floor)
+    if cache is None or kind not in NETWORKS:
+        return ConfiguredSegmenter(_load(name, settings, context), settings, source, also)
+    named = ("mask_threshold", "classes", "network_side", "onnx_normalisation")
+    identity = {
+        "code": _code_of(name),
+        "source": source,
+        "weights": weights_digest(settings, sequence_id),
+        "confidence": floor,
+        "settings": {field: getattr(settings, field) for field in named},
+        "device": device,
+        "threads": threads,
+    }
+    cached = CachedSegmenter(partial(_load, name, settings, context), identity, cache)
+    if not identity["weights"]:
+        cached.network()  # without a file there is nothing to wait for
+    return ConfiguredSegmenter(cached, settings, source, also)
+
+
+def _load(name: str, settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
+    """Construct a registered segmenter."""
     spec = SEGMENTERS.get(name)
-    context = SegmenterContext(
-        sequence_id, masks, device, threads, argument, min(LOWEST_CONFIDENCE, settings.confidence)
-    )
-
-    def load() -> Segmenter:
-        try:
-            segmenter = load_object(spec.entry_point)(settings, context)
-        except DynslamError:
-            raise
-        except Exception as error:  # a plug-in's factory may raise anything
-            raise SegmentationError(
-                f"segmenter '{spec.id}' cannot be built: {type(error).__name__}: {error}"
-            ) from error
-        if not isinstance(segmenter, Segmenter):
-            raise SegmentationError(f"'{spec.entry_point}' gave a {type(segmenter).__name__} without segment()")
-        return segmenter
-
-    waits = deferred and prefix in ("embedded", "coco", "onnx", "weights") and weights_digest(settings, sequence_id)
-    return ConfiguredSegmenter(DeferredSegmenter(load) if waits else load(), settings, source, also)
+    try:
+        segmenter = load_object(spec.entry_point)(settings, context)
+    except DynslamError:
+        raise
+    except Exception as error:  # a plug-in's factory may raise anything
+        raise SegmentationError(f"segmenter '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
+    if not isinstance(segmenter, Segmenter):
+        raise SegmentationError(f"'{spec.entry_point}' gave a {type(segmenter).__name__} without segment()")
+    return segmenter
 
 
-class DeferredSegmenter:
-    """A segmenter that is loaded when the first frame asks for it.
+@cache
+def _code_of(name: str) -> str:
+    """Digest of the code of a segmenter: this package's, and a plug-in's own.
+
+    It is read once a process, when the plug-in is loaded: later edits of its file do not act in this process.
+
+    Raises:
+        PluginError: No such segmenter, or its code cannot be read.
+    """
+    return code_digest(SEGMENTERS.get(name).entry_point, _PACKAGES)
+
+
+class CachedSegmenter:
+    """A network whose masks are stored in the stage cache, addressed by the image and by the network's identity.
 
     Args:
-        load: Loads it; raises `SegmentationError` if the network's file does not fit.
+        load: Loads the network, when a frame needs it.
+        identity: JSON-able description of code, network, weights and settings that change its masks, and of its cost.
+        cache: Where results are stored.
+
+    Attributes:
+        network: Loads the network at its first call and returns it.
+        hit: Whether the result of the last call came from the cache.
+        saved_s: Seconds to add to the last call's wall time to get its cost without the cache.
     """
 
-    def __init__(self, load: Callable[[], Segmenter]) -> None:
-        self._load = load
-
-    @cached_property
-    def segmenter(self) -> Segmenter:
-        """The segmenter itself."""
-        return self._load()
+    def __init__(self, load: Callable[[], Segmenter], identity: object, cache: StageCache) -> None:
+        self.network = lru_cache(maxsize=1)(load)
+        self._cache = cache
+        self._prefix = digest([identity, machine_digest()])
+        self.hit = False
+        self.saved_s = 0.0
 
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame."""
-        return self.segmenter.segment(frame)
+        begin = time.perf_counter()
+        key = digest([self._prefix, content_digest(frame.rgb)], 32)
+        entry = self._cache.get("masks", key)
+        self.hit = entry is not None
+        if entry is not None:
+            instances, cost = _unpack(entry.arrays), entry.cost_s
+        else:
+            network = self.network()  # loading is no part of the frame's cost
+            start = time.perf_counter()
+            instances = network.segment(frame)
+            cost = time.perf_counter() - start
+            self._cache.put("masks", key, _pack(instances), cost)
+        self.saved_s = cost - (time.perf_counter() - begin)
+        return instances
+
+
+def _pack(instances: Instances) -> Arrays:
+    arrays: Arrays = {
+        "masks": np.packbits(instances.masks),
+        "shape": np.array(instances.masks.shape),
+        "boxes": instances.boxes,
+        "class_names": np.array(instances.class_names, dtype=np.str_),
+        "scores": instances.scores,
+    }
+    return arrays if instances.moving is None else {**arrays, "moving": instances.moving}
+
+
+def _unpack(stored: Arrays) -> Instances:
+    shape = tuple(stored["shape"].tolist())
+    masks = np.unpackbits(stored["masks"], count=int(np.prod(shape))).astype(bool).reshape(shape)
+    names = tuple(stored["class_names"].tolist())
+    return Instances(masks, stored["boxes"], names, stored["scores"], stored.get("moving"))
 
 
 class ConfiguredSegmenter:
@@ -280,70 +347,17 @@ def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks:
     Raises:
         SegmentationError: The file cannot be read.
     """
-    prefix, _, argument = resolve_source(settings, sequence_id, masks).partition(":")
+    kind, _, argument = resolve_source(settings, sequence_id, masks).partition(":")
     path: Path | None = None
-    if prefix == "embedded":
+    if kind == "embedded":
         path = embedded_weights()
-    elif prefix == "coco":
+    elif kind == "coco":
         path = cached_checkpoint(COCO)
         if path is None:
             return COCO.sha256_prefix
-    elif prefix in ("onnx", "weights", "recorded"):
+    elif kind in ("onnx", "weights", "recorded"):
         path = Path(argument).expanduser()
     try:
         return path_digest(path)[:12] if path is not None and path.exists() else ""
     except OSError as error:
         raise SegmentationError(f"cannot read {error.filename}: {error.strerror}") from error
-
-
-def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """Exact masks of the sequence; ``oracle`` also returns what moves, whatever its class.
-
-    Raises:
-        SegmentationError: The sequence has no exact masks.
-    """
-    from dynslam_bench.segmentation.recorded import OracleSegmenter
-
-    if context.masks is None:
-        raise SegmentationError(
-            f"segmentation.source={settings.source}: sequence '{context.sequence_id}' has no exact masks",
-            "only synthetic/* has them; use coco, onnx:PATH or recorded:DIR",
-        )
-    return OracleSegmenter(context.masks, motion=settings.source != "oracle-classes")
-
-
-def build_recorded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """Masks from a folder."""
-    from dynslam_bench.segmentation.recorded import RecordedSegmenter
-
-    return RecordedSegmenter(Path(context.argument))
-
-
-def build_onnx(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """A network from an ONNX file."""
-    from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
-
-    return OnnxSegmenter(Path(context.argument), settings, threads=context.threads, floor=context.floor)
-
-
-def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """The small network in this package, at the input size that it was trained with."""
-    return _mask_rcnn(require_embedded_weights(), settings.model_copy(update={"network_side": 0}), context)
-
-
-def build_coco(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """Torchvision's COCO checkpoint, downloaded on first use."""
-    return _mask_rcnn(fetch_checkpoint(COCO), settings, context)
-
-
-def build_weights(settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    """A Mask R-CNN checkpoint of the user's."""
-    return _mask_rcnn(Path(context.argument), settings, context)
-
-
-def _mask_rcnn(path: Path, settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
-    from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
-
-    return MaskRCNNSegmenter.from_file(
-        path, settings, device=context.device, threads=context.threads, floor=context.floor
-    )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.segmentation.postprocess import boxes_of, pick
+from dynslam_bench.segmentation.postprocess import boxes_of, pick, region
 
 Gray = NDArray[np.uint8]
 WORK_SIDE = 240
@@ -82,8 +84,7 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
             ),
             np.float32,
         )
-    scale = np.array([width / field.shape[1], height / field.shape[0]], np.float32)
-    full = back * scale
+    full = back * np.array([width / field.shape[1], height / field.shape[0]], np.float32)
     if field.shape[:2] != (height, width):
         full = np.asarray(cv2.resize(full, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     at_x = np.arange(width, dtype=np.float32)[None] - full[:, :, 0]
@@ -99,26 +100,28 @@ def carry_dense(instances: Instances, previous: Gray, current: Gray) -> Instance
     if not len(instances):
         return instances
     flow = dense_flow(previous, current)
-    masks = np.zeros_like(instances.masks)
-    for index, mask in enumerate(instances.masks):
-        _carry_object(mask, flow, masks[index])
-    return _moved(instances, masks)
+    return _moved(instances, [_carry_object(mask, flow) for mask in instances.masks])
 
 
-def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32], moved: NDArray[np.bool_]) -> None:
-    """Write one object's moved mask into `moved`, working in a window around the object only."""
-    step_y, step_x = mask.shape[0] / flow.shape[0], mask.shape[1] / flow.shape[1]
-    small = cv2.resize(mask.view(np.uint8), (flow.shape[1], flow.shape[0]), interpolation=cv2.INTER_NEAREST) > 0
-    rows, columns = np.flatnonzero(small.any(axis=1)), np.flatnonzero(small.any(axis=0))
-    if not rows.size:
-        return
-    inside = flow[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    margin = 4 + int(np.ceil(min(float(np.abs(inside).max()), max(flow.shape[:2]))))
-    y0, y1 = max(0, int(rows[0]) - margin), min(flow.shape[0], int(rows[-1]) + 1 + margin)
-    x0, x1 = max(0, int(columns[0]) - margin), min(flow.shape[1], int(columns[-1]) + 1 + margin)
-    field = object_flow(np.ascontiguousarray(small[y0:y1, x0:x1]), np.ascontiguousarray(flow[y0:y1, x0:x1]))
-    part = (slice(round(y0 * step_y), round(y1 * step_y)), slice(round(x0 * step_x), round(x1 * step_x)))
-    moved[part] = push_mask(np.ascontiguousarray(mask[part]), field)
+def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """One object's moved mask, computed in a window around the object only."""
+    moved = np.zeros_like(mask)
+    height, width = flow.shape[:2]
+    step_y, step_x = mask.shape[0] / height, mask.shape[1] / width
+    small = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    inside = region(small, 0)
+    if inside is None:
+        return moved
+    part = region(small, 4 + int(np.ceil(min(float(np.abs(flow[inside]).max()), max(height, width)))))
+    assert part is not None
+    field = object_flow(np.ascontiguousarray(small[part]), np.ascontiguousarray(flow[part]))
+    rows, columns = part
+    whole = (
+        slice(round(rows.start * step_y), round(rows.stop * step_y)),
+        slice(round(columns.start * step_x), round(columns.stop * step_x)),
+    )
+    moved[whole] = push_mask(np.ascontiguousarray(mask[whole]), field)
+    return moved
 
 
 def carry_sparse(instances: Instances, previous: Gray, current: Gray) -> Instances:
@@ -127,14 +130,9 @@ def carry_sparse(instances: Instances, previous: Gray, current: Gray) -> Instanc
     Corners on each object are tracked there and back by pyramidal Lucas-Kanade; RANSAC fits a similarity. An object
     with fewer than six consistent corners keeps its place.
     """
-    if not len(instances):
-        return instances
-    masks = instances.masks.copy()
-    for index, mask in enumerate(instances.masks):
-        motion = _similarity(mask, previous, current)
-        if motion is not None:
-            masks[index] = _warp(mask, motion)
-    return _moved(instances, masks)
+    motions = [_similarity(mask, previous, current) for mask in instances.masks]
+    pairs = zip(instances.masks, motions, strict=True)
+    return _moved(instances, [mask if motion is None else _warp(mask, motion) for mask, motion in pairs])
 
 
 def shift_mask(mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0) -> NDArray[np.bool_]:
@@ -171,7 +169,7 @@ def _similarity(mask: NDArray[np.bool_], previous: Gray, current: Gray) -> NDArr
     return None if motion is None else np.asarray(motion, np.float64)
 
 
-def _moved(instances: Instances, masks: NDArray[np.bool_]) -> Instances:
+def _moved(instances: Instances, masks: list[NDArray[np.bool_]]) -> Instances:
     """The same objects under new masks, without those that left the image."""
-    moved = Instances(masks, boxes_of(masks), instances.class_names, instances.scores, instances.moving)
-    return pick(moved, np.asarray(masks.any(axis=(1, 2))))
+    stack = np.array(masks, bool).reshape(instances.masks.shape)
+    return pick(replace(instances, masks=stack, boxes=boxes_of(stack)), np.asarray(stack.any(axis=(1, 2))))

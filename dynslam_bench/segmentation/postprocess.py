@@ -80,13 +80,12 @@ def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     """
     if radius <= 0:
         return mask
-    part = _region(mask, radius + 1)
+    part = region(mask, radius + 1)
     if part is None:
         return mask
-    rows, columns = part
-    distance = cv2.distanceTransform((~mask[rows, columns]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     grown = mask.copy()
-    grown[rows, columns] = distance <= radius + 1e-3
+    distance = cv2.distanceTransform((~mask[part]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    grown[part] = distance <= radius + 1e-3
     return grown
 
 
@@ -97,7 +96,7 @@ def repair(mask: NDArray[np.bool_], depth: NDArray[np.float32] | None, step_m: f
     `step_m` of the mean depth of the object's core nearby. This is mask repair by depth fusion as in Blitz-SLAM and
     MOR-SLAM; band and local mean are assumptions. Pixels without depth stay as they are.
     """
-    part = _region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)
+    part = region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)
     if part is None:
         return mask
     patch = fill_holes(mask[part])
@@ -138,13 +137,10 @@ def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: f
     return np.asarray(np.where(judged, near, mask))
 
 
-def _region(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice] | None:
-    """The mask's bounding box grown by a margin, as slices; None for an empty mask."""
-    rows = np.flatnonzero(mask.any(axis=1))
-    if not rows.size:
+def region(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice] | None:
+    """The mask's bounding box grown by a margin, as slices of rows and columns; None for an empty mask."""
+    x0, y0, x1, y1 = (int(value) for value in boxes_of(mask[None])[0])
+    if x1 == 0:
         return None
-    columns = np.flatnonzero(mask[rows[0] : rows[-1] + 1].any(axis=0))
-    return (
-        slice(max(0, int(rows[0]) - margin), min(mask.shape[0], int(rows[-1]) + margin + 1)),
-        slice(max(0, int(columns[0]) - margin), min(mask.shape[1], int(columns[-1]) + margin + 1)),
-    )
+    rows = slice(max(0, y0 - margin), min(mask.shape[0], y1 + margin))
+    return rows, slice(max(0, x0 - margin), min(mask.shape[1], x1 + margin))

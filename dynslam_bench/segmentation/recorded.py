@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.segmenter import Instances, SegmenterContext
 from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
@@ -48,21 +48,23 @@ class RecordedSegmenter:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.expanduser()
-        files = sorted(self.folder.glob("*.png")) if self.folder.is_dir() else []
+        files = sorted(self.folder.glob("*.png"))
         if not files:
             reason = "holds no PNG files" if self.folder.is_dir() else "does not exist"
             raise SegmentationError(
                 f"the folder of recorded masks {self.folder} {reason}",
                 "it needs one PNG a frame, named by stamp or index",
             )
-        stamped = [file for file in files if "." in file.stem]
-        if stamped and len(stamped) != len(files):
+        stamped = sum("." in file.stem for file in files)
+        if stamped not in (0, len(files)):
             raise SegmentationError(
-                f"{self.folder}: {len(stamped)} of {len(files)} mask files are named by stamp, the others are not",
+                f"{self.folder}: {stamped} of {len(files)} mask files are named by stamp, the others are not",
                 "name all by stamp or all by index",
             )
+        self.by_stamp = stamped > 0
+        self._tolerance = MAX_DIFFERENCE_S if self.by_stamp else 0.5
         try:
-            numbers = [float(file.stem if stamped else int(file.stem)) for file in files]
+            numbers = np.array([float(file.stem if self.by_stamp else int(file.stem)) for file in files])
             if not np.isfinite(numbers).all():
                 raise ValueError("a stamp is not finite")
         except (ValueError, OverflowError) as error:
@@ -70,11 +72,9 @@ class RecordedSegmenter:
                 f"{self.folder}: a mask file is named neither by stamp nor by index: {error}",
                 "for example 1311868164.363181.png or 000012.png",
             ) from error
-        self.by_stamp = bool(stamped)
         order = np.argsort(numbers, kind="stable")
-        self._tolerance = MAX_DIFFERENCE_S if self.by_stamp else 0.5
-        self._keys: NDArray[np.float64] = np.asarray(numbers, np.float64)[order]
-        self._files: list[Path] = [files[i] for i in order]
+        self._keys: NDArray[np.float64] = numbers[order]
+        self._files = [files[i] for i in order]
         self._names = read_classes(self.folder / CLASSES_FILE)
 
     def segment(self, frame: Frame) -> Instances:
@@ -83,7 +83,14 @@ class RecordedSegmenter:
         Raises:
             SegmentationError: No file for the frame, an unreadable file, a wrong size, an object without a class.
         """
-        path = self._find(frame)
+        nearest, distance = self._nearest(frame.timestamp if self.by_stamp else frame.index)
+        path = self._files[nearest]
+        if distance >= self._tolerance:
+            within = f" within {MAX_DIFFERENCE_S} s" if self.by_stamp else ""
+            raise SegmentationError(
+                f"no recorded mask{within} of frame {frame.index} ({frame.timestamp:.6f} s) in {self.folder}",
+                f"the nearest is {path.name}" + (f", {distance:.3f} s away" if self.by_stamp else ""),
+            )
         height, width = frame.rgb.shape[:2]
         labels = read_image(
             path,
@@ -99,10 +106,13 @@ class RecordedSegmenter:
                     f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
                 )
             labels = np.asarray(labels[:, :, 0])
-        values = [int(value) for value in np.unique(labels) if value != 0]
-        masks = _planes(labels, values)
-        names = tuple(self._name(value, path) for value in values)
-        return Instances(masks, boxes_of(masks), names, np.ones(len(values), np.float32))
+        numbers = [int(value) for value in np.unique(labels) if value != 0]
+        names = dict.fromkeys(numbers, "person") if self._names is None else self._names
+        nameless = [number for number in numbers if number not in names]
+        if nameless:
+            known = ", ".join(map(str, sorted(names)))
+            raise SegmentationError(f"{path}: object {nameless[0]} has no class in {CLASSES_FILE}", f"known: {known}")
+        return _objects(labels, {number: names[number] for number in numbers})
 
     def missing(self, timestamps: NDArray[np.float64]) -> list[int]:
         """Indices of the frames that have no file.
@@ -119,34 +129,11 @@ class RecordedSegmenter:
         nearest = int(np.argmin(distance))
         return nearest, float(distance[nearest])
 
-    def _find(self, frame: Frame) -> Path:
-        nearest, distance = self._nearest(frame.timestamp if self.by_stamp else frame.index)
-        if distance < self._tolerance:
-            return self._files[nearest]
-        if self.by_stamp:
-            raise SegmentationError(
-                f"no recorded mask within {MAX_DIFFERENCE_S} s of frame {frame.index} ({frame.timestamp:.6f} s) "
-                f"in {self.folder}",
-                f"the nearest is {self._files[nearest].name}, {distance:.3f} s away",
-            )
-        raise SegmentationError(
-            f"no recorded mask of frame {frame.index} in {self.folder}",
-            f"there are {len(self._files)}, indices {self._keys[0]:.0f} to {self._keys[-1]:.0f}",
-        )
 
-    def _name(self, value: int, path: Path) -> str:
-        if self._names is None:
-            return "person"
-        if value not in self._names:
-            raise SegmentationError(
-                f"{path}: object {value} has no class in {CLASSES_FILE}",
-                "known: " + ", ".join(map(str, sorted(self._names))),
-            )
-        return self._names[value]
-
-
-def _planes(labels: NDArray[Any], values: list[int]) -> NDArray[np.bool_]:
-    return np.asarray(labels[None] == np.array(values, labels.dtype)[:, None, None])
+def _objects(labels: NDArray[Any], names: dict[int, str]) -> Instances:
+    """The objects of a label image by number, with exact boxes and score 1."""
+    masks = np.asarray(labels[None] == np.array(list(names), labels.dtype)[:, None, None])
+    return Instances(masks, boxes_of(masks), tuple(names.values()), np.ones(len(names), np.float32))
 
 
 def read_classes(path: Path) -> dict[int, str] | None:
@@ -161,7 +148,7 @@ def read_classes(path: Path) -> dict[int, str] | None:
         names = {int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()}
     except (ValueError, AttributeError) as error:
         raise SegmentationError(f"cannot read {path}: {error}", 'expected {"1": "person", ...}') from error
-    unknown = sorted({name for name in names.values() if name not in COCO_NAMES})
+    unknown = sorted(set(names.values()) - set(COCO_NAMES))
     if unknown:
         raise SegmentationError(f"{path}: '{unknown[0]}' is no COCO class")
     return names
@@ -206,12 +193,15 @@ def record_masks(
         "confidence": settings.confidence,
     }
     _begin(folder, origin)
-    numbers = LabelNumbers(folder / CLASSES_FILE)
+    classes = read_classes(folder / CLASSES_FILE) or {}
     segmented = 0
     for index in range(len(sequence)):
         path = folder / f"{sequence.timestamps[index]:.6f}.png"
         if not path.exists():
-            labels = numbers.label_image(segmenter.segment(sequence[index]))
+            before = len(classes)
+            labels = label_image(segmenter.segment(sequence[index]), classes)
+            if len(classes) > before:
+                write_atomic(folder / CLASSES_FILE, json.dumps(classes, indent=1))
             write_atomic(path, cv2.imencode(".png", labels)[1].tobytes())
             segmented += 1
         if progress is not None:
@@ -238,36 +228,25 @@ def _begin(folder: Path, origin: dict[str, object]) -> None:
     write_atomic(path, json.dumps(origin, indent=1))
 
 
-class LabelNumbers:
-    """The number of each object in the label images: one for the first person of a frame, one for the second, ...
+def label_image(instances: Instances, classes: dict[int, str]) -> NDArray[np.uint16]:
+    """Objects as a label image uint16 ``[H, W]``: 0 background, else the object's number; the highest score on top.
 
     Args:
-        path: The file that says which class each number is; written whenever a number is added.
+        instances: The objects.
+        classes: The class of each number; a number is added where a frame has more objects of a class than before.
     """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._classes = read_classes(path) or {}
-
-    def label_image(self, instances: Instances) -> NDArray[np.uint16]:
-        """uint16 ``[H, W]``: 0 background, else the object's number; the object with the highest score on top."""
-        labels = np.zeros(instances.masks.shape[1:], np.uint16)
-        free = sorted(self._classes)
-        for index in np.argsort(instances.scores, kind="stable"):
-            name = instances.class_names[index]
-            number = next((number for number in free if self._classes[number] == name), None)
-            if number is None:
-                number = self._add(name)
-            else:
-                free.remove(number)
-            labels[instances.masks[index]] = number
-        return labels
-
-    def _add(self, name: str) -> int:
-        number = max(self._classes, default=0) + 1
-        self._classes[number] = name
-        write_atomic(self._path, json.dumps(self._classes, indent=1))
-        return number
+    labels = np.zeros(instances.masks.shape[1:], np.uint16)
+    free = sorted(classes)
+    for index in np.argsort(instances.scores, kind="stable"):
+        name = instances.class_names[index]
+        number = next((number for number in free if classes[number] == name), 0)
+        if number:
+            free.remove(number)
+        else:
+            number = max(classes, default=0) + 1
+            classes[number] = name
+        labels[instances.masks[index]] = number
+    return labels
 
 
 def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
@@ -291,14 +270,8 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
             f"{where}: instance {nameless[0]} has no class name",
             "known ids: " + (", ".join(map(str, sorted(masks.class_names))) or "none"),
         )
-    planes = _planes(labels, ids)
-    return Instances(
-        planes,
-        boxes_of(planes),
-        tuple(masks.class_names[number] for number in ids),
-        np.ones(len(ids), np.float32),
-        np.array([number in masks.moving for number in ids], dtype=bool),
-    )
+    moving = np.array([number in masks.moving for number in ids], dtype=bool)
+    return replace(_objects(labels, {number: masks.class_names[number] for number in ids}), moving=moving)
 
 
 class OracleSegmenter:
@@ -335,3 +308,22 @@ class OracleSegmenter:
             )
         instances = instances_of(masks, where=f"exact masks of frame {frame.index}")
         return instances if self.motion else replace(instances, moving=None)
+
+
+def build_oracle(settings: SegmentationSettings, context: SegmenterContext) -> OracleSegmenter:
+    """Exact masks of the sequence; ``oracle`` also returns what moves, whatever its class.
+
+    Raises:
+        SegmentationError: The sequence has no exact masks.
+    """
+    if context.masks is None:
+        raise SegmentationError(
+            f"segmentation.source={settings.source}: sequence '{context.sequence_id}' has no exact masks",
+            "only synthetic/* has them; use coco, onnx:PATH or recorded:DIR",
+        )
+    return OracleSegmenter(context.masks, motion=settings.source != "oracle-classes")
+
+
+def build_recorded(settings: SegmentationSettings, context: SegmenterContext) -> RecordedSegmenter:
+    """Masks from a folder."""
+    return RecordedSegmenter(Path(context.argument))

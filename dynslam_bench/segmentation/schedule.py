@@ -79,18 +79,16 @@ class MaskScheduler:
         return self._instances
 
     def _due(self, keyframe: bool) -> bool:
-        if self._settings.schedule == "every" or self._crowded():
+        settings = self._settings
+        if settings.schedule == "every":
             return True
-        if self._settings.schedule == "every_nth":
-            return self._age >= self._settings.n
+        if settings.crowded_share < 1 and len(self._instances):
+            covered = float(select(self._instances, settings).union().mean())  # by the masks of the previous frame
+            if covered > settings.crowded_share:
+                return True
+        if settings.schedule == "every_nth":
+            return self._age >= settings.n
         return keyframe or self._age >= MAX_CARRY
-
-    def _crowded(self) -> bool:
-        """Whether the masks of the previous frame covered more of the view than `crowded_share`."""
-        if self._settings.crowded_share >= 1:
-            return False
-        chosen = select(self._instances, self._settings)
-        return len(chosen) > 0 and float(chosen.union().mean()) > self._settings.crowded_share
 
 
 @dataclass
@@ -102,6 +100,28 @@ class _Track:
     velocity: NDArray[np.float32]
     hits: int = 1
     missed: int = 0
+
+    def see(self, detections: Instances, index: int, frames: int) -> None:
+        """Take over a detection of the object, `frames` frames after the last update."""
+        box = detections.boxes[index]
+        velocity = (box - self.box) / np.float32(max(frames * (self.missed + 1), 1))
+        self.velocity = np.asarray(SMOOTHING * velocity + (1 - SMOOTHING) * self.velocity, np.float32)
+        self.box, self.mask, self.score = box, detections.masks[index], float(detections.scores[index])
+        self.hits += 1
+        self.missed = 0
+
+    def move(self, box: NDArray[np.float32]) -> bool:
+        """Move a missed object to its predicted box; False if it left the image."""
+        shift = (box[:2] + box[2:] - self.box[:2] - self.box[2:]) / 2
+        before = np.maximum(self.box[2:] - self.box[:2], 1)
+        scale = float(np.clip(np.mean((box[2:] - box[:2]) / before), 0.8, 1.25))
+        mask = shift_mask(self.mask, float(shift[0]), float(shift[1]), scale)
+        if np.count_nonzero(mask) < 0.2 * np.count_nonzero(self.mask):
+            return False
+        height, width = mask.shape
+        self.mask, self.box = mask, np.clip(box, 0, np.array([width, height] * 2)).astype(np.float32)
+        self.missed += 1
+        return True
 
 
 class MissedDetections:
@@ -136,45 +156,27 @@ class MissedDetections:
             return detections
         predicted = [np.asarray(track.box + track.velocity * frames, np.float32) for track in self._tracks]
         matches = dict(associate(predicted, [track.name for track in self._tracks], detections))
-        height, width = detections.masks.shape[1:]
         tracks: list[_Track] = []
         bridged: list[_Track] = []
         for index, track in enumerate(self._tracks):
             if index in matches:
-                _update_track(track, detections, matches[index], frames)
+                track.see(detections, matches[index], frames)
                 tracks.append(track)
-            elif self._bridge(track, predicted[index], height, width):
+            elif track.hits >= LEAST_HITS and track.missed < self.limit and track.move(predicted[index]):
                 bridged.append(track)
         self._tracks = tracks + bridged
         for new in sorted(set(range(len(detections))) - set(matches.values())):
-            self._tracks.append(
-                _Track(detections.boxes[new], detections.masks[new], detections.class_names[new],
-                       float(detections.scores[new]), np.zeros(4, np.float32))
-            )  # fmt: skip
-        return _extend(detections, bridged) if bridged else detections
-
-    def _bridge(self, track: _Track, box: NDArray[np.float32], height: int, width: int) -> bool:
-        """Move a missed object to its predicted box; False if it is given up."""
-        if track.hits < LEAST_HITS or track.missed >= self.limit:
-            return False
-        shift = (box[:2] + box[2:] - track.box[:2] - track.box[2:]) / 2
-        before = np.maximum(track.box[2:] - track.box[:2], 1)
-        scale = float(np.clip(np.mean((box[2:] - box[:2]) / before), 0.8, 1.25))
-        mask = shift_mask(track.mask, float(shift[0]), float(shift[1]), scale)
-        if np.count_nonzero(mask) < 0.2 * np.count_nonzero(track.mask):
-            return False  # it left the image
-        track.mask, track.box = mask, np.clip(box, 0, np.array([width, height] * 2)).astype(np.float32)
-        track.missed += 1
-        return True
-
-
-def _update_track(track: _Track, detections: Instances, index: int, frames: int) -> None:
-    box = detections.boxes[index]
-    velocity = (box - track.box) / np.float32(max(frames * (track.missed + 1), 1))
-    track.velocity = np.asarray(SMOOTHING * velocity + (1 - SMOOTHING) * track.velocity, np.float32)
-    track.box, track.mask, track.score = box, detections.masks[index], float(detections.scores[index])
-    track.hits += 1
-    track.missed = 0
+            box, mask, score = detections.boxes[new], detections.masks[new], float(detections.scores[new])
+            self._tracks.append(_Track(box, mask, detections.class_names[new], score, np.zeros(4, np.float32)))
+        if not bridged:
+            return detections
+        masks = np.stack([track.mask for track in bridged])
+        return Instances(
+            np.concatenate([detections.masks, masks]),
+            np.concatenate([detections.boxes, boxes_of(masks)]),
+            (*detections.class_names, *(track.name for track in bridged)),
+            np.concatenate([detections.scores, np.array([track.score for track in bridged], np.float32)]),
+        )
 
 
 def associate(predicted: list[NDArray[np.float32]], names: list[str], detections: Instances) -> list[tuple[int, int]]:
@@ -199,13 +201,3 @@ def box_iou(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float6
     areas = [np.clip(x[:, 2:] - x[:, :2], 0, None).prod(axis=1).astype(np.float64) for x in (a, b)]
     union = areas[0][:, None] + areas[1][None] - inter
     return np.asarray(inter / np.maximum(union, 1e-9))
-
-
-def _extend(detections: Instances, bridged: list[_Track]) -> Instances:
-    masks = np.stack([track.mask for track in bridged])
-    return Instances(
-        np.concatenate([detections.masks, masks]),
-        np.concatenate([detections.boxes, boxes_of(masks)]),
-        (*detections.class_names, *(track.name for track in bridged)),
-        np.concatenate([detections.scores, np.array([track.score for track in bridged], np.float32)]),
-    )

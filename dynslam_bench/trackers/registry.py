@@ -16,7 +16,7 @@ from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, PluginError, TrackerError
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.settings import Settings, apply_overrides
-from dynslam_bench.trackers.adapters.specs import adapter_specs
+from dynslam_bench.trackers.adapters.specs import ADAPTERS
 
 SYSTEMS = (
     "blitz_slam", "cfp_slam", "chen_slam", "dai_slam", "detect_slam", "dgs_slam", "di_slam", "ds_slam", "dynaslam",
@@ -33,7 +33,7 @@ KINDS = {
 
 def all_specs() -> list[TrackerSpec]:
     """The specs of all built-in trackers; imports neither torch nor OpenCV."""
-    specs = adapter_specs()
+    specs = list(ADAPTERS)
     for name in SYSTEMS:
         module = import_module(f"dynslam_bench.trackers.systems.{name}")
         specs += getattr(module, "SPECS", None) or [module.SPEC]
@@ -132,9 +132,9 @@ def build_tracker(
     if missing:
         raise TrackerError(f"tracker '{spec.id}' needs a package that is not installed", "; ".join(missing))
     factory = load_object(spec.entry_point)
-    arguments = {"context": context or TrackerContext()} if _takes_context(factory) else {}
     try:
-        tracker = factory(settings, **arguments)
+        takes_context = "context" in inspect.signature(factory).parameters
+        tracker = factory(settings, **({"context": context or TrackerContext()} if takes_context else {}))
     except DynslamError:
         raise
     except Exception as error:
@@ -142,13 +142,6 @@ def build_tracker(
     if not isinstance(tracker, Tracker):
         raise TrackerError(f"'{spec.entry_point}' gave a {type(tracker).__name__} without reset() and track()")
     return tracker
-
-
-def _takes_context(factory: Any) -> bool:
-    try:
-        return "context" in inspect.signature(factory).parameters
-    except (TypeError, ValueError):
-        return False
 
 
 def epipolar_skipped(tracker: str) -> dict[str, float]:

@@ -1,26 +1,25 @@
 """Do the re-implemented systems fail and survive where the published ones do?
 
 Reads the results folder of ``dynslam-bench bench dynamic`` and prints, in Markdown, each system's class on each
-rendered twin beside the class that published figures put it in, and which filters cull nothing or take long.
+rendered replica beside the class that published figures put it in, and how long filters take and what they cull.
 
     dynslam-bench bench dynamic --results results
     python tests/benchmarks/baseline_signatures.py results --instances 100:200
 
-Each instance of a twin is a row of its own. Its repeats (start offsets, sensor-noise seeds, seeds) are one cell: the
+Each instance of a replica is a row of its own. Its repeats (start offsets, sensor-noise seeds, seeds) are one cell: the
 median counts, the range stands beside it.
 
 Measured class (medians over the repeats):
   fails     ATE >= 0.5 x that of a camera that never moves, or coverage < 80 %, or the run did not end;
-  survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same twin;
+  survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same replica;
   between   neither.
-Where a twin moves so little that both hold (half of never-move is below three times the yardstick's error: the rotating
-and the standing camera), the cell survives: what is as good as exact masks has not failed. The counts without such
-cells and with `fails` first are given as well.
+Where a replica moves so little that both hold (half of never-move is below three times the reference system's error:
+the rotating and the standing camera), the cell survives: what is as good as exact masks has not failed.
 
 Published class, from the product's own table of reported numbers, by the same rule: a cell is
   fails     if all published ATEs of the system on the recorded sequence are >= 0.5 x never-move there;
-  survives  if all are <= 3 x the yardstick's, which is DynaSLAM N (Mask R-CNN's masks alone), or where that is not
-            published the best published ATE of DynaSLAM;
+  survives  if all are <= 3 x the reference system's, which is DynaSLAM N (Mask R-CNN's masks alone), or where that is
+            not published the best published ATE of DynaSLAM;
 and clear if exactly one of the two holds. Sim(3)-aligned numbers and ablations do not count.
 """
 
@@ -46,13 +45,13 @@ from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.trackers.registry import TRACKERS
 
 FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"
-YARDSTICKS = (("DynaSLAM N",), ("DynaSLAM N+G", "DynaSLAM"))
+REFERENCES = (("DynaSLAM N",), ("DynaSLAM N+G", "DynaSLAM"))
 FAITHFUL = ("faithful-code", "faithful-paper")
 
 
 @dataclass
 class Cell:
-    """One system on one twin, over its repeats."""
+    """One system on one replica, over its repeats."""
 
     ates: list[float] = field(default_factory=list)
     coverages: list[float] = field(default_factory=list)
@@ -87,26 +86,23 @@ def classify(
     ate: float,
     coverage: float,
     static_camera: float,
-    yardstick: float,
+    reference: float,
     broken: bool = False,
-    *,
-    fails_first: bool = False,
 ) -> str:
-    """The measured class of a cell; where both hold it survives, unless `fails_first`."""
+    """The measured class of a cell; where both hold it survives."""
     fails = broken or not np.isfinite(ate) or coverage < 0.8 or ate >= 0.5 * static_camera
-    survives = np.isfinite(ate) and ate <= 3 * yardstick and coverage >= 0.8 and not broken
-    if fails and survives:
-        return FAILS if fails_first else SURVIVES
-    return FAILS if fails else SURVIVES if survives else BETWEEN
+    if np.isfinite(ate) and ate <= 3 * reference and coverage >= 0.8 and not broken:
+        return SURVIVES
+    return FAILS if fails else BETWEEN
 
 
-def recorded(twin: str) -> str:
-    """The recorded sequence behind a twin: ``synthetic/walking_xyz?scene=3`` -> ``tum/fr3/walking_xyz``."""
-    return "tum/fr3/" + twin.removeprefix("synthetic/").partition("?")[0]
+def recorded(replica: str) -> str:
+    """The recorded sequence behind a replica: ``synthetic/walking_xyz?scene=3`` -> ``tum/fr3/walking_xyz``."""
+    return "tum/fr3/" + replica.removeprefix("synthetic/").partition("?")[0]
 
 
 def instance_of(sequence: str) -> int | None:
-    """The instance of a rendered twin; None for any other sequence."""
+    """The instance of a rendered replica; None for any other sequence."""
     return parse_synthetic_id(sequence).scene if sequence.startswith("synthetic/") else None
 
 
@@ -143,9 +139,9 @@ def published_class(tracker: str, sequence: str) -> str | None:
     if not values:
         return None
     standstill = published_never_move().get(sequence)
-    yardstick = next((min(found) for names in YARDSTICKS if (found := published_values(names, sequence))), None)
+    reference = next((min(found) for names in REFERENCES if (found := published_values(names, sequence))), None)
     fails = standstill is not None and min(values) >= 0.5 * standstill
-    survives = yardstick is not None and max(values) <= 3 * yardstick
+    survives = reference is not None and max(values) <= 3 * reference
     if fails == survives:
         return BETWEEN
     return FAILS if fails else SURVIVES
@@ -158,13 +154,14 @@ def read_cells(
 
     Args:
         folder: Results of the suite.
-        instances: Which instances of the twins count; None for all.
+        instances: Which instances of the replicas count; None for all.
 
     Returns:
-        Cells by (tracker with its default settings, sequence), the yardstick's by sequence, provenance by tracker.
+        Cells by (tracker with its default settings, sequence), the reference system's by sequence, and provenance by
+        tracker.
     """
     cells: dict[tuple[str, str], Cell] = {}
-    yardstick: dict[str, Cell] = {}
+    reference: dict[str, Cell] = {}
     provenance: dict[str, str] = {}
     for run in load_runs(open_stores(folder), get_protocol(DEFAULT_PROTOCOL)).rows:
         if run.kind != "run" or run.degrade or run.drop_share or run.realtime:
@@ -172,11 +169,11 @@ def read_cells(
         if instances is not None and instance_of(run.sequence.id) not in instances:
             continue
         if run.tracker.id == "mask-rcnn" and run.overrides == {"segmentation.source": "oracle"}:
-            add(yardstick.setdefault(run.sequence.id, Cell()), run)
+            add(reference.setdefault(run.sequence.id, Cell()), run)
         elif not run.overrides:
             add(cells.setdefault((run.tracker.id, run.sequence.id), Cell()), run)
             provenance[run.tracker.id] = run.tracker.provenance
-    return cells, yardstick, provenance
+    return cells, reference, provenance
 
 
 def add(cell: Cell, run: RunRow) -> None:
@@ -203,126 +200,103 @@ def report(folder: Path, instances: range | None = None) -> str:
 
     Args:
         folder: Results of the suite.
-        instances: Which instances of the twins count; None for all.
+        instances: Which instances of the replicas count; None for all.
 
     Raises:
-        DynslamError: The folder holds no runs, or not the yardstick's, or none on these instances.
+        DynslamError: The folder holds no runs, or not the reference system's, or none on these instances.
     """
-    cells, yardstick, provenance = read_cells(folder, instances)
-    twins = [twin for twin in dict.fromkeys(twin for _, twin in cells) if twin.startswith("synthetic/")]
-    missing = [twin for twin in twins if twin not in yardstick or not np.isfinite(yardstick[twin].ate)]
-    if not twins and instances is not None:
+    cells, reference, provenance = read_cells(folder, instances)
+    replicas = [
+        replica for replica in dict.fromkeys(replica for _, replica in cells) if replica.startswith("synthetic/")
+    ]
+    missing = [replica for replica in replicas if replica not in reference or not np.isfinite(reference[replica].ate)]
+    if not replicas and instances is not None:
         raise DynslamError(
-            f"{folder} holds no runs on instances {instances.start} to {instances.stop - 1} of the rendered twins",
+            f"{folder} holds no runs on instances {instances.start} to {instances.stop - 1} of the rendered replicas",
             "run the suite 'dynamic', or ask for other --instances",
         )
-    if missing or not twins:
+    if missing or not replicas:
         raise DynslamError(
-            f"{folder} holds no run of mask-rcnn with exact masks on {missing[0] if missing else 'any twin'}",
+            f"{folder} holds no run of mask-rcnn with exact masks on {missing[0] if missing else 'any replica'}",
             "run the suite 'dynamic', or mask-rcnn with --set segmentation.source=oracle",
         )
     trackers = sorted({tracker for tracker, _ in cells}, key=lambda name: (provenance[name] not in FAITHFUL, name))
     lines = [
-        "| twin | never-move m | exact masks m | fails from m | survives up to m |",
+        "| replica | never-move m | exact masks m | fails from m | survives up to m |",
         "| --- | --- | --- | --- | --- |",
     ]
-    standstill = {twin: standstill_of(twin, cells, yardstick) for twin in twins}
-    for twin in twins:
-        known = standstill[twin]
+    standstill = {replica: standstill_of(replica, cells, reference) for replica in replicas}
+    for replica in replicas:
+        known = standstill[replica]
         lines.append(
-            f"| {short(twin)} | {known:.3f} | {yardstick[twin].ate:.4f} | {0.5 * known:.4f} "
-            f"| {3 * yardstick[twin].ate:.4f} |"
+            f"| {short(replica)} | {known:.3f} | {reference[replica].ate:.4f} | {0.5 * known:.4f} "
+            f"| {3 * reference[replica].ate:.4f} |"
         )
     lines += [
         "",
-        "| system | provenance | twin | ATE m | coverage | measured | published | verdict |",
+        "| system | provenance | replica | ATE m | coverage | measured | published | verdict |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    matched, by_letter, clear, alone, alone_matched, misses = 0, 0, 0, 0, 0, []
+    matched, clear, misses = 0, 0, []
     for tracker in trackers:
-        for twin in twins:
-            cell = cells.get((tracker, twin))
-            expected = published_class(tracker, recorded(twin))
+        for replica in replicas:
+            cell = cells.get((tracker, replica))
+            expected = published_class(tracker, recorded(replica))
             if cell is None or expected is None:
                 continue
-            numbers = (cell.ate, cell.coverage, standstill[twin], yardstick[twin].ate, cell.broken > 0)
-            measured = classify(*numbers)
+            measured = classify(cell.ate, cell.coverage, standstill[replica], reference[replica].ate, cell.broken > 0)
             verdict = "not clear" if expected == BETWEEN else "match" if measured == expected else "**miss**"
             if provenance[tracker] in FAITHFUL and expected != BETWEEN:
                 clear += 1
                 matched += measured == expected
-                letter = classify(*numbers, fails_first=True)
-                by_letter += letter == expected
-                alone += letter == measured
-                alone_matched += letter == measured == expected
                 if measured != expected:
-                    misses.append(f"{tracker} on {short(twin)}: {measured} ({cell.ate:.4f} m), published {expected}")
+                    misses.append(f"{tracker} on {short(replica)}: {measured} ({cell.ate:.4f} m), published {expected}")
             elif verdict != "not clear":
                 verdict += " (not counted)"
             lines.append(
-                f"| `{tracker}` | {provenance[tracker]} | {short(twin)} | {cell.ate:.4f}{cell.spread} "
+                f"| `{tracker}` | {provenance[tracker]} | {short(replica)} | {cell.ate:.4f}{cell.spread} "
                 f"| {100 * cell.coverage:.0f} % | {measured} | {expected} | {verdict} |"
             )
-    share, other, single = (
-        f"{100 * n / of:.0f} %" if of else "-"
-        for n, of in ((matched, clear), (by_letter, clear), (alone_matched, alone))
-    )
-    lines += [
-        "",
-        f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %).",
-        f"Without the cells where both classes hold: {alone_matched} of {alone} ({single}).",
-        f"With `fails` first where both classes hold: {by_letter} of {clear} ({other}).",
-    ]
+    share = f"{100 * matched / clear:.0f} %" if clear else "-"
+    lines += ["", f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %)."]
     lines += ["", "Misses:", "", *(f"- {miss}" for miss in misses)] if misses else []
-    return "\n".join([*lines, "", *filter_table(trackers, twins, cells, provenance)])
+    return "\n".join([*lines, "", *filter_table(trackers, replicas, cells)])
 
 
-def standstill_of(twin: str, cells: dict[tuple[str, str], Cell], yardstick: dict[str, Cell]) -> float:
-    """ATE of a camera that never moves on a twin, metres; NaN where no run says it."""
-    known = yardstick[twin].static_camera
-    return cells["never-move", twin].ate if known is None and ("never-move", twin) in cells else known or float("nan")
+def standstill_of(replica: str, cells: dict[tuple[str, str], Cell], reference: dict[str, Cell]) -> float:
+    """ATE of a camera that never moves on a replica, metres; NaN where no run says it."""
+    known = reference[replica].static_camera
+    return (
+        cells["never-move", replica].ate
+        if known is None and ("never-move", replica) in cells
+        else known or float("nan")
+    )
 
 
-def filter_table(
-    trackers: list[str], twins: list[str], cells: dict[tuple[str, str], Cell], provenance: dict[str, str]
-) -> list[str]:
-    """How long each system's filters take, what they cull, and who culls nothing on walking twins."""
+def filter_table(trackers: list[str], replicas: list[str], cells: dict[tuple[str, str], Cell]) -> list[str]:
+    """How long each system's filters take and what they cull."""
     lines = [
-        "| system | filters ms per frame (median, worst twin) | culled per frame, walking | sitting |",
+        "| system | filters ms per frame (median, worst replica) | culled per frame, walking | sitting |",
         "| --- | --- | --- | --- |",
     ]
-    idle, slow = [], []
     for tracker in trackers:
-        found = {twin: cells[tracker, twin] for twin in twins if (tracker, twin) in cells}
+        found = {replica: cells[tracker, replica] for replica in replicas if (tracker, replica) in cells}
         counts = {
-            kind: [n for twin, cell in found.items() if f"/{kind}_" in twin for n in cell.culled]
+            kind: [n for replica, cell in found.items() if f"/{kind}_" in replica for n in cell.culled]
             for kind in ("walking", "sitting")
         }
         if not any(counts.values()):
             continue  # controls and adapters cull nothing by nature and say nothing
-        ms = {twin: float(np.median(cell.filter_ms)) for twin, cell in found.items()}
-        worst = max(ms, key=lambda twin: ms[twin])
+        ms = {replica: float(np.median(cell.filter_ms)) for replica, cell in found.items()}
+        worst = max(ms, key=lambda replica: ms[replica])
         mean = [f"{np.mean(counts[kind]):.0f}" if counts[kind] else "-" for kind in ("walking", "sitting")]
         lines.append(f"| `{tracker}` | {ms[worst]:.1f} ({short(worst)}) | {mean[0]} | {mean[1]} |")
-        if counts["walking"] and not any(counts["walking"]) and not is_identity(tracker):
-            idle.append(tracker)
-        if ms[worst] > 10:
-            slow.append(f"{tracker} {ms[worst]:.1f} ms")
-    lines += ["", f"Culled nothing on any walking twin: {', '.join(idle) or 'none (identity systems aside)'}."]
-    return [*lines, f"Filters over 10 ms: {', '.join(slow) or 'none'}."]
+    return lines
 
 
-def is_identity(tracker: str) -> bool:
-    """Whether a tracker has no filters by design."""
-    try:
-        return TRACKERS.get(tracker).entry_point.startswith("dynslam_bench.trackers.systems.orb_slam2")
-    except DynslamError:
-        return False
-
-
-def short(twin: str) -> str:
+def short(replica: str) -> str:
     """``synthetic/walking_xyz?scene=0&frames=600`` -> ``walking_xyz``; other scenes keep their number."""
-    return twin.removeprefix("synthetic/").partition("&")[0].removesuffix("?scene=0")
+    return replica.removeprefix("synthetic/").partition("&")[0].removesuffix("?scene=0")
 
 
 def main() -> int:

@@ -26,7 +26,6 @@ from dynslam_bench.sequences.readers import recorded as recorded_sequence
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.slam.settings import TrackingSettings
 from dynslam_bench.suites import load_suite
-from dynslam_bench.trackers.adapters import program
 from dynslam_bench.trackers.adapters import subprocess_tracker as answers
 from dynslam_bench.tuning import study_file
 
@@ -124,7 +123,7 @@ def _read_yolo(data: bytes | None, folder: Path) -> None:
 
 
 def _read_answer(text: str) -> None:
-    answer = program.parse_answer(text)
+    answer = answers.parse_answer(text)
     try:
         answers.read_track_answer(answer, "program at frame 1", lambda: 0.1)
     except TrackerError:

@@ -12,7 +12,6 @@ from dynslam_bench.segmentation.postprocess import boxes_of, dilate, dynamic_mas
 from dynslam_bench.segmentation.schedule import MaskScheduler, MissedDetections
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import MaskTally, average_precision
-from dynslam_bench.segmentation.training.labelled_images import LabelledImage
 
 H, W = 120, 160
 
@@ -270,11 +269,6 @@ def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
 # --- metrics -----------------------------------------------------------------------------------------------------
 
 
-def labelled(*masks, names=None):
-    stack = np.stack(masks) if masks else np.zeros((0, H, W), bool)
-    return LabelledImage(np.zeros((H, W, 3), np.uint8), stack, tuple(names or ["person"] * len(stack)))
-
-
 def test_average_precision_by_hand():
     hits = np.array([True, False, True])
     # recall .5 at precision 1, recall 1 at precision 2/3: 51 points at 1, 50 at 2/3
@@ -284,33 +278,34 @@ def test_average_precision_by_hand():
     assert np.isnan(average_precision(np.array([0.5]), np.array([False]), 0))
 
 
+def add(tally, true=(), guess=(), scores=None):
+    found = instances(*guess, scores=scores)
+    tally.add(instances(*true).masks, found.masks, found.scores)
+
+
 def test_quality_of_perfect_shifted_missed_and_false_detections():
-    tally = MaskTally({"person", "chair"})
-    truth = labelled(walker(0), walker(10))
-    tally.add(truth, instances(walker(0), walker(10)))
-    perfect = tally.quality().classes["person"]
-    assert (perfect.ap, perfect.iou, perfect.instance_iou, perfect.recall, perfect.truths) == (1, 1, 1, 1, 2)
-    tally.add(labelled(walker(5)), instances())
-    tally.add(labelled(), instances(walker(5)))
-    worse = tally.quality()
-    quality = worse.classes["person"]
-    assert (quality.truths, quality.detections, worse.images) == (3, 3, 3)
-    assert quality.recall == pytest.approx(2 / 3) and quality.instance_iou == pytest.approx(2 / 3)
-    area = walker(0).sum()
-    assert quality.iou == pytest.approx(2 * area / (4 * area)) and quality.frame_iou == pytest.approx(1 / 3)
-    assert 0 < quality.ap50 < 1 and np.isnan(worse.classes["chair"].ap)
-    assert worse.mean_ap == quality.ap
+    tally = MaskTally()
+    add(tally, [walker(0), walker(10)], [walker(0), walker(10)])
+    perfect = tally.quality()
+    assert [perfect[name] for name in ("ap", "iou", "instance_iou", "recall", "truths")] == [1, 1, 1, 1, 2]
+    add(tally, [walker(5)])
+    add(tally, [], [walker(5)])
+    quality = tally.quality()
+    assert (quality["truths"], quality["detections"]) == (3, 3) and 0 < quality["ap50"] < 1
+    assert quality["recall"] == pytest.approx(2 / 3) and quality["instance_iou"] == pytest.approx(2 / 3)
+    assert quality["iou"] == pytest.approx(2 / 4) and quality["frame_iou"] == pytest.approx(1 / 3)
+    nothing = MaskTally().quality()
+    assert nothing["truths"] == 0 and nothing["ap"] is None and nothing["iou"] is None
 
 
 def test_two_detections_of_one_object_count_once_and_small_objects_are_left_out():
-    tally = MaskTally({"person"})
-    tally.add(labelled(walker(0)), instances(walker(0), walker(0), scores=[0.9, 0.8]))
-    assert tally.quality().classes["person"].ap50 == 1.0
-    tally.add(labelled(walker(0)), instances(walker(0), scores=[0.7]))
-    assert tally.quality().classes["person"].ap50 < 1.0  # the duplicate at .8 lies between the hits
-    small = MaskTally({"person"}, min_area=100)
-    small.add(labelled(walker(0), block(0, 5, 0, 5)), instances(walker(0), block(0, 5, 0, 5)))
-    quality = small.quality().classes["person"]
-    assert (quality.truths, quality.ap) == (1, 1.0)
+    tally = MaskTally()
+    add(tally, [walker(0)], [walker(0), walker(0)], scores=[0.9, 0.8])
+    assert tally.quality()["ap50"] == 1.0
+    add(tally, [walker(0)], [walker(0)], scores=[0.7])
+    assert tally.quality()["ap50"] < 1.0  # the duplicate at .8 lies between the hits
+    small = MaskTally(min_area=100)
+    add(small, [walker(0), block(0, 5, 0, 5)], [walker(0), block(0, 5, 0, 5)])
+    assert (small.quality()["truths"], small.quality()["ap"]) == (1, 1.0)
     with pytest.raises(SegmentationError, match="cannot be compared"):
-        small.add(labelled(walker(0)), Instances.empty(5, 5))
+        small.add(instances(walker(0)).masks, np.zeros((0, 5, 5), bool), np.zeros(0, np.float32))

@@ -15,8 +15,7 @@ from dynslam_bench.segmentation.networks import boxes as box_ops
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig, resnet18_config
 from dynslam_bench.segmentation.networks.loading import load_network, save_network
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter, paste
-from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.networks.roi_heads import levels_of, roi_align
+from dynslam_bench.segmentation.networks.network import MaskRCNN, levels_of, roi_align
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 SMALL = NetworkConfig(

@@ -11,8 +11,14 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.networks.onnx_header import TensorInfo, read_header
-from dynslam_bench.segmentation.networks.onnx_outputs import Layout, Placement, decode, detect_layout
-from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter, fit
+from dynslam_bench.segmentation.networks.onnx_segmenter import (
+    Layout,
+    OnnxSegmenter,
+    Placement,
+    decode,
+    detect_layout,
+    fit,
+)
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -86,12 +92,12 @@ def test_yolo_decoding_cuts_masks_to_boxes_and_suppresses_per_class():
         [(8, 8, 40, 56), (9, 8, 41, 56), (8, 8, 40, 56), (50, 4, 60, 20)], [0.9, 0.8, 0.7, 0.2], [0, 0, 16, 0]
     )
     layout = Layout("yolo", ("a", "b"), {k: str(k) for k in range(80)} | {0: "person", 16: "dog"})
-    place = Placement(1, 1, 0, 0, 128, 96)
-    found = decode(layout, outputs, place, 96, 128, SETTINGS, 0.1)
+    place = Placement((96, 128), (96, 128))
+    found = decode(layout, outputs, place, SETTINGS, 0.1)
     assert found.class_names == ("person", "person") and found.scores == pytest.approx([0.9, 0.2])
     assert found.boxes[0] == pytest.approx([8, 8, 40, 56])
     assert found.masks[0].sum() == 32 * 48 and found.masks[0][8:56, 8:40].all()
-    both = decode(layout, outputs, place, 96, 128, SegmentationSettings(classes="person,dog"), 0.5)
+    both = decode(layout, outputs, place, SegmentationSettings(classes="person,dog"), 0.5)
     assert both.class_names == ("person", "dog")
 
 
@@ -101,7 +107,7 @@ def test_yolo_letterbox_is_undone():
     rgb = np.zeros((240, 320, 3), np.uint8)
     image, place = fit(rgb, (128, 128), keep_aspect=True)
     assert image.shape == (128, 128, 3) and (image[:16] == 114).all() and (image[16:112] == 0).all()
-    found = decode(layout, outputs, place, 240, 320, SETTINGS, 0.1)
+    found = decode(layout, outputs, place, SETTINGS, 0.1)
     assert found.boxes[0] == pytest.approx([40, 40, 120, 120])
     assert found.masks[0][41:119, 41:119].all() and found.masks[0].sum() == 80 * 80
 
@@ -113,7 +119,7 @@ def test_semantic_decoding_is_argmax_split_into_parts():
     logits[0, 15, 300:400, 400:600] = 4.0
     logits[0, 9, 250:280, 10:40] = 4.0
     layout = detect_layout(info(out=logits.shape), {}, (480, 640), "f")
-    found = decode(layout, [logits], Placement(1, 1, 0, 0, 640, 480), 480, 640, SETTINGS, 0.1)
+    found = decode(layout, [logits], Placement((480, 640), (480, 640)), SETTINGS, 0.1)
     assert found.class_names == ("person", "person")
     assert found.masks[0][100:200, 50:150].all() and found.masks.sum() == 100 * 100 + 100 * 200
     assert found.scores == pytest.approx([1 / (1 + np.exp(-3.0))] * 2, abs=1e-5)
@@ -124,7 +130,7 @@ def test_aligned_logits_are_interpolated_between_corners():
     logits[0, 0] = 1.0
     logits[0, 15] = np.linspace(-1, 3, 41)[None]
     layout = detect_layout(info(out=logits.shape), {}, (481, 641), "f")
-    found = decode(layout, [logits], Placement(1, 1, 0, 0, 641, 481), 481, 641, SETTINGS, 0.1)
+    found = decode(layout, [logits], Placement((481, 641), (481, 641)), SETTINGS, 0.1)
     assert found.masks[0][:, 321:].all() and not found.masks[0][:, :320].any()
 
 
@@ -136,23 +142,23 @@ def test_torchvision_instances():
     boxes = np.array([[20, 10, 60, 50], [70, 60, 100, 90], [0, 0, 9, 9]], np.float32)
     values = [boxes, np.array([1, 62, 1], np.float32), np.array([0.9, 0.8, 0.05], np.float32), masks]
     layout = detect_layout(info(boxes=(3, 4), labels=(3,), scores=(3,), masks=(3, 1, 96, 128)), {}, (96, 128), "f")
-    place = Placement(1, 1, 0, 0, 128, 96)
-    found = decode(layout, values, place, 96, 128, SETTINGS, 0.1)
+    place = Placement((96, 128), (96, 128))
+    found = decode(layout, values, place, SETTINGS, 0.1)
     assert found.class_names == ("person",) and (found.masks[0] == (masks[0, 0] > 0.5)).all()
-    assert decode(layout, values, place, 96, 128, SegmentationSettings(classes="chair"), 0.1).class_names == ("chair",)
+    assert decode(layout, values, place, SegmentationSettings(classes="chair"), 0.1).class_names == ("chair",)
     with pytest.raises(SegmentationError, match=r"disagree: 3 boxes, 2 labels"):
-        decode(layout, [boxes, values[1][:2], *values[2:]], place, 96, 128, SETTINGS, 0.1)
+        decode(layout, [boxes, values[1][:2], *values[2:]], place, SETTINGS, 0.1)
     with pytest.raises(SegmentationError, match="28x28"):
-        decode(layout, [*values[:3], np.ones((3, 1, 28, 28), np.float32)], place, 96, 128, SETTINGS, 0.1)
+        decode(layout, [*values[:3], np.ones((3, 1, 28, 28), np.float32)], place, SETTINGS, 0.1)
     none = [np.zeros((0, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 1, 96, 128))]
-    assert len(decode(layout, none, place, 96, 128, SETTINGS, 0.1)) == 0
+    assert len(decode(layout, none, place, SETTINGS, 0.1)) == 0
 
 
 def test_nan_outputs_are_refused():
     logits = np.full((1, 21, 8, 8), np.nan, np.float32)
     layout = detect_layout(info(out=logits.shape), {}, (64, 64), "f")
     with pytest.raises(SegmentationError, match=r"'out' holds NaN"):
-        decode(layout, [logits], Placement(1, 1, 0, 0, 64, 64), 64, 64, SETTINGS, 0.1)
+        decode(layout, [logits], Placement((64, 64), (64, 64)), SETTINGS, 0.1)
 
 
 def write(tmp_path, *arguments, **options):

@@ -10,7 +10,7 @@ import pytest
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.recorded import LabelNumbers, RecordedSegmenter, record_masks
+from dynslam_bench.segmentation.recorded import RecordedSegmenter, label_image, record_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -52,7 +52,7 @@ def test_a_folder_of_other_masks_is_refused(sequence, tmp_path: Path) -> None:
         record_masks(sequence, tmp_path / "none", SegmentationSettings(source="none"))
 
 
-def test_numbers_stand_for_classes_in_every_frame(tmp_path: Path) -> None:
+def test_numbers_stand_for_classes_in_every_frame() -> None:
     def objects(*names: str) -> Instances:
         masks = np.zeros((len(names), 2, 8), bool)
         for place in range(len(names)):
@@ -60,10 +60,10 @@ def test_numbers_stand_for_classes_in_every_frame(tmp_path: Path) -> None:
         scores = np.linspace(0.9, 0.5, len(names)).astype(np.float32)
         return Instances(masks, np.zeros((len(names), 4), np.float32), names, scores)
 
-    path = tmp_path / "classes.json"
-    first = LabelNumbers(path).label_image(objects("person", "chair", "person"))
-    again = LabelNumbers(path).label_image(objects("chair", "person"))
-    table = {1: "person", 2: "chair", 3: "person"}
+    table: dict[int, str] = {}
+    first = label_image(objects("person", "chair", "person"), table)
+    again = label_image(objects("chair", "person"), table)
+    assert table == {1: "person", 2: "chair", 3: "person"}
     assert [table[int(v)] for v in first[0, :4]] == ["person", "person", "chair", "person"], "the surest is on top"
     assert [table[int(v)] for v in again[0, :3]] == ["chair", "chair", "person"]
     assert len(np.unique(first)) == 4

@@ -10,7 +10,7 @@ import torch
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.boxes import IGNORED, NEGATIVE, match, sample
 from dynslam_bench.segmentation.networks.loading import load_network
-from dynslam_bench.segmentation.networks.roi_heads import crop_masks
+from dynslam_bench.segmentation.networks.network import crop_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
 from dynslam_bench.segmentation.training.labelled_images import (
@@ -140,13 +140,13 @@ def test_matching_and_sampling():
     best = match(boxes, truth, high=0.8, low=0.1, keep_best=True).tolist()
     assert best == [0, IGNORED, NEGATIVE, 1, NEGATIVE]
     assert match(boxes, truth[:0], high=0.7, low=0.3, keep_best=True).tolist() == [NEGATIVE] * 5
-    chosen = sample(
+    positive, negative = sample(
         torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9),
         count=8,
         positive_share=0.25,
         generator=torch.Generator().manual_seed(0),
     )
-    assert len(chosen.positive) == 2 and len(chosen.negative) == 6 and int(chosen.negative.max()) < 54
+    assert len(positive) == 2 and len(negative) == 6 and int(negative.max()) < 54
 
 
 def test_mask_targets_are_the_mask_inside_the_box():
@@ -168,7 +168,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
     data = write_yolo(tmp_path / "data", 4)
     cache = tmp_path / "cache"
     whole = train(settings_for(data), tmp_path / "whole", data_cache=cache)
-    assert whole.stopped == "finished" and whole.best == tmp_path / "whole" / "best.pt"
+    assert whole.best == tmp_path / "whole" / "best.pt"
 
     class Stop(Exception):
         pass
@@ -196,7 +196,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
     assert started.step == 1
 
 
-def test_losses_fall_on_a_simple_task_and_early_stop_ends_it(tmp_path):
+def test_losses_fall_on_a_simple_task(tmp_path):
     data = write_yolo(tmp_path / "data", 4)
     seen = []
     train(
@@ -206,12 +206,6 @@ def test_losses_fall_on_a_simple_task_and_early_stop_ends_it(tmp_path):
         progress=lambda p: seen.append(sum(p.values.values())) if p.stage == "train" else None,
     )
     assert np.mean(seen[-3:]) < 0.75 * np.mean(seen[:3])
-    stopped = train(
-        settings_for(data, iterations=50, evaluate_every=1, patience=1, learning_rate=1e-9, warmup=0),
-        tmp_path / "stop",
-        data_cache=tmp_path / "cache",
-    )
-    assert stopped.stopped == "no gain"
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path):

@@ -40,7 +40,7 @@ def test_cached_runs_have_the_same_bits_and_load_no_network(
     def refuse(*_: object) -> None:
         raise AssertionError("a network was loaded although all masks are stored")
 
-    monkeypatch.setattr("dynslam_bench.segmentation.build_segmenter.build_embedded", refuse)
+    monkeypatch.setattr("dynslam_bench.segmentation.networks.mask_rcnn_segmenter.build_embedded", refuse)
     warm, found = run(sequence, tmp_path, **{"epipolar.threshold_px": 2.0, "segmentation.confidence": 0.35})
     again, _ = run(sequence, tmp_path)
     assert [result.stats["cached_stages"] for result in found] == [2.0] * FRAMES

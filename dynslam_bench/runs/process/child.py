@@ -125,7 +125,7 @@ def _redirect(log: Path) -> None:
             stream.reconfigure(line_buffering=True)
     os.close(handle)
     faulthandler.enable(file=2, all_threads=False)
-    programs = logging.getLogger("dynslam_bench.trackers.adapters.program")
+    programs = logging.getLogger("dynslam_bench.trackers.adapters.subprocess_tracker")
     programs.setLevel(logging.INFO)
     programs.addHandler(logging.StreamHandler(sys.stderr))
 

@@ -6,9 +6,9 @@ paper's section on semantic segmentation; see `CFPN`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Literal
 
-import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 from torch.nn import functional
@@ -103,46 +103,32 @@ def resnet18_config(classes: tuple[str, ...] = ("person",), *, cfpn: bool = True
     return NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, cfpn=cfpn, classes=classes, norm="batch")
 
 
-def normal(weight: Tensor, std: float) -> None:
-    """Initialise weights with a normal distribution; nothing on torch's ``meta`` device.
+def initialise(module: nn.Module, weights: Callable[[Tensor], object]) -> None:
+    """Initialise the weights of all convolutions in a module, and their biases with zero.
 
-    A network whose shapes are only compared with a file lies on the ``meta`` device. Drawing numbers there has no
-    effect, but loads torch's compiler (1.6 s of processor, once a process).
+    Nothing on torch's ``meta`` device, on which a network lies whose shapes are only compared with a file: drawing
+    numbers there has no effect, but loads torch's compiler (1.6 s of processor, once a process).
     """
-    if not weight.is_meta:
-        nn.init.normal_(weight, std=std)
+    for conv in module.modules():
+        if isinstance(conv, nn.Conv2d) and not conv.weight.is_meta:
+            weights(conv.weight)
+            assert conv.bias is not None
+            nn.init.zeros_(conv.bias)
 
 
-def kaiming_normal(weight: Tensor) -> None:
-    """Initialise as He et al. 2015 for a ReLU, by the outputs; nothing on the ``meta`` device, see `normal`."""
-    if not weight.is_meta:
-        nn.init.kaiming_normal_(weight, mode="fan_out", nonlinearity="relu")
-
-
-class FrozenBatchNorm2d(nn.Module):
-    """Batch normalisation with constant statistics and affine parameters (four buffers)."""
-
-    weight: Tensor
-    bias: Tensor
-    running_mean: Tensor
-    running_var: Tensor
+class FrozenBatchNorm2d(nn.BatchNorm2d):
+    """Batch normalisation with constant statistics and affine parameters."""
 
     def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.register_buffer("weight", torch.ones(channels))
-        self.register_buffer("bias", torch.zeros(channels))
-        self.register_buffer("running_mean", torch.zeros(channels))
-        self.register_buffer("running_var", torch.ones(channels))
-        self.eps = 1e-5
+        super().__init__(channels)
+        self.requires_grad_(False)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Scale and shift each channel of ``[B, C, H, W]``."""
-        scale = self.weight * (self.running_var + self.eps).rsqrt()
-        shift = self.bias - self.running_mean * scale
-        return x * scale.reshape(1, -1, 1, 1) + shift.reshape(1, -1, 1, 1)
+    def train(self, mode: bool = True) -> FrozenBatchNorm2d:
+        """Stay in inference mode."""
+        return super().train(False)
 
 
-def _norm(channels: int, config: NetworkConfig) -> nn.Module:
+def _norm(channels: int, config: NetworkConfig) -> nn.BatchNorm2d:
     return nn.BatchNorm2d(channels) if config.norm == "batch" else FrozenBatchNorm2d(channels)
 
 
@@ -150,48 +136,32 @@ def _conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
 
 
-class BasicBlock(nn.Module):
-    """Two 3x3 convolutions around a shortcut."""
+class ResidualBlock(nn.Module):
+    """Convolutions around a shortcut: two of 3x3, or as a bottleneck 1x1, 3x3 (with the stride) and 1x1."""
 
-    expansion = 1
-
-    def __init__(self, inputs: int, width: int, stride: int, config: NetworkConfig) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int, config: NetworkConfig) -> None:
         super().__init__()
-        self.conv1, self.bn1 = _conv(inputs, width, 3, stride), _norm(width, config)
-        self.conv2, self.bn2 = _conv(width, width, 3), _norm(width, config)
-        self.downsample = _shortcut(inputs, width, stride, config)
+        width = outputs // 4 if config.bottleneck else outputs
+        shapes = [(width, 3, stride), (width, 3, 1)]
+        if config.bottleneck:
+            shapes = [(width, 1, 1), (width, 3, stride), (outputs, 1, 1)]
+        self.convolutions, channels = len(shapes), inputs
+        for number, (wanted, kernel, step) in enumerate(shapes, start=1):
+            self.add_module(f"conv{number}", _conv(channels, wanted, kernel, step))
+            self.add_module(f"bn{number}", _norm(wanted, config))
+            channels = wanted
+        self.downsample: nn.Module | None = None
+        if stride > 1 or inputs != outputs:
+            self.downsample = nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config))
 
     def forward(self, x: Tensor) -> Tensor:
-        """``[B, C, H, W]`` to ``[B, width, H / stride, W / stride]``."""
-        y = functional.relu(self.bn1(self.conv1(x)), inplace=True)
-        y = self.bn2(self.conv2(y))
+        """``[B, inputs, H, W]`` to ``[B, outputs, H / stride, W / stride]``."""
+        y = x
+        for number in range(1, self.convolutions + 1):
+            y = self.get_submodule(f"bn{number}")(self.get_submodule(f"conv{number}")(y))
+            if number < self.convolutions:
+                y = functional.relu(y, inplace=True)
         return functional.relu(y + (x if self.downsample is None else self.downsample(x)), inplace=True)
-
-
-class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolution around a shortcut."""
-
-    expansion = 4
-
-    def __init__(self, inputs: int, width: int, stride: int, config: NetworkConfig) -> None:
-        super().__init__()
-        self.conv1, self.bn1 = _conv(inputs, width, 1), _norm(width, config)
-        self.conv2, self.bn2 = _conv(width, width, 3, stride), _norm(width, config)
-        self.conv3, self.bn3 = _conv(width, 4 * width, 1), _norm(4 * width, config)
-        self.downsample = _shortcut(inputs, 4 * width, stride, config)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``[B, C, H, W]`` to ``[B, 4 width, H / stride, W / stride]``."""
-        y = functional.relu(self.bn1(self.conv1(x)), inplace=True)
-        y = functional.relu(self.bn2(self.conv2(y)), inplace=True)
-        y = self.bn3(self.conv3(y))
-        return functional.relu(y + (x if self.downsample is None else self.downsample(x)), inplace=True)
-
-
-def _shortcut(inputs: int, outputs: int, stride: int, config: NetworkConfig) -> nn.Sequential | None:
-    if stride == 1 and inputs == outputs:
-        return None
-    return nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config))
 
 
 class Trunk(nn.Module):
@@ -199,14 +169,12 @@ class Trunk(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        block = Bottleneck if config.bottleneck else BasicBlock
         self.conv1 = nn.Conv2d(3, config.stem, 7, 2, 3, bias=False)
         self.bn1 = _norm(config.stem, config)
         inputs = config.stem
         for stage, (count, outputs) in enumerate(zip(config.blocks, config.stages, strict=True)):
-            width = outputs // block.expansion
-            blocks = [block(inputs, width, 1 if stage == 0 else 2, config)]
-            blocks += [block(outputs, width, 1, config) for _ in range(count - 1)]
+            blocks = [ResidualBlock(inputs, outputs, 1 if stage == 0 else 2, config)]
+            blocks += [ResidualBlock(outputs, outputs, 1, config) for _ in range(count - 1)]
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
             inputs = outputs
 
@@ -228,11 +196,7 @@ class FPN(nn.Module):
         super().__init__()
         self.inner_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(width, channels, 1)) for width in stages)
         self.layer_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1)) for _ in stages)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_uniform_(module.weight, a=1)
-                assert module.bias is not None
-                nn.init.zeros_(module.bias)
+        initialise(self, lambda weight: nn.init.kaiming_uniform_(weight, a=1))
 
     def forward(self, stages: list[Tensor]) -> list[Tensor]:
         """C2..C5 to P2..P6."""
@@ -257,12 +221,8 @@ class CFPN(nn.Module):
         super().__init__()
         self.reduce = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in stages)
         self.smooth = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in stages)
-        for reduce, smooth in zip(self.reduce, self.smooth, strict=True):
-            assert isinstance(reduce, nn.Conv2d) and isinstance(smooth, nn.Conv2d)
-            nn.init.kaiming_uniform_(reduce.weight, a=1)
-            for zero in (reduce.bias, smooth.weight, smooth.bias):
-                assert zero is not None
-                nn.init.zeros_(zero)
+        initialise(self.reduce, lambda weight: nn.init.kaiming_uniform_(weight, a=1))
+        initialise(self.smooth, nn.init.zeros_)
 
     def forward(self, stages: list[Tensor], levels: list[Tensor]) -> list[Tensor]:
         """C2..C5 and P2..P5 (a longer list is cut) to the mask branch's m2..m5."""

@@ -6,7 +6,6 @@ Boxes are x0, y0, x1, y1 in pixels.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -102,14 +101,6 @@ def _size_centre(boxes: Tensor) -> tuple[Tensor, Tensor]:
     return size, boxes[:, :2] + 0.5 * size
 
 
-@dataclass(frozen=True)
-class Sampled:
-    """Indices of the boxes that enter a loss."""
-
-    positive: Tensor
-    negative: Tensor
-
-
 def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: bool) -> Tensor:
     """Index of the object that each box is assigned to, or `NEGATIVE`, or `IGNORED` for overlaps in between.
 
@@ -134,13 +125,20 @@ def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: b
     return result
 
 
-def sample(matched: Tensor, *, count: int, positive_share: float, generator: torch.Generator) -> Sampled:
-    """Draw at most `count` boxes, at most `positive_share` of them positive."""
+def sample(matched: Tensor, *, count: int, positive_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Indices of the positive and of the negative boxes that enter a loss, drawn at random.
+
+    Args:
+        matched: Result of `match`.
+        count: How many boxes at most.
+        positive_share: Largest share of positive ones.
+        generator: Draws.
+    """
     positive = torch.nonzero(matched >= 0)[:, 0]
     negative = torch.nonzero(matched == NEGATIVE)[:, 0]
     positives = min(len(positive), int(count * positive_share))
     negatives = min(len(negative), count - positives)
-    return Sampled(_draw(positive, positives, generator), _draw(negative, negatives, generator))
+    return _draw(positive, positives, generator), _draw(negative, negatives, generator)
 
 
 def _draw(index: Tensor, count: int, generator: torch.Generator) -> Tensor:

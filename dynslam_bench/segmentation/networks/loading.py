@@ -5,6 +5,7 @@ Loading is strict and never unpickles.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import zipfile
@@ -47,13 +48,12 @@ def load_network(path: Path) -> MaskRCNN:
         SegmentationError: The file cannot be read, is truncated, or does not fit: says which keys are missing or
             unknown and which shapes differ.
     """
-    state, config = split(read_checkpoint(path), str(path))
-    state = canonical_names(state)
-    config = config or infer_config(state, str(path))
+    state, config = read_weights(path)
+    config = config or infer_config(state, path)
     with torch.device("meta"):  # compares the shapes before memory is allocated for them
-        _check_fit(MaskRCNN(config), state, str(path))
+        _check_fit(MaskRCNN(config), state, path)
     network = MaskRCNN(config)
-    load_strictly(network, state, str(path))
+    load_strictly(network, state, path)
     return network.eval()
 
 
@@ -87,33 +87,25 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     return content
 
 
-def split(content: Mapping[str, Any], where: str) -> tuple[dict[str, Tensor], NetworkConfig | None]:
-    """Weights and, for a file of this project, the network's shape.
+def read_weights(path: Path) -> tuple[dict[str, Tensor], NetworkConfig | None]:
+    """Weights under today's torchvision names in float32 and, for a file of this project, the network's shape.
 
     Raises:
         SegmentationError: The file holds no weights, or a shape that is not understood.
     """
-    config = None
+    content, config = read_checkpoint(path), None
     if "config" in content and "format" in content:
         if content["format"] != FORMAT:
-            raise SegmentationError(f"{where} has the format {content['format']!r}, this version reads {FORMAT!r}")
-        try:
-            config = NetworkConfig.model_validate_json(str(content["config"]))
-        except ValidationError as error:
-            raise _not_understood(error, where) from error
+            raise SegmentationError(f"{path} has the format {content['format']!r}, this version reads {FORMAT!r}")
+        config = _config(str(content["config"]), path)
     content = next((content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)), content)
     state = {str(key): value for key, value in content.items() if isinstance(value, Tensor)}
     if not state:
-        raise SegmentationError(f"{where} holds no weights; its keys: {_some(map(str, content))}")
+        raise SegmentationError(f"{path} holds no weights; its keys: {_some(map(str, content))}")
     for key, value in state.items():
         if not _is_plain(value):
-            raise SegmentationError(f"{where}: {key[:100]!r} is no plain array of numbers")
-    return state, config
-
-
-def _not_understood(error: ValidationError, where: str) -> SegmentationError:
-    first = error.errors()[0]
-    return SegmentationError(f"{where}: the network's shape is not understood: {first['loc']}: {first['msg']}")
+            raise SegmentationError(f"{path}: {key[:100]!r} is no plain array of numbers")
+    return _renamed(state), config
 
 
 def _is_plain(value: Tensor) -> bool:
@@ -123,7 +115,16 @@ def _is_plain(value: Tensor) -> bool:
     return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
-def canonical_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _config(text: str, path: Path) -> NetworkConfig:
+    try:
+        return NetworkConfig.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        reason = f"{path}: the network's shape is not understood: {first['loc']}: {first['msg']}"
+        raise SegmentationError(reason) from error
+
+
+def _renamed(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Today's torchvision names in float32, without ``num_batches_tracked`` and the prefix of a parallel wrapper."""
     prefix = "module." if all(key.startswith("module.") for key in state) else ""
     result = {}
@@ -139,70 +140,63 @@ def canonical_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return result
 
 
-def infer_config(state: Mapping[str, Tensor], where: str) -> NetworkConfig:
+def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
     """The network's shape, inferred from the weights of a torchvision model.
 
     Raises:
         SegmentationError: Weights that give the shape are missing, or the classes have no names.
     """
-    needed = (
-        "backbone.body.conv1.weight",
-        "roi_heads.box_predictor.cls_score.weight",
-        "backbone.fpn.inner_blocks.0.0.weight",
-        "rpn.head.cls_logits.weight",
-        "roi_heads.mask_head.0.0.weight",
-    )
-    missing = [key for key in needed if key not in state or state[key].dim() not in (2, 4)]
+    needed = {
+        "stem": "backbone.body.conv1.weight",
+        "classes": "roi_heads.box_predictor.cls_score.weight",
+        "channels": "backbone.fpn.inner_blocks.0.0.weight",
+        "ratios": "rpn.head.cls_logits.weight",
+        "mask_channels": "roi_heads.mask_head.0.0.weight",
+    }
+    missing = [key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)]
     if missing:
         raise SegmentationError(
-            f"{where} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
+            f"{path} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
             f"for example {_some(state)})"
         )
-    bottleneck = "backbone.body.layer1.0.conv3.weight" in state
-    blocks = tuple(
-        len({key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{stage}.")})
-        for stage in range(1, 5)
-    )
-    classes = int(state["roi_heads.box_predictor.cls_score.weight"].shape[0]) - 1
-    names = {len(COCO_CLASSES): COCO_CLASSES, 1: ("person",)}.get(classes)
+    rows = {what: int(state[key].shape[0]) for what, key in needed.items()}
+    names = {len(COCO_CLASSES): COCO_CLASSES, 1: ("person",)}.get(rows["classes"] - 1)
     if names is None:
         raise SegmentationError(
-            f"{where} has {classes} classes without names",
+            f"{path} has {rows['classes'] - 1} classes without names",
             "90 (COCO) and 1 (person) are known; others need this project's format",
         )
-    ratios = int(state["rpn.head.cls_logits.weight"].shape[0])
-    if ratios != 3:
-        raise SegmentationError(f"{where} has {ratios} anchors a cell, torchvision's models have 3")
-    try:
-        return NetworkConfig(
-            blocks=blocks,
-            bottleneck=bottleneck,
-            stem=int(state["backbone.body.conv1.weight"].shape[0]),
-            channels=int(state["backbone.fpn.inner_blocks.0.0.weight"].shape[0]),
-            classes=names,
-            box_hidden=int(state["roi_heads.box_predictor.cls_score.weight"].shape[1]),
-            mask_channels=int(state["roi_heads.mask_head.0.0.weight"].shape[0]),
-            mask_layers=len({k.split(".")[2] for k in state if k.startswith("roi_heads.mask_head.")}),
-            cfpn=True,
-        )
-    except ValidationError as error:
-        raise _not_understood(error, where) from error
+    if rows["ratios"] != 3:
+        raise SegmentationError(f"{path} has {rows['ratios']} anchors a cell, torchvision's models have 3")
+    stages = [[key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{n}.")] for n in range(1, 5)]
+    shape = {
+        "blocks": [len(set(blocks)) for blocks in stages],
+        "bottleneck": "backbone.body.layer1.0.conv3.weight" in state,
+        "stem": rows["stem"],
+        "channels": rows["channels"],
+        "classes": names,
+        "box_hidden": int(state[needed["classes"]].shape[1]),
+        "mask_channels": rows["mask_channels"],
+        "mask_layers": len({key.split(".")[2] for key in state if key.startswith("roi_heads.mask_head.")}),
+        "cfpn": True,
+    }
+    return _config(json.dumps(shape), path)
 
 
-def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> None:
+def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:
     """Copy weights into a network; only the whole CFPN may be missing, and then it adds nothing.
 
     Raises:
         SegmentationError: Keys are missing or unknown, shapes differ, or a weight is not finite.
     """
-    _check_fit(network, state, where)
+    _check_fit(network, state, path)
     for key, value in state.items():
         if value.is_floating_point() and not math.isfinite(float(value.abs().sum())):
-            raise SegmentationError(f"{where}: {key} holds NaN or infinite values")
+            raise SegmentationError(f"{path}: {key} holds NaN or infinite values")
     network.load_state_dict(dict(state), strict=False)
 
 
-def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> None:
+def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:
     own = _weights(network)
     has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
@@ -215,7 +209,7 @@ def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], where: str) -> No
     checks = (("keys are missing", missing), ("keys are unknown", unknown), ("shapes differ", shapes))
     faults = [f"{len(keys)} {what} ({_some(keys)})" for what, keys in checks if keys]
     if faults:
-        raise SegmentationError(f"{where} does not fit the network: " + "; ".join(faults))
+        raise SegmentationError(f"{path} does not fit the network: " + "; ".join(faults))
 
 
 def _weights(network: MaskRCNN) -> dict[str, Tensor]:
@@ -224,9 +218,10 @@ def _weights(network: MaskRCNN) -> dict[str, Tensor]:
 
 def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
     """Write a network with its shape; `half` stores float16."""
-    state = {key: value.detach().cpu() for key, value in _weights(network).items()}
-    if half:
-        state = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
+    state = {
+        key: value.detach().cpu().half() if half and value.is_floating_point() else value.detach().cpu()
+        for key, value in _weights(network).items()
+    }
     content = {"format": FORMAT, "config": network.config.model_dump_json(), "model": state}
     with (
         replacing(path) as temporary,

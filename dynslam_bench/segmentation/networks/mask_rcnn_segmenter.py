@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.segmenter import Instances, SegmenterContext
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.postprocess import pick
@@ -44,36 +45,13 @@ class MaskRCNNSegmenter:
         self.network = network.eval().fuse().to(device)
         self.settings, self.device, self.threads, self.floor = settings, device, threads, floor
 
-    @classmethod
-    def from_file(
-        cls, path: Path, settings: SegmentationSettings, *, device: str = "cpu", threads: int = 1, floor: float = 0.1
-    ) -> MaskRCNNSegmenter:
-        """The segmenter of a checkpoint file; a COCO checkpoint works at `settings.network_side` pixels.
-
-        Raises:
-            SegmentationError: The file does not fit, the device is missing, or the network knows none of the classes.
-        """
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise SegmentationError(f"device '{device}' is not available: torch {torch.__version__} sees no GPU")
-        network = load_network(path)
-        classes = set(network.config.classes)
-        if not classes & settings.class_names():
-            raise SegmentationError(
-                f"{path} knows none of the classes {', '.join(sorted(settings.class_names()))}",
-                "it knows " + ", ".join(sorted(filter(None, classes))),
-            )
-        if settings.network_side > 0:
-            network.set_input(settings.network_side)
-        return cls(network, settings, device=device, threads=threads, floor=floor)
-
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame; none is an empty result."""
         height, width = frame.rgb.shape[:2]
         with torch_threads(self.threads):
             image = torch.from_numpy(np.ascontiguousarray(frame.rgb)).to(self.device).permute(2, 0, 1).float() / 255
             detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
-            boxes, scores = detections.boxes.cpu().numpy(), detections.scores.cpu().numpy()
-            labels, planes = detections.labels.cpu().numpy(), detections.masks.cpu().numpy()
+            boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
         config, wanted = self.network.config, self.settings.class_names()
         names = [config.classes[label - 1] for label in labels]
         masks = np.zeros((len(names), height, width), bool)
@@ -83,6 +61,41 @@ class MaskRCNNSegmenter:
             )
         instances = Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32))
         return pick(instances, np.asarray(masks.any(axis=(1, 2))))
+
+
+def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
+    """The small network in this package, at the input size that it was trained with."""
+    return load_segmenter(require_embedded_weights(), settings.model_copy(update={"network_side": 0}), context)
+
+
+def build_coco(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
+    """Torchvision's COCO checkpoint, downloaded on first use."""
+    return load_segmenter(fetch_checkpoint(COCO), settings, context)
+
+
+def build_weights(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
+    """A Mask R-CNN checkpoint of the user's."""
+    return load_segmenter(Path(context.argument), settings, context)
+
+
+def load_segmenter(path: Path, settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
+    """The segmenter of a checkpoint file; it works at `settings.network_side` pixels.
+
+    Raises:
+        SegmentationError: The file does not fit, the device is missing, or the network knows none of the classes.
+    """
+    if context.device.startswith("cuda") and not torch.cuda.is_available():
+        raise SegmentationError(f"device '{context.device}' is not available: torch {torch.__version__} sees no GPU")
+    network = load_network(path)
+    classes = set(network.config.classes)
+    if not classes & settings.class_names():
+        raise SegmentationError(
+            f"{path} knows none of the classes {', '.join(sorted(settings.class_names()))}",
+            "it knows " + ", ".join(sorted(filter(None, classes))),
+        )
+    if settings.network_side > 0:
+        network.set_input(settings.network_side)
+    return MaskRCNNSegmenter(network, settings, device=context.device, threads=context.threads, floor=context.floor)
 
 
 def paste(

@@ -9,7 +9,7 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,11 +21,16 @@ from dynslam_bench.core.version import install_hint
 from dynslam_bench.segmentation.networks.boxes import BOX_WEIGHTS, RPN_WEIGHTS, clip, decode
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network
-from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.networks.roi_heads import BOX_POOL, MIN_BOX_PX, level_scale, levels_of
-from dynslam_bench.segmentation.networks.rpn import MIN_BOX_PX as MIN_PROPOSAL_PX
-from dynslam_bench.segmentation.networks.rpn import anchors_of
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.networks.network import (
+    BOX_POOL,
+    MIN_BOX_PX,
+    MIN_PROPOSAL_PX,
+    MaskRCNN,
+    anchors_of,
+    level_scale,
+    levels_of,
+)
+from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
 
 OPSET = 18
 SIZE = (480, 640)
@@ -33,7 +38,6 @@ SIZE = (480, 640)
 FLOOR = 0.1
 SMALLEST, LARGEST = 32, 4096
 """Sides of an image in pixels."""
-OUTPUTS = ("boxes", "labels", "scores", "masks")
 ROUNDS = 24
 """Rounds of suppression: the longest chain of boxes that suppress each other."""
 CANDIDATES = 400
@@ -62,7 +66,7 @@ class ExportedNetwork:
 
 
 def export_network(
-    weights: Path, path: Path, *, size: tuple[int, int] = SIZE, side: int = 0, score: float = FLOOR, iou: float = 0.5
+    source: str, path: Path, *, size: tuple[int, int] = SIZE, side: int | None = None
 ) -> ExportedNetwork:
     """Write a Mask R-CNN checkpoint as an ONNX file that ``onnx:PATH`` takes.
 
@@ -70,49 +74,31 @@ def export_network(
     scores, masks in the whole image) with as many rows as the network finds objects at most, unused ones of score 0.
 
     Args:
-        weights: The checkpoint.
+        source: ``embedded``, ``coco`` (fetched if need be) or ``weights:PATH``.
         path: The file to write.
         size: Height and width of the images; others are fitted in when it is used.
-        side: Shorter side in pixels at which the network works; 0 for its own.
-        score: Least score of an object.
-        iou: Overlap of two boxes of one class above which the weaker one is dropped.
+        side: Shorter side in pixels at which the network works; 0 for its own, None for that of a run.
 
     Raises:
-        SegmentationError: The checkpoint cannot be read, `onnx` or `onnxscript` is missing, or torch cannot export it.
+        SegmentationError: There is no such checkpoint, it cannot be fetched or read, `onnx` or `onnxscript` is missing,
+            or torch cannot export it.
         OSError: The file cannot be written.
-    """
-    network = load_network(weights).eval()
-    if side > 0:
-        network.set_input(side)
-    return write_onnx(network.fuse(), path, size=size, score=score, iou=iou)
-
-
-class Weights(NamedTuple):
-    """A checkpoint and the shorter side at which it works, 0 for its own."""
-
-    path: Path
-    side: int
-
-
-def weights_of(source: str, side: int | None = None) -> Weights:
-    """The checkpoint behind a source of masks, fetched if need be.
-
-    Args:
-        source: ``embedded``, ``coco`` or ``weights:PATH``.
-        side: Shorter side in pixels; None for that of a run.
-
-    Raises:
-        SegmentationError: There is no such checkpoint, or it cannot be fetched.
     """
     kind, _, argument = source.partition(":")
     if source == "embedded":
-        return Weights(require_embedded_weights(), side or 0)
-    side = SegmentationSettings().network_side if side is None else side
-    if source == "coco":
-        return Weights(fetch_checkpoint(COCO), side)
-    if kind == "weights" and argument:
-        return Weights(Path(argument).expanduser(), side)
-    raise SegmentationError(f"'{source}' is no network of this project", "export embedded, coco or weights:PATH")
+        weights = require_embedded_weights()
+    elif source == "coco":
+        weights = fetch_checkpoint(COCO)
+    elif kind == "weights" and argument:
+        weights = Path(argument).expanduser()
+    else:
+        raise SegmentationError(f"'{source}' is no network of this project", "export embedded, coco or weights:PATH")
+    if side is None:
+        side = 0 if source == "embedded" else SegmentationSettings().network_side
+    network = load_network(weights)
+    if side > 0:
+        network.set_input(side)
+    return write_onnx(network.fuse(), path, size=size)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -130,9 +116,7 @@ def parse_size(text: str) -> tuple[int, int]:
     return height, width
 
 
-def write_onnx(
-    network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE, score: float = FLOOR, iou: float = 0.5
-) -> ExportedNetwork:
+def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -> ExportedNetwork:
     """`export_network` of a network in memory.
 
     Raises:
@@ -140,38 +124,36 @@ def write_onnx(
         OSError: The file cannot be written.
     """
     onnx = _library()
-    static = StaticMaskRCNN(network, *size, score=score, iou=iou).eval()
+    static = StaticMaskRCNN(network, *size, score=FLOOR, iou=NMS_IOU).eval()
+    image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0))
     classes = {number: name for number, name in enumerate(network.config.classes, start=1) if name}
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with replacing(path) as temporary:
-        _export(static, torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0)), temporary)
+        try:
+            with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(StringIO()):
+                warnings.simplefilter("ignore")
+                torch.onnx.export(
+                    static,
+                    (image,),
+                    str(temporary),
+                    dynamo=True,
+                    external_data=False,
+                    opset_version=OPSET,
+                    input_names=["image"],
+                    output_names=["boxes", "labels", "scores", "masks"],
+                    verbose=False,
+                )
+        except (torch.onnx.errors.OnnxExporterError, TypeError) as error:  # TypeError: options of a newer torch
+            reason = " ".join(str(error).split())[:200]
+            raise SegmentationError(
+                f"torch {torch.__version__} cannot export the network: {reason}", "torch >= 2.6"
+            ) from error
         model = onnx.load(str(temporary))
         onnx.helper.set_model_props(model, {"names": repr(classes), "producer": "dynslam-bench"})
         onnx.checker.check_model(model)
         onnx.save(model, str(temporary))
         megabytes = temporary.stat().st_size / 1e6
     return ExportedNetwork(path, size, classes, megabytes)
-
-
-def _export(static: StaticMaskRCNN, image: torch.Tensor, path: Path) -> None:
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    try:
-        with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(StringIO()):
-            warnings.simplefilter("ignore")
-            torch.onnx.export(
-                static,
-                (image,),
-                str(path),
-                dynamo=True,
-                external_data=False,
-                opset_version=OPSET,
-                input_names=["image"],
-                output_names=list(OUTPUTS),
-                verbose=False,
-            )
-    except (torch.onnx.errors.OnnxExporterError, TypeError) as error:  # TypeError: options of a newer torch
-        raise SegmentationError(
-            f"torch {torch.__version__} cannot export the network: {' '.join(str(error).split())[:200]}", "torch >= 2.6"
-        ) from error
 
 
 def _library() -> Any:
@@ -226,15 +208,13 @@ class StaticMaskRCNN(nn.Module):
         logits = heads.mask_predictor(heads.mask_head(pooled))
         chosen = labels[:, None, None, None].expand(-1, 1, *logits.shape[2:])
         planes = torch.gather(logits, 1, chosen)[:, 0].sigmoid()
-        back = boxes.new_tensor([self.width / self.size[1], self.height / self.size[0]]).repeat(2)
-        boxes = boxes * back
+        boxes = boxes * boxes.new_tensor([self.width / self.size[1], self.height / self.size[0]]).repeat(2)
         return boxes, labels, scores, self._pasted(planes, boxes)[:, None]
 
     def _proposals(self, levels: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Boxes ``[post_nms, 4]`` that may hold an object, and whether each is one, 0 or 1."""
-        config, logits_codes = self.network.config, self.network.rpn.head(levels)
-        boxes, scores = [], []
-        for level, (logits, codes) in enumerate(zip(*logits_codes, strict=True)):
+        config, boxes, scores = self.network.config, [], []
+        for level, (logits, codes) in enumerate(zip(*self.network.rpn.head(levels), strict=True)):
             anchors: Tensor = getattr(self, f"anchors{level}")
             best, chosen = logits[0].topk(min(config.pre_nms, len(anchors)))
             codes, anchors = codes[0].index_select(0, chosen), anchors.index_select(0, chosen)

@@ -48,25 +48,18 @@ def read_header(path: Path) -> OnnxHeader:
             f"cannot read the network {path}: {error.strerror}", "give the path of an .onnx file"
         ) from error
     try:
-        header = _decode(memoryview(data))
-        if not header.inputs or not header.outputs:
-            raise ValueError(f"it declares {len(header.inputs)} inputs and {len(header.outputs)} outputs")
+        graph = _first(memoryview(data), 7)
+        initialised = {_text(tensor, 8) for tensor in _messages(graph, 5)}
+        inputs = tuple(_tensor(value) for value in _messages(graph, 11) if _text(value, 1) not in initialised)
+        outputs = tuple(_tensor(value) for value in _messages(graph, 12))
+        metadata = {_text(entry, 1): _text(entry, 2) for entry in _messages(memoryview(data), 14)}
+        if not inputs or not outputs:
+            raise ValueError(f"it declares {len(inputs)} inputs and {len(outputs)} outputs")
     except (ValueError, IndexError) as error:
         raise SegmentationError(
             f"{path} is not an ONNX model ({len(data)} bytes): {error}", "the file is truncated or of another format"
         ) from error
-    return header
-
-
-def _decode(data: memoryview) -> OnnxHeader:
-    graph = _first(data, 7)
-    initialised = {_text(tensor, 8) for tensor in _messages(graph, 5)}
-    inputs = [_tensor(value) for value in _messages(graph, 11)]
-    return OnnxHeader(
-        tuple(tensor for tensor in inputs if tensor.name not in initialised),
-        tuple(_tensor(value) for value in _messages(graph, 12)),
-        {_text(entry, 1): _text(entry, 2) for entry in _messages(data, 14)},
-    )
+    return OnnxHeader(inputs, outputs, metadata)
 
 
 def _tensor(data: memoryview) -> TensorInfo:
@@ -102,12 +95,11 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
             value, position = _varint(data, position)
             yield key >> 3, value
             continue
+        if kind not in (1, 2, 5):
+            raise ValueError(f"unknown wire type {kind}")
+        size = 8 if kind == 1 else 4
         if kind == 2:
             size, position = _varint(data, position)
-        elif kind in (1, 5):
-            size = 8 if kind == 1 else 4
-        else:
-            raise ValueError(f"unknown wire type {kind}")
         if position + size > len(data):
             raise ValueError(f"a field of {size} bytes ends beyond the file")
         yield key >> 3, data[position : position + size]

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
@@ -19,124 +17,88 @@ from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.segmentation.training.labelled_images import LabelledImage, LabelledImages, open_labelled
+from dynslam_bench.segmentation.training.labelled_images import LabelledImages, open_labelled
 
 THRESHOLDS: tuple[float, ...] = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
 RECALL_POINTS = np.linspace(0, 1, 101)
 
 
-@dataclass
-class _ClassTally:
-    counts: MaskCounts = field(default_factory=MaskCounts)
-    truths: int = 0
-    scores: list[float] = field(default_factory=list)
-    hits: list[NDArray[np.bool_]] = field(default_factory=list)
-    ignored: list[NDArray[np.bool_]] = field(default_factory=list)
-    best: list[float] = field(default_factory=list)
-    frames: list[float] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class ClassQuality:
-    """Mask quality of one class over a set of images.
-
-    Attributes:
-        truths: Objects that are there.
-        detections: Objects that were found.
-        ap: Mean over IoU thresholds 0.50, 0.55 ... 0.95 of the average precision (COCO's 101 recall points).
-        ap50: Average precision at IoU 0.5.
-        iou: Intersection over union of the class's pixels, added up over all images.
-        frame_iou: Mean over the images in which the class is there or was found of their IoU.
-        instance_iou: Mean over the objects of the IoU of the detection that fits best (0 if there is none).
-        recall: Share of the objects that a detection covers with IoU >= 0.5.
-    """
-
-    truths: int
-    detections: int
-    ap: float
-    ap50: float
-    iou: float
-    frame_iou: float
-    instance_iou: float
-    recall: float
-
-
-@dataclass(frozen=True)
-class MaskQuality:
-    """Mask quality over a set of images, and by class."""
-
-    images: int
-    classes: dict[str, ClassQuality]
-
-    @property
-    def mean_ap(self) -> float:
-        """Mean over the classes that occur."""
-        return self._mean("ap")
-
-    @property
-    def mean_iou(self) -> float:
-        """Mean over the classes that occur."""
-        return self._mean("iou")
-
-    def _mean(self, name: str) -> float:
-        values = [getattr(quality, name) for quality in self.classes.values() if quality.truths]
-        return float(np.mean(values)) if values else float("nan")
-
-
 class MaskTally:
-    """Mask quality, gathered image by image.
+    """Mask quality of one class, gathered image by image.
 
     Args:
-        classes: The classes to measure.
         confidence: Least score of detections that count for IoU and recall; AP takes them all.
         min_area: Objects with fewer pixels are ignored, and detections of them are no errors.
     """
 
-    def __init__(self, classes: Collection[str], *, confidence: float = 0.5, min_area: int = 0) -> None:
-        self.confidence = confidence
-        self.min_area = min_area
-        self._tallies = {name: _ClassTally() for name in sorted(classes)}
-        self._images = 0
+    def __init__(self, confidence: float = 0.5, min_area: int = 0) -> None:
+        self.confidence, self.min_area = confidence, min_area
+        self.truths = 0
+        self._counts = MaskCounts()
+        self._frame_ious: list[float] = []
+        self._object_ious: list[float] = []
+        self._scores: list[float] = []
+        self._hits: list[NDArray[np.bool_]] = []
+        self._ignored: list[NDArray[np.bool_]] = []
 
-    def add(self, truth: LabelledImage, detections: Instances) -> None:
-        """Compare the detections in an image with its labels.
+    def add(self, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]) -> None:
+        """Compare the detections in an image with its labels: masks ``[M, H, W]``, ``[N, H, W]`` and scores ``[N]``.
 
         Raises:
             SegmentationError: The masks differ in size.
         """
-        if truth.masks.shape[1:] != detections.masks.shape[1:]:
-            raise SegmentationError(
-                f"masks of {detections.masks.shape[1:]} cannot be compared with {truth.masks.shape[1:]}"
-            )
-        self._images += 1
-        for name, tally in self._tallies.items():
-            true = truth.masks[[kind == name for kind in truth.class_names]]
-            guess = detections.of_classes([name])
-            self._add_class(tally, true, guess.masks, guess.scores)
-
-    def _add_class(
-        self, tally: _ClassTally, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]
-    ) -> None:
+        if true.shape[1:] != guess.shape[1:]:
+            raise SegmentationError(f"masks of {guess.shape[1:]} cannot be compared with {true.shape[1:]}")
         order = np.argsort(-scores, kind="stable")
         guess, scores = guess[order], scores[order]
         overlap = mask_iou(guess, true)
-        large = np.count_nonzero(true, axis=(1, 2)) >= max(self.min_area, 1) if len(true) else np.zeros(0, bool)
+        large = np.count_nonzero(true, axis=(1, 2)) >= max(self.min_area, 1)
         sure = scores >= self.confidence
         if len(true) or sure.any():
             counts = compare_masks(np.asarray(guess[sure].any(axis=0)), np.asarray(true.any(axis=0)))
-            tally.counts = tally.counts + counts
+            self._counts = self._counts + counts
             if counts.iou is not None:
-                tally.frames.append(counts.iou)
-        tally.truths += int(large.sum())
-        tally.best.extend(overlap[sure][:, large].max(axis=0, initial=0.0).tolist())
-        hit, ignored = assign(overlap, large, np.count_nonzero(guess, axis=(1, 2)) < self.min_area)
-        tally.scores.extend(scores.tolist())
-        tally.hits.extend(hit)
-        tally.ignored.extend(ignored)
+                self._frame_ious.append(counts.iou)
+        self.truths += int(large.sum())
+        self._object_ious.extend(overlap[sure][:, large].max(axis=0, initial=0.0).tolist())
+        hits, ignored = assign(overlap, large, np.count_nonzero(guess, axis=(1, 2)) < self.min_area)
+        self._scores.extend(scores.tolist())
+        self._hits.extend(hits)
+        self._ignored.extend(ignored)
 
-    def quality(self) -> MaskQuality:
-        """The quality over the images so far."""
-        return MaskQuality(self._images, {name: _summary(tally) for name, tally in self._tallies.items()})
+    def quality(self) -> dict[str, float | None]:
+        """The quality over the images so far; None where there is nothing to measure.
+
+        Returns:
+            ``truths`` and ``detections``: objects that are there, and that were found. ``ap``: mean over IoU thresholds
+            0.50, 0.55 ... 0.95 of the average precision (COCO's 101 recall points). ``ap50``: average precision at IoU
+            0.5. ``iou``: intersection over union of the class's pixels, added up over all images. ``frame_iou``: mean
+            over the images in which the class is there or was found of their IoU. ``instance_iou``: mean over the
+            objects of the IoU of the detection that fits best (0 if there is none). ``recall``: share of the objects
+            that a detection covers with IoU >= 0.5.
+        """
+        scores, best = np.array(self._scores), np.array(self._object_ious)
+        hits, ignored = (np.array(rows, bool).reshape(-1, len(THRESHOLDS)) for rows in (self._hits, self._ignored))
+        precisions = [
+            average_precision(scores[~ignored[:, k]], hits[~ignored[:, k], k], self.truths)
+            for k in range(len(THRESHOLDS))
+        ]
+        return {
+            "truths": float(self.truths),
+            "detections": float(len(scores)),
+            "ap": mean(precisions),
+            "ap50": mean(precisions[:1]),
+            "iou": self._counts.iou,
+            "frame_iou": mean(self._frame_ious),
+            "instance_iou": mean(self._object_ious),
+            "recall": mean((best >= 0.5).tolist()),
+        }
+
+
+def mean(values: Sequence[float | None]) -> float | None:
+    """The mean of the values; None without any, or if one is missing or NaN."""
+    result = float(np.mean(np.array(values, np.float64))) if values else float("nan")
+    return result if np.isfinite(result) else None
 
 
 def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -193,22 +155,6 @@ def average_precision(scores: NDArray[np.float64], hits: NDArray[np.bool_], trut
     return float(np.append(precision, 0.0)[np.minimum(at, len(precision))].mean())
 
 
-def _summary(tally: _ClassTally) -> ClassQuality:
-    scores = np.array(tally.scores)
-    hits = np.array(tally.hits, dtype=bool).reshape(-1, len(THRESHOLDS))
-    ignored = np.array(tally.ignored, dtype=bool).reshape(-1, len(THRESHOLDS))
-    precisions = [
-        average_precision(scores[~ignored[:, k]], hits[~ignored[:, k], k], tally.truths) for k in range(len(THRESHOLDS))
-    ]
-    best = np.array(tally.best)
-    iou = tally.counts.iou
-    return ClassQuality(
-        tally.truths, len(scores), float(np.mean(precisions)), precisions[0],
-        float("nan") if iou is None else iou, float(np.mean(tally.frames)) if tally.frames else float("nan"),
-        float(best.mean()) if best.size else float("nan"), float((best >= 0.5).mean()) if best.size else float("nan"),
-    )  # fmt: skip
-
-
 class SegmenterScore(Record):
     """The result of `evaluate_segmenter`.
 
@@ -221,7 +167,7 @@ class SegmenterScore(Record):
         min_area: Smaller objects are left out.
         mean_ap: Mask AP (IoU 0.50 to 0.95), mean over the classes that occur.
         mean_iou: Pixel IoU, mean over the classes that occur.
-        classes: By class: truths, detections, ap, ap50, iou, frame_iou, instance_iou, recall (see `ClassQuality`).
+        classes: By class: truths, detections, ap, ap50, iou, frame_iou, instance_iou, recall (see `MaskTally.quality`).
         median_ms: Median time of one image.
         threads: Threads the network could use.
     """
@@ -275,7 +221,7 @@ def evaluate_segmenter(
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
     count = len(images) if limit is None else min(limit, len(images))
     chosen = np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))
-    tally = MaskTally(settings.class_names(), confidence=settings.confidence, min_area=min_area)
+    tallies = {name: MaskTally(settings.confidence, min_area) for name in sorted(settings.class_names())}
     times = []
     for done, index in enumerate(chosen.tolist(), 1):
         image = images[index]
@@ -283,25 +229,20 @@ def evaluate_segmenter(
         start = time.perf_counter()
         detections = segmenter.segment(frame)
         times.append(time.perf_counter() - start)
-        tally.add(image, detections)
+        for name, tally in tallies.items():
+            found = detections.of_classes([name])
+            tally.add(image.masks[[kind == name for kind in image.class_names]], found.masks, found.scores)
         if progress is not None:
             progress(done, len(chosen))
-    quality = tally.quality()
-    classes = {
-        name: {key: _finite(value) for key, value in asdict(scores).items()}
-        for name, scores in quality.classes.items()
-        if scores.truths or scores.detections
-    }
+    qualities = {name: tally.quality() for name, tally in tallies.items()}
+    there = [quality for quality in qualities.values() if quality["truths"]]
     score = SegmenterScore(
         segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
-        data=images.name, images=quality.images, confidence=settings.confidence, min_area=min_area,
-        mean_ap=_finite(quality.mean_ap), mean_iou=_finite(quality.mean_iou), classes=classes,
+        data=images.name, images=len(chosen), confidence=settings.confidence, min_area=min_area,
+        mean_ap=mean([quality["ap"] for quality in there]), mean_iou=mean([quality["iou"] for quality in there]),
+        classes={name: quality for name, quality in qualities.items() if quality["truths"] or quality["detections"]},
         median_ms=1000 * float(np.median(times)) if times else float("nan"), threads=threads,
     )  # fmt: skip
     if output is not None:
         write_atomic(output, score.to_json())
     return score
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

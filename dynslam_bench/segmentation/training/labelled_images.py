@@ -133,8 +133,7 @@ class YoloImages:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.expanduser()
-        self.name = f"yolo:{self.folder.name}"
-        root = self.folder / "images"
+        self.name, root = f"yolo:{self.folder.name}", self.folder / "images"
         self._images = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
         if not self._images:
             raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
@@ -157,14 +156,13 @@ class YoloImages:
                 continue
             try:
                 kind, *points = line.split()
-                name = dict(enumerate(COCO_NAMES))[int(kind)]
+                names.append(dict(enumerate(COCO_NAMES))[int(kind)])
                 polygon = _polygon(points) * [rgb.shape[1], rgb.shape[0]]
             except (ValueError, LookupError, OverflowError) as error:
                 raise SegmentationError(
                     f"{label} line {number} is no polygon label: {error}", "expected class x1 y1 x2 y2 ..."
                 ) from error
             masks.append(_fill([polygon], rgb.shape[:2]))
-            names.append(name)
         return _labelled(rgb, masks, names)
 
 
@@ -173,8 +171,7 @@ def _files_digest(paths: list[Path]) -> str:
 
 
 def _read(path: Path) -> NDArray[np.uint8]:
-    image = read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)
-    return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+    return np.ascontiguousarray(read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)[:, :, ::-1], np.uint8)
 
 
 def _labelled(rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: list[str]) -> LabelledImage:
@@ -210,25 +207,22 @@ def _polygon(points: Any) -> NDArray[np.float64]:
 
 
 def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:
+    """A mask from polygons, or from run lengths column by column, which must fill the image exactly."""
     try:
         if isinstance(segmentation, list):
             return _fill([_polygon(points) for points in segmentation], shape)
-        if isinstance(segmentation, dict) and "counts" in segmentation and "size" in segmentation:
-            return _from_runs(segmentation["counts"], segmentation["size"], shape)
+        counts = segmentation["counts"]
+        runs = decode_runs(counts) if isinstance(counts, str) else [int(count) for count in counts]
+        height, width = (int(value) for value in segmentation["size"])
+        total = sum(runs)
+        if (height, width) != tuple(shape) or total != height * width or min(runs) < 0:
+            raise ValueError(f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}")
+        flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+        return np.ascontiguousarray(flat.reshape(width, height).T)
     except (ValueError, TypeError, LookupError, OverflowError) as error:
-        raise SegmentationError(f"{where}: a segmentation is damaged: {str(error)[:200]}") from error
-    raise SegmentationError(f"{where}: a segmentation is neither polygons nor run lengths")
-
-
-def _from_runs(counts: Any, size: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The mask of run lengths, column by column; raises ValueError where they do not fill the image exactly."""
-    runs = decode_runs(counts) if isinstance(counts, str) else [int(count) for count in counts]
-    height, width = (int(value) for value in size)
-    total = sum(runs)
-    if (height, width) != tuple(shape) or total != height * width or min(runs) < 0:
-        raise ValueError(f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}")
-    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-    return np.ascontiguousarray(flat.reshape(width, height).T)
+        raise SegmentationError(
+            f"{where}: a segmentation is damaged: {str(error)[:200]}", "COCO's are polygons or run lengths"
+        ) from error
 
 
 def decode_runs(text: str) -> list[int]:
@@ -238,21 +232,21 @@ def decode_runs(text: str) -> list[int]:
         ValueError: The text ends within a number, or a number is longer than any image.
     """
     runs: list[int] = []
-    position = 0
-    while position < len(text):
-        value = shift = 0
-        while True:
-            if position == len(text) or shift > 60:
-                raise ValueError(f"the run lengths are damaged at character {position} of {len(text)}")
-            digit = ord(text[position]) - 48
-            position += 1
-            value |= (digit & 0x1F) << shift
-            shift += 5
-            if not digit & 0x20:
-                if digit & 0x10:
-                    value |= -1 << shift
-                break
+    value = shift = 0
+    for position, character in enumerate(text):
+        digit = ord(character) - 48
+        value |= (digit & 0x1F) << shift
+        shift += 5
+        if digit & 0x20 and shift <= 60:  # another digit follows
+            continue
+        if digit & 0x20:
+            raise ValueError(f"the run lengths are damaged at character {position} of {len(text)}")
+        if digit & 0x10:
+            value |= -1 << shift
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    if shift:
+        raise ValueError(f"the run lengths are damaged: their {len(text)} characters end within a number")
     return runs
 
 
@@ -373,13 +367,13 @@ def open_labelled(text: str) -> LabelledImages:
         SegmentationError: Another form, or the set does not exist.
     """
     kind, _, rest = text.partition(":")
+    path, _, images = rest.partition(":")
     if kind == "synthetic":
         return RenderedFrames(rest)
     if kind == "sequence" and rest:
         return SequenceFrames(rest)
     if kind == "coco" and rest:
-        annotations, _, images = rest.partition(":")
-        return CocoImages(Path(annotations), Path(images) if images else None)
+        return CocoImages(Path(path), Path(images) if images else None)
     if kind == "yolo" and rest:
         return YoloImages(Path(rest))
     hint = did_you_mean(kind, ["synthetic", "sequence", "coco", "yolo"])

@@ -35,7 +35,6 @@ class TrainSettings(Settings):
     average: float = Field(0.998, ge=0, lt=1, description="decay of the averaged weights that are evaluated and kept")
     precision: Literal["float32", "bfloat16"] = Field("float32", description="of the convolutions")
     evaluate_every: int = Field(500, ge=1, description="steps between evaluations on the validation set")
-    patience: int = Field(0, ge=0, description="stop after so many evaluations without gain; 0 = never")
     checkpoint_every: int = Field(100, ge=1, description="steps between resumable checkpoints")
     seed: int = Field(0, ge=0, description="of weights, order and augmentation")
 
@@ -65,10 +64,8 @@ class TrainResult:
         best: The averaged weights with the best validation score, in this project's checkpoint format.
         step: Step at which they were reached.
         iou: Their mean IoU over the objects of the validation set.
-        stopped: Why the run ended: ``finished`` or ``no gain``.
     """
 
     best: Path
     step: int
     iou: float
-    stopped: str

@@ -19,21 +19,13 @@ from dynslam_bench.core.files import replacing, write_atomic
 from dynslam_bench.core.reading import read_json
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig, embedded_config, resnet18_config
-from dynslam_bench.segmentation.networks.loading import (
-    canonical_names,
-    load_strictly,
-    read_checkpoint,
-    save_network,
-    split,
-)
+from dynslam_bench.segmentation.networks.loading import load_strictly, read_checkpoint, read_weights, save_network
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import paste, torch_threads
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.settings import COCO_NAMES, PRESETS
 from dynslam_bench.segmentation.training.labelled_images import open_labelled
 from dynslam_bench.segmentation.training.prepared import Example, PreparedImages, batch_of, prepare
 from dynslam_bench.segmentation.training.settings import TrainProgress, TrainResult, TrainSettings
-
-__all__ = ["TrainProgress", "TrainResult", "input_size", "network_config", "train"]
 
 LOSSES = ("objectness", "anchor", "class", "box", "mask")
 SCORES = ("iou", "pixel_iou", "recall")
@@ -71,11 +63,20 @@ def train(
     """
     report = progress or (lambda _: None)
     config = network_config(settings)
+    height, width = config.min_side, round(config.min_side * 4 / 3)  # as the frames of most sequences
     output.mkdir(parents=True, exist_ok=True)
     if resume:
         _check_settings(settings, output / "settings.json")
     write_atomic(output / "settings.json", settings.model_dump_json(indent=2) + "\n")
-    sets, validation = _open_data(settings, config, data_cache or output / "data", report)
+
+    def load(text: str) -> PreparedImages:
+        folder = prepare(
+            open_labelled(text), data_cache or output / "data", height, width,
+            lambda done, total: report(TrainProgress("data", done, total, {})),
+        )  # fmt: skip
+        return PreparedImages(folder, config.classes)
+
+    sets, validation = [load(text) for text in settings.data], load(settings.validation)
     with torch_threads(threads):
         run = TrainingRun(settings, config, output, device)
         if resume and (output / "last.pt").is_file():
@@ -104,36 +105,17 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
     return config.model_copy(update={"min_side": 480, "max_side": 800})
 
 
-def input_size(config: NetworkConfig) -> tuple[int, int]:
-    """Height and width of training images: 4:3, as the frames of most sequences."""
-    return config.min_side, round(config.min_side * 4 / 3)
-
-
 def _check_settings(settings: TrainSettings, path: Path) -> None:
     """Raise where the folder's run has other settings than its length."""
     before = read_json(path, kind=SegmentationError) if path.is_file() else {}
     if not isinstance(before, dict):
         raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
     for key, value in json.loads(settings.model_dump_json()).items():
-        if before.get(key, value) != value and key not in ("iterations", "patience"):
+        if before.get(key, value) != value and key != "iterations":
             raise SegmentationError(
                 f"{path.parent} holds a training run with another {key}: {before[key]!r}, now {value!r}",
                 "name another folder, or do not resume",
             )
-
-
-def _open_data(
-    settings: TrainSettings, config: NetworkConfig, cache: Path, report: Callable[[TrainProgress], None]
-) -> tuple[list[PreparedImages], PreparedImages]:
-    height, width = input_size(config)
-
-    def prepared(done: int, total: int) -> None:
-        report(TrainProgress("data", done, total, {}))
-
-    def load(text: str) -> PreparedImages:
-        return PreparedImages(prepare(open_labelled(text), cache, height, width, prepared), config.classes)
-
-    return [load(text) for text in settings.data], load(settings.validation)
 
 
 class TrainingRun:
@@ -146,6 +128,9 @@ class TrainingRun:
         device: ``cpu`` or ``cuda:N``.
     """
 
+    _MODULES = ("network", "average", "optimiser")
+    _PLAIN = {"step": int, "rows": list, "best": dict, "recent": dict}  # noqa: RUF012 - a constant
+
     def __init__(self, settings: TrainSettings, config: NetworkConfig, output: Path, device: str) -> None:
         torch.manual_seed(settings.seed)
         self.settings, self.output, self.device = settings, output, device
@@ -154,10 +139,9 @@ class TrainingRun:
             _initialise(self.network, Path(settings.init))
         self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval()
-        parameters = list(self.network.parameters())
         groups: list[dict[str, Any]] = [
-            {"params": [parameter for parameter in parameters if parameter.dim() > 1]},
-            {"params": [parameter for parameter in parameters if parameter.dim() <= 1], "weight_decay": 0.0},
+            {"params": [weight for weight in self.network.parameters() if weight.dim() > 1]},
+            {"params": [weight for weight in self.network.parameters() if weight.dim() <= 1], "weight_decay": 0.0},
         ]
         self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay)
         self.step = 0
@@ -168,11 +152,10 @@ class TrainingRun:
     def run(
         self, sets: list[PreparedImages], validation: PreparedImages, report: Callable[[TrainProgress], None]
     ) -> TrainResult:
-        """Learn until the last step, or until the validation score stops improving."""
+        """Learn until the last step."""
         settings, total = self.settings, self.settings.iterations
         if not sum(map(len, sets)) or not len(validation):
             raise SegmentationError("there are no images to learn from or to validate on")
-        stopped = "finished"
         while self.step < total:
             losses = self._learn(batch_of(sets, settings, self.step))
             self.step += 1
@@ -184,11 +167,7 @@ class TrainingRun:
                 report(TrainProgress("validation", self.step, total, self._evaluate(validation)))
             if evaluate or self.step % settings.checkpoint_every == 0:
                 self.save()
-            waited = (self.step - self.best["step"]) / settings.evaluate_every
-            if evaluate and settings.patience and waited >= settings.patience:
-                stopped = "no gain"
-                break
-        return TrainResult(self.output / "best.pt", int(self.best["step"]), self.best["iou"], stopped)
+        return TrainResult(self.output / "best.pt", int(self.best["step"]), self.best["iou"])
 
     def _learn(self, batch: list[Example]) -> dict[str, float]:
         settings = self.settings
@@ -249,16 +228,8 @@ class TrainingRun:
 
     def save(self) -> None:
         """Write the whole state of the run to ``last.pt``."""
-        content = {
-            "format": "dynslam-bench/training/1",
-            "step": self.step,
-            "network": self.network.state_dict(),
-            "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "rows": self.rows,
-            "best": self.best,
-            "recent": self.recent,
-        }
+        content = {"format": "dynslam-bench/training/1", **{name: getattr(self, name) for name in self._PLAIN}}
+        content |= {name: getattr(self, name).state_dict() for name in self._MODULES}
         with replacing(self.output / "last.pt") as temporary, temporary.open("wb") as file:
             torch.save(content, file)
 
@@ -268,13 +239,12 @@ class TrainingRun:
         Raises:
             SegmentationError: The file does not fit.
         """
-        content: dict[str, Any] = dict(read_checkpoint(self.output / "last.pt"))
+        content = read_checkpoint(self.output / "last.pt")
         try:
-            self.network.load_state_dict(content["network"])
-            self.average.load_state_dict(content["average"])
-            self.optimiser.load_state_dict(content["optimiser"])
-            self.step, self.rows = int(content["step"]), list(content["rows"])
-            self.best, self.recent = dict(content["best"]), dict(content["recent"])
+            for name in self._MODULES:
+                getattr(self, name).load_state_dict(content[name])
+            for name, kind in self._PLAIN.items():
+                setattr(self, name, kind(content[name]))
         except (LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
             reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise SegmentationError(f"{self.output / 'last.pt'} does not fit these settings: {reason}") from error
@@ -308,12 +278,12 @@ def _rate(step: int, settings: TrainSettings) -> float:
 
 def _initialise(network: MaskRCNN, path: Path) -> None:
     """Start from a checkpoint; heads whose class count differs keep their random start."""
-    state = canonical_names(split(read_checkpoint(path), str(path))[0])
+    state, _ = read_weights(path)
     per_class = ("roi_heads.box_predictor.", "roi_heads.mask_predictor.mask_fcn_logits.")
     for key, value in network.state_dict().items():
         if key.startswith(per_class) and key in state and state[key].shape != value.shape:
             state[key] = value
-    load_strictly(network, state, str(path))
+    load_strictly(network, state, path)
 
 
 @torch.no_grad()
@@ -331,9 +301,7 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
         example = images[index]
         height, width = example.rgb.shape[:2]
         image = torch.from_numpy(example.rgb).to(device).permute(2, 0, 1).float() / 255
-        detections = network.detect(image, score=CONFIDENCE)
-        boxes, planes = detections.boxes.cpu().numpy(), detections.masks.float().cpu().numpy()
-        labels = detections.labels.cpu().numpy()
+        boxes, labels, _, planes = (part.cpu().numpy() for part in network.detect(image, score=CONFIDENCE))
         masks = [paste(plane, box, height, width, 0.5, exact=True) for plane, box in zip(planes, boxes, strict=True)]
         for truth, label in zip(example.masks, example.labels.tolist(), strict=True):
             same_class = [mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]

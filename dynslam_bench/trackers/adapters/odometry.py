@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from copy import copy
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,45 +28,38 @@ MAX_FAILURES = 5
 """Lost frames in a row after which the chain continues from the newest frame."""
 INSTALL = "pip install 'opencv-python-headless>=5' (or, for OpenCV 4, opencv-contrib-python-headless)"
 
-Prepared = TypeVar("Prepared")
 
-
-class Aligner(Protocol[Prepared]):
-    """The alignment of two RGB-D images of one camera."""
-
-    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Prepared:
-        """Prepare an image once: colour uint8 ``[H, W, 3]``, depth float32 ``[H, W]``, metres, 0 = missing."""
-        ...
-
-    def align(self, reference: Prepared, current: Prepared) -> NDArray[np.float64] | None:
-        """``T_reference_current`` ``[4, 4]``; None if they cannot be aligned."""
-        ...
-
-
-class FrameToFrame(ABC, Generic[Prepared]):
-    """Chains the motions from frame to frame; subclasses align two frames.
+class FrameToFrame(ABC):
+    """Chains the motions from frame to frame; subclasses align two RGB-D images of one camera.
 
     A frame that cannot be aligned is lost. The next one is aligned to the last good frame again, at most five times in
     a row; then the chain continues from the newest frame as if the camera had not moved since.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._aligner: Aligner[Prepared] | None = None
+    _started = False
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> FrameToFrame[Prepared]:
+    def __deepcopy__(self, memo: dict[int, Any]) -> FrameToFrame:
         """A tracker at the same frame; the alignment and the last good frame are shared, since neither changes."""
         return copy(self)
 
     @abstractmethod
-    def make_aligner(self, camera: Camera) -> Aligner[Prepared]:
-        """The alignment for images of this (undistorted) camera."""
+    def start(self, camera: Camera) -> None:
+        """Set up the alignment for images of this (undistorted) camera."""
+
+    @abstractmethod
+    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
+        """Prepare an image once: colour uint8 ``[H, W, 3]``, depth float32 ``[H, W]``, metres, 0 = missing."""
+
+    @abstractmethod
+    def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
+        """``T_reference_current`` ``[4, 4]`` of two prepared images; None if they cannot be aligned."""
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; nothing here is random."""
-        self._aligner = self.make_aligner(camera.undistorted())
+        self.start(camera.undistorted())
+        self._started = True
         self._maps = undistortion_maps(camera)
-        self._reference: Prepared | None = None
+        self._reference: Any = None
         self._pose: NDArray[np.float64] = np.eye(4)
         self._failures = 0
 
@@ -76,23 +69,24 @@ class FrameToFrame(ABC, Generic[Prepared]):
         Raises:
             TrackerError: `reset` was not called.
         """
-        if self._aligner is None:
-            raise TrackerError(f"{self._name} was given a frame before reset()")
+        if not self._started:
+            raise TrackerError(f"{type(self).__name__} was given a frame before reset()")
         start = time.perf_counter()
-        rgb, depth = self._undistort(frame)
+        rgb, depth = frame.rgb, np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
+        if self._maps is not None:
+            rgb = np.asarray(cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
+            depth = np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST), dtype=np.float32)
         valid = np.count_nonzero(depth > 0)
-        state: TrackingState = "lost"
-        if valid < LEAST_DEPTH_PIXELS:
-            state = "initialising" if self._reference is None else "lost"
-        elif self._align(self._aligner, self._aligner.prepare(rgb, depth)):
-            state = "ok"
+        state: TrackingState = "initialising" if self._reference is None else "lost"
+        if valid >= LEAST_DEPTH_PIXELS:
+            state = "ok" if self._extend(self.prepare(rgb, depth)) else "lost"
         pose = self._pose.copy() if state == "ok" else None
         timings = {"tracking": time.perf_counter() - start}
         return TrackResult(pose, state, {"depth_fraction": valid / depth.size}, timings)
 
-    def _align(self, aligner: Aligner[Prepared], current: Prepared) -> bool:
+    def _extend(self, current: Any) -> bool:
         """Extend the chain by a frame; False if it cannot be aligned."""
-        motion = np.eye(4) if self._reference is None else aligner.align(self._reference, current)
+        motion = np.eye(4) if self._reference is None else self.align(self._reference, current)
         aligned = motion is not None and se3.is_pose(motion)
         if motion is not None and aligned:
             self._pose = self._pose @ motion
@@ -100,13 +94,6 @@ class FrameToFrame(ABC, Generic[Prepared]):
         if aligned or self._failures >= MAX_FAILURES:
             self._reference = current
         return aligned
-
-    def _undistort(self, frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        depth = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
-        if self._maps is None:
-            return frame.rgb, depth
-        rgb = np.asarray(cv2.remap(frame.rgb, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
-        return rgb, np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST), dtype=np.float32)
 
 
 def undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
@@ -123,7 +110,7 @@ def unavailable() -> str:
     return "" if hasattr(cv2, "Odometry") or hasattr(cv2, "rgbd") else f"OpenCV {cv2.__version__} lacks it: {INSTALL}"
 
 
-class OpenCvOdometry(FrameToFrame[Any]):
+class OpenCvOdometry(FrameToFrame):
     """Dense frame-to-frame odometry of OpenCV with its default pyramid and iterations.
 
     Raises:
@@ -131,127 +118,91 @@ class OpenCvOdometry(FrameToFrame[Any]):
     """
 
     def __init__(self, settings: OpenCvOdometrySettings) -> None:
-        super().__init__("opencv-odometry")
-        reason = unavailable()
-        if reason:
-            raise TrackerError("opencv-odometry cannot run", reason)
+        if unavailable():
+            raise TrackerError("opencv-odometry cannot run", unavailable())
         self.settings = settings
 
-    def make_aligner(self, camera: Camera) -> Aligner[Any]:
-        """That of the OpenCV at hand."""
-        return (_Odometry5 if hasattr(cv2, "Odometry") else _Odometry4)(camera, self.settings)
-
-
-class _Odometry5:
-    """`cv2.Odometry`, OpenCV 5; missing depth is NaN there."""
-
-    def __init__(self, camera: Camera, settings: OpenCvOdometrySettings) -> None:
-        options = cv2.OdometrySettings()
-        options.setCameraMatrix(camera.matrix.astype(np.float32))
-        options.setMinDepth(settings.min_depth_m)
-        options.setMaxDepth(settings.max_depth_m)
-        options.setMaxDepthDiff(settings.max_depth_difference_m)
-        kinds = {
-            "rgbd": cv2.OdometryType_RGB_DEPTH,
-            "icp": cv2.OdometryType_DEPTH,
-            "rgb": cv2.OdometryType_RGB,
-        }
-        # OdometryAlgoType_FAST fails for colour alone in 5.0.0 and was no faster here
-        self._odometry = cv2.Odometry(kinds[settings.method], options, cv2.OdometryAlgoType_COMMON)
+    def start(self, camera: Camera) -> None:
+        """Set up that of the OpenCV at hand."""
+        settings, matrix = self.settings, camera.matrix.astype(np.float32)
+        if hasattr(cv2, "Odometry"):
+            options = cv2.OdometrySettings()
+            options.setCameraMatrix(matrix)
+            options.setMinDepth(settings.min_depth_m)
+            options.setMaxDepth(settings.max_depth_m)
+            options.setMaxDepthDiff(settings.max_depth_difference_m)
+            kinds = {"rgbd": cv2.OdometryType_RGB_DEPTH, "icp": cv2.OdometryType_DEPTH, "rgb": cv2.OdometryType_RGB}
+            # OdometryAlgoType_FAST fails for colour alone in 5.0.0 and was no faster here
+            self._odometry: Any = cv2.Odometry(kinds[settings.method], options, cv2.OdometryAlgoType_COMMON)
+        else:
+            rgbd: Any = getattr(cv2, "rgbd")  # noqa: B009 - only the contrib packages of OpenCV 4 have it
+            names = {"rgbd": "RgbdICPOdometry_create", "icp": "ICPOdometry_create", "rgb": "RgbdOdometry_create"}
+            self._odometry = getattr(rgbd, names[settings.method])(
+                matrix,
+                minDepth=settings.min_depth_m,
+                maxDepth=settings.max_depth_m,
+                maxDepthDiff=settings.max_depth_difference_m,
+            )
 
     def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
-        return cv2.OdometryFrame(np.where(depth > 0, depth, np.float32(np.nan)), cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        """OpenCV 5's frame, or the arguments of OpenCV 4: intensities, depth (missing is NaN) and its mask."""
+        grey, known = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.where(depth > 0, depth, np.float32(np.nan))
+        if hasattr(cv2, "Odometry"):
+            return cv2.OdometryFrame(known, grey)
+        return grey, known, (depth > 0).astype(np.uint8) * 255
 
     def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
+        """The motion that OpenCV finds."""
         try:
-            self._odometry.prepareFrames(reference, current)
-            success, T_current_reference = self._odometry.compute(reference, current)
+            if hasattr(cv2, "Odometry"):
+                self._odometry.prepareFrames(reference, current)
+                success, T_current_reference = self._odometry.compute(reference, current)
+            else:
+                success, T_current_reference = self._odometry.compute(*reference, *current)
         except cv2.error:  # too little texture or depth in one of them
             return None
-        return _inverted(success, T_current_reference)
+        pose = np.asarray(T_current_reference, dtype=np.float64)
+        return se3.inverse(pose) if success and se3.is_pose(pose) else None
 
 
-class _Odometry4:
-    """`cv2.rgbd`, OpenCV 4 contrib."""
-
-    def __init__(self, camera: Camera, settings: OpenCvOdometrySettings) -> None:
-        rgbd: Any = getattr(cv2, "rgbd")  # noqa: B009 - only the contrib packages have it
-        create = {
-            "rgbd": rgbd.RgbdICPOdometry_create,
-            "icp": rgbd.ICPOdometry_create,
-            "rgb": rgbd.RgbdOdometry_create,
-        }
-        self._odometry = create[settings.method](
-            camera.matrix.astype(np.float32),
-            minDepth=settings.min_depth_m,
-            maxDepth=settings.max_depth_m,
-            maxDepthDiff=settings.max_depth_difference_m,
-        )
-
-    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
-        valid = depth > 0
-        masked = np.where(valid, depth, np.float32(np.nan))
-        return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), masked, valid.astype(np.uint8) * 255
-
-    def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
-        try:
-            success, T_current_reference = self._odometry.compute(*reference, *current)
-        except cv2.error:
-            return None
-        return _inverted(success, T_current_reference)
-
-
-def _inverted(success: bool, T_current_reference: Any) -> NDArray[np.float64] | None:
-    if not success:
-        return None
-    pose = np.asarray(T_current_reference, dtype=np.float64)
-    return se3.inverse(pose) if se3.is_pose(pose) else None
-
-
-class Open3dOdometry(FrameToFrame[Any]):
+class Open3dOdometry(FrameToFrame):
     """Dense frame-to-frame odometry of Open3D."""
 
     def __init__(self, settings: Open3dOdometrySettings) -> None:
-        super().__init__("open3d-odometry")
         self.settings = settings
 
-    def make_aligner(self, camera: Camera) -> Aligner[Any]:
-        """Open3D's multi-scale alignment."""
-        return _MultiScale(camera, self.settings)
-
-
-class _MultiScale:
-    def __init__(self, camera: Camera, settings: Open3dOdometrySettings) -> None:
+    def start(self, camera: Camera) -> None:
+        """Set up Open3D's multi-scale alignment."""
         import open3d as o3d
 
+        settings, odometry = self.settings, o3d.t.pipelines.odometry
         self._o3d = o3d
-        self._pipeline = o3d.t.pipelines.odometry
-        methods = {
-            "hybrid": self._pipeline.Method.Hybrid,
-            "intensity": self._pipeline.Method.Intensity,
-            "point-to-plane": self._pipeline.Method.PointToPlane,
-        }
-        self._method = methods[settings.method]
-        self._max_depth = settings.max_depth_m
-        self._parameters = self._pipeline.OdometryLossParams(depth_outlier_trunc=settings.max_depth_difference_m)
+        method = {
+            "hybrid": odometry.Method.Hybrid,
+            "intensity": odometry.Method.Intensity,
+            "point-to-plane": odometry.Method.PointToPlane,
+        }[settings.method]
         counts = (settings.iterations_coarse, settings.iterations_middle, settings.iterations_fine)
-        self._criteria = [self._pipeline.OdometryConvergenceCriteria(count) for count in counts]
-        self._intrinsics = o3d.core.Tensor(camera.matrix, o3d.core.Dtype.Float64)
-        self._still = o3d.core.Tensor(np.eye(4), o3d.core.Dtype.Float64)
-
-    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
-        colour = self._o3d.t.geometry.Image(self._o3d.core.Tensor(np.ascontiguousarray(rgb)))
-        return self._o3d.t.geometry.RGBDImage(
-            colour, self._o3d.t.geometry.Image(self._o3d.core.Tensor(np.ascontiguousarray(depth)))
+        self._arguments = (
+            o3d.core.Tensor(camera.matrix, o3d.core.Dtype.Float64),
+            o3d.core.Tensor(np.eye(4), o3d.core.Dtype.Float64),
+            1.0,
+            settings.max_depth_m,
+            [odometry.OdometryConvergenceCriteria(count) for count in counts],
+            method,
+            odometry.OdometryLossParams(depth_outlier_trunc=settings.max_depth_difference_m),
         )
 
+    def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
+        """Open3D's image with depth."""
+        tensors = [self._o3d.core.Tensor(np.ascontiguousarray(image)) for image in (rgb, depth)]
+        return self._o3d.t.geometry.RGBDImage(*map(self._o3d.t.geometry.Image, tensors))
+
     def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
+        """The motion that Open3D finds."""
         try:
             with self._o3d.utility.VerbosityContextManager(self._o3d.utility.VerbosityLevel.Error):
-                scales = (self._criteria, self._method, self._parameters)
-                result = self._pipeline.rgbd_odometry_multi_scale(
-                    current, reference, self._intrinsics, self._still, 1.0, self._max_depth, *scales
-                )
+                result = self._o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(current, reference, *self._arguments)
         except RuntimeError:  # singular: too little texture or depth
             return None
         return np.asarray(result.transformation.numpy(), dtype=np.float64) if result.fitness > 0 else None

@@ -265,8 +265,7 @@ OPEN3D_ODOMETRY = TrackerSpec(
     remarks="No map and no loop closing: it drifts. Assumes a static world.",
 )
 
-
-def adapter_specs() -> list[TrackerSpec]:
-    """The control trackers and the adapters."""
-    external = [SUBPROCESS, ORBSLAM3, ORBSLAM3_MONO, OPENCV_ODOMETRY, OPEN3D_ODOMETRY]
-    return [NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, *external]
+ADAPTERS = (
+    NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, ORBSLAM3, ORBSLAM3_MONO, OPENCV_ODOMETRY, OPEN3D_ODOMETRY,
+)  # fmt: skip
+"""The control trackers and the adapters."""

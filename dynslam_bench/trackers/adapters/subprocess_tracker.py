@@ -1,33 +1,252 @@
-"""A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol)."""
+"""A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol).
+
+A fault or the death of the program becomes one clear error.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import json
+import logging
+import os
+import queue
+import signal
+import subprocess
+import sys
 import tempfile
+import threading
 import time
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import IO, Any, Literal, cast, get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext, TrackingState, TrackResult
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError
 from dynslam_bench.core.files import SHARED_MEMORY, TemporaryFolder
+from dynslam_bench.core.reading import parse_json
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.trackers.adapters.program import Program
 from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
 
+_SET_PARENT_DEATH_SIGNAL = 1
+LOGGER = logging.getLogger(__name__)
+"""Gets, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
+LONGEST_LINE = 1 << 26
+"""Bytes of the longest line that is read from a program: a final trajectory of half a million poses."""
 FRAME_FILE = "frame.raw"
 PROTOCOL = 2
 """Version of the JSON lines."""
 CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m", "readout_s")
+
+
+class Program:
+    """One run of an external program.
+
+    Requests go to its standard input, one JSON object a line; it answers each with one JSON object a line on its
+    standard output. Lines that do not begin with ``{`` are log output and skipped, as is its standard error; the last
+    ones are kept for error messages, all of them go to `LOGGER`. It has a session of its own, so that its child
+    processes end with it. It should end by itself at the end of its standard input; on Linux it is killed when the
+    process that started it dies.
+
+    Args:
+        name: For messages.
+        command: Program and arguments.
+        folder: Its working folder; None for the current one.
+        environment: Variables to set beside the inherited ones.
+
+    Raises:
+        TrackerError: The program cannot be started.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        folder: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self.name = name
+        try:
+            self._process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                cwd=folder,
+                env={**os.environ, **(environment or {})},
+                start_new_session=True,
+                preexec_fn=end_with_parent(),
+            )
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise TrackerError(f"{name}: cannot start '{command[0]}': {reason}", "check its path") from error
+        self._kill = weakref.finalize(self, _kill_group, self._process)
+        self._answers: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # None: standard output has ended
+        self._old_lines: dict[str, str] = {}
+        self._new_lines: dict[str, str] = {}  # since the last request
+        self._readers = [
+            threading.Thread(target=_read, args=(name, channel, stream, self._answers, self._new_lines), daemon=True)
+            for channel, stream in (("out", self._process.stdout), ("err", self._process.stderr))
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
+        """Send a request and wait for its answer.
+
+        Args:
+            request: JSON-able; ``op`` names what is asked.
+            timeout_s: Seconds until the program is given up and killed.
+            doing: For messages, e.g. ``at frame 12``.
+
+        Raises:
+            TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
+        """
+        self._refuse_surplus(doing)
+        self._old_lines.update(self._new_lines)
+        self._new_lines.clear()
+        try:
+            self._write(request)
+            text = self._answers.get(timeout=timeout_s)
+        except (OSError, ValueError):  # it has closed its input, or was killed before
+            text = None
+        except queue.Empty:
+            line_shown = f"; its last line: '{self._last_line()}'" if self._last_line() else ""
+            self.kill()
+            raise TrackerError(f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{line_shown}") from None
+        if text is None:
+            raise self._death(doing)
+        try:
+            answer = parse_answer(text)
+        except TrackerError as error:
+            self.kill()
+            raise TrackerError(f"{self.name} {doing}: {error.args[0]}", "one JSON object a line") from None
+        if answer.get("error"):
+            raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
+        self._refuse_surplus(doing)
+        return answer
+
+    def close(self, timeout_s: float) -> None:
+        """Ask it to end, wait, and kill it if it does not; may be called more than once."""
+        with contextlib.suppress(OSError, ValueError, subprocess.TimeoutExpired):
+            self._write({"op": "close"})
+            self._process.stdin.close()  # type: ignore[union-attr]
+            self._process.wait(timeout_s)
+        self.kill()
+
+    def kill(self) -> None:
+        """End it and everything it started, at once."""
+        self._kill()
+        for reader in self._readers:
+            reader.join(timeout=0.5)  # a process in another session may hold the pipe open for ever
+
+    def _write(self, message: Mapping[str, Any]) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(message, allow_nan=False).encode() + b"\n")
+        self._process.stdin.flush()
+
+    def _refuse_surplus(self, doing: str) -> None:
+        """Raise on an unrequested answer: it would be taken for the next one, a pose of the wrong frame."""
+        if self._answers.empty():
+            return
+        surplus = self._answers.get()
+        if surplus is None:
+            raise self._death(doing)
+        self.kill()
+        raise TrackerError(
+            f"{self.name} {doing}: wrote an answer that was not asked for: '{surplus[:80]}'",
+            "one line that begins with { for each request",
+        )
+
+    def _last_line(self) -> str:
+        """The last line of its log.
+
+        Lines since the last request count before earlier ones, and standard error before standard output, which often
+        arrives late, when it is flushed at the end.
+        """
+        lines = (self._new_lines.get("err"), self._new_lines.get("out"), self._old_lines.get("err"))
+        return next(filter(None, lines), self._old_lines.get("out", ""))
+
+    def _death(self, doing: str) -> TrackerError:
+        try:
+            code = self._process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return TrackerError(f"{self.name} {doing}: closed its output without an answer")
+        self.kill()
+        line = self._last_line()
+        shown = f"its last line: '{line}'" if line else "it wrote no message"
+        return TrackerError(f"{self.name} {doing}: the program {_describe(code)}; {shown}")
+
+
+def _read(
+    name: str, channel: str, stream: IO[bytes], answers: queue.SimpleQueue[str | None], lines: dict[str, str]
+) -> None:
+    """Sort the lines of a program's output into answers and log until it ends; runs in a thread of its own."""
+    with stream:
+        for raw in iter(lambda: stream.readline(LONGEST_LINE), b""):
+            text = raw.decode(errors="replace").strip()
+            if channel == "out" and text.startswith("{"):
+                answers.put(text)
+            elif text:
+                lines[channel] = text[:300]
+                LOGGER.info("[%s] %s", name, text)
+    if channel == "out":
+        answers.put(None)
+
+
+def parse_answer(text: str) -> dict[str, Any]:
+    """A program's answer.
+
+    Raises:
+        TrackerError: It is no JSON object; the name of the program is still to be added.
+    """
+    answer = parse_json(text, f"its answer '{text[:80]}'", kind=TrackerError)
+    if not isinstance(answer, dict):
+        raise TrackerError(f"its answer '{text[:80]}' is no JSON object")
+    return answer
+
+
+def end_with_parent() -> Callable[[], object] | None:
+    """A function that runs in the new process before the program, so that Linux kills it when this process dies.
+
+    None elsewhere, and in threads: Linux watches the thread that starts the process.
+    """
+    if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
+        return None
+    prctl = ctypes.CDLL(None).prctl  # loaded here: between fork and exec as little as possible is done
+    return lambda: prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+
+
+def _describe(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        return f"was killed by {signal.Signals(-code).name}"
+    except ValueError:
+        return f"was killed by signal {-code}"
+
+
+def _kill_group(process: subprocess.Popen[bytes]) -> None:
+    """Kill the program with all that it started."""
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=5.0)
+    with contextlib.suppress(OSError):
+        assert process.stdin is not None
+        process.stdin.close()
 
 
 def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[], float]) -> TrackResult:
@@ -45,11 +264,17 @@ def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[
     if not isinstance(state, str) or state not in get_args(TrackingState):
         states = ", ".join(get_args(TrackingState))
         raise TrackerError(f"{who}: answered state {str(state)[:80]!r}", f"known: {states}")
-    pose = _pose(answer.get("T_world_cam"), who)
+    value = answer.get("T_world_cam")
+    try:
+        pose = None if value is None else np.asarray(value, dtype=np.float64).reshape(4, 4)
+    except (TypeError, ValueError, OverflowError):
+        reason = f"{who}: T_world_cam is not 16 numbers: {str(value)[:80]}"
+        raise TrackerError(reason, "row by row, camera to world") from None
     if pose is None and state == "ok":
         raise TrackerError(f"{who}: answered state 'ok' without T_world_cam")
-    stats = _numbers(answer.get("stats"), "stats", who)
-    timings = _numbers(answer.get("timings"), "timings", who)
+    if pose is not None and not se3.is_pose(pose):
+        raise TrackerError(f"{who}: T_world_cam is no rigid pose: {pose.tolist()}")
+    stats, timings = (_numbers(answer.get(name), name, who) for name in ("stats", "timings"))
     timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
     return TrackResult(pose, cast(TrackingState, state), stats, timings)
 
@@ -75,20 +300,6 @@ def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
         raise TrackerError(f"{who}: {error}") from error
 
 
-def _pose(value: Any, who: str) -> NDArray[np.float64] | None:
-    if value is None:
-        return None
-    try:
-        pose = np.asarray(value, dtype=np.float64).reshape(4, 4)
-    except (TypeError, ValueError, OverflowError):
-        raise TrackerError(
-            f"{who}: T_world_cam is not 16 numbers: {str(value)[:80]}", "row by row, camera to world"
-        ) from None
-    if not se3.is_pose(pose):
-        raise TrackerError(f"{who}: T_world_cam is no rigid pose: {pose.tolist()}")
-    return pose
-
-
 def _numbers(value: Any, what: str, who: str) -> dict[str, float]:
     try:
         return {str(key): float(number) for key, number in (value or {}).items()}
@@ -112,7 +323,6 @@ class ImageExchange:
 
     def __init__(self, camera: Camera, mode: Literal["raw", "png"]) -> None:
         self.camera, self.mode = camera, mode
-        self._last: tuple[Path, ...] = ()
         colour = camera.height * camera.width * 3
         self.depth_offset = -(-colour // 16) * 16
         size = self.depth_offset + camera.height * camera.width * 4
@@ -151,19 +361,13 @@ class ImageExchange:
             np.copyto(self._rgb, frame.rgb)
             np.copyto(self._depth, frame.depth)
             return {}
-        return self._write_png(frame)
-
-    def _write_png(self, frame: Frame) -> dict[str, Any]:
+        for old in self.folder.glob("*.png"):
+            old.unlink()
         rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
         units = np.rint(np.nan_to_num(frame.depth) * self.camera.depth_factor).clip(0, 65535).astype(np.uint16)
-        fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
         for path, image in ((rgb, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)), (depth, units)):
-            if not cv2.imwrite(str(path), image, fast):
+            if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
                 raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
-        for old in self._last:
-            if old not in (rgb, depth):
-                old.unlink(missing_ok=True)
-        self._last = (rgb, depth)
         return {"rgb": str(rgb), "depth": str(depth)}
 
     def close(self) -> None:
@@ -178,16 +382,15 @@ def _with_space(size: int) -> TemporaryFolder:
         InfrastructureError: There is no room, neither in shared memory nor among the temporary files.
     """
     reasons = []
-    for base in (SHARED_MEMORY, None):
-        folder = None
-        try:
-            folder = TemporaryFolder(base)
-            (folder.path / FRAME_FILE).write_bytes(bytes(size))
-            return folder
-        except OSError as error:
-            reasons.append(f"{base or tempfile.gettempdir()}: {error.strerror}")
-            if folder is not None:
-                folder.close()
+    for base in (SHARED_MEMORY, Path(tempfile.gettempdir())):
+        with contextlib.ExitStack() as undo:
+            try:
+                folder = undo.enter_context(contextlib.closing(TemporaryFolder(base)))
+                (folder.path / FRAME_FILE).write_bytes(bytes(size))
+                undo.pop_all()
+                return folder
+            except OSError as error:
+                reasons.append(f"{base}: {error.strerror}")
     raise InfrastructureError(f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space")
 
 
@@ -236,7 +439,6 @@ class ProgramTracker:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
         """
         self.close()
-        seed = derive_seed(rng)
         threads = str(self.context.threads)
         limits = {name: threads for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
         self._exchange = ImageExchange(camera, self._images)
@@ -252,14 +454,14 @@ class ProgramTracker:
                 "fps": self.context.fps,
             },
             "images": self._exchange.announce(),
-            "seed": seed,
+            "seed": derive_seed(rng),
             "threads": self.context.threads,
             "device": self.context.device,
             "sequence": self.context.sequence_id,
             "options": self.options(camera, self._exchange.folder),
         }
         try:
-            self._program.ask(request, self.limits.start_timeout_s, "at reset")
+            self._ask(request, self.limits.start_timeout_s, "at reset")
         except DynslamError:
             self.close()
             raise
@@ -276,12 +478,11 @@ class ProgramTracker:
         Raises:
             TrackerError: It dies, hangs, or does not answer with a pose.
         """
-        program, exchange = self._running()
         start = time.perf_counter()
         doing = f"at frame {frame.index}"
-        images = exchange.put(frame)
+        images = {} if self._exchange is None else self._exchange.put(frame)
         request = {"op": "track", "index": frame.index, "timestamp": frame.timestamp, **images}
-        answer = program.ask(request, self.limits.frame_timeout_s, doing)
+        answer = self._ask(request, self.limits.frame_timeout_s, doing)
         if answer.get("index") != frame.index:
             raise TrackerError(
                 f"{self.name} {doing}: answered index {str(answer.get('index'))[:20]}",
@@ -298,10 +499,10 @@ class ProgramTracker:
             self._exchange.close()
             self._exchange = None
 
-    def _running(self) -> tuple[Program, ImageExchange]:
-        if self._program is None or self._exchange is None:
+    def _ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
+        if self._program is None:
             raise TrackerError(f"{self.name} was used before reset() or after close()")
-        return self._program, self._exchange
+        return self._program.ask(request, timeout_s, doing)
 
 
 class FinalizingProgramTracker(ProgramTracker):
@@ -313,8 +514,7 @@ class FinalizingProgramTracker(ProgramTracker):
         Raises:
             TrackerError: It dies, hangs, or does not answer with a trajectory.
         """
-        program, _ = self._running()
-        answer = program.ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
+        answer = self._ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
         return read_final_answer(answer, f"{self.name} at finalize")
 
 

@@ -1,7 +1,5 @@
 """Blitz-SLAM (Fan et al. 2022): masks repaired by depth, then a strict epipolar test inside the boxes."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import BoxEpipolarSettings, DepthBlockSettings
 from dynslam_bench.trackers.systems.composition import (

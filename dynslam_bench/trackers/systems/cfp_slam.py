@@ -1,7 +1,5 @@
 """CFP-SLAM (Hu et al. 2022): a static probability weighs each point instead of dropping it."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.segmentation.settings import SegmentationSettings

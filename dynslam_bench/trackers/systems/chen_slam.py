@@ -3,8 +3,6 @@
 Theirs is monocular: `chen-slam-mono`. `chen-slam` is the same with depth, to stand beside the other systems.
 """
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import BoxEpipolarSettings
 from dynslam_bench.trackers.systems.composition import (

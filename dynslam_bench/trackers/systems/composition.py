@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
+from dynslam_bench.contracts.filter import DynamicFilter
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.plugins import load_object
@@ -19,11 +20,6 @@ from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
-
-if TYPE_CHECKING:
-    from dynslam_bench.contracts.filter import DynamicFilter
-    from dynslam_bench.segmentation.schedule import MaskScheduler
-    from dynslam_bench.slam.pipeline import SlamPipeline
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Sources of masks, as `segmentation.source` names them."""
@@ -115,18 +111,20 @@ def movable_classes(filters: Sequence[DynamicFilter]) -> frozenset[str]:
 def composed(*filters: tuple[str, ...]) -> Callable[[Any, TrackerContext], Tracker]:
     """A tracker factory: the filters of a system on the shared back end.
 
-    The filters are loaded when a tracker is built, so that the module of a system imports neither torch nor OpenCV.
+    A filter is left out where the settings lack one of its groups, or where its own group has ``enabled = false``. The
+    filters are loaded when a tracker is built, so that the module of a system imports neither torch nor OpenCV.
 
     Args:
         filters: In the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups of the
-            system's settings that the class takes.
+            system's settings that the class takes, its own first.
     """
 
     def build(settings: UnfilteredSystemSettings, context: TrackerContext) -> Tracker:
-        blocks = [
-            load_object(f"dynslam_bench.culling.{name}")(*(getattr(settings, group) for group in groups))
-            for name, *groups in filters
-        ]
+        blocks = []
+        for name, *groups in filters:
+            arguments = [getattr(settings, group, None) for group in groups]
+            if None not in arguments and getattr(arguments[0], "enabled", True):
+                blocks.append(load_object(f"dynslam_bench.culling.{name}")(*arguments))
         return compose(settings, context, blocks, getattr(settings, "flow", None))
 
     return build
@@ -137,7 +135,7 @@ def compose(
     context: TrackerContext,
     filters: Sequence[DynamicFilter] = (),
     flow: FlowMethodSettings | None = None,
-) -> SlamPipeline:
+) -> Tracker:
     """The pipeline of a system.
 
     Args:
@@ -154,7 +152,8 @@ def compose(
     from dynslam_bench.features.cached import cached_extractor
     from dynslam_bench.features.registry import build_extractor
     from dynslam_bench.flow.registry import build_flow
-    from dynslam_bench.segmentation.cached import cache_segmenter
+    from dynslam_bench.segmentation.build_segmenter import CachedSegmenter, build_segmenter
+    from dynslam_bench.segmentation.schedule import MaskScheduler
     from dynslam_bench.slam.backend import build_backend
     from dynslam_bench.slam.pipeline import CachedStage, SlamPipeline
 
@@ -162,13 +161,29 @@ def compose(
     cached: dict[str, CachedStage] = {}
     features = settings.features
     extractor = build_extractor(features)
-    masks = _mask_stage(settings, context, filters, deferred=cache is not None)
     if cache is not None:
         extractor = cached["features"] = cached_extractor(extractor, features, cache, context.threads)
-        if masks is not None:
-            segmenter = cache_segmenter(masks, cache, context.sequence_id, context.device, context.threads)
-            if segmenter is not None:
-                cached["segmentation"] = segmenter
+    segmenter, masks = None, None
+    if isinstance(settings, SemanticSystemSettings):
+        segmenter = build_segmenter(
+            settings.segmentation,
+            sequence_id=context.sequence_id,
+            masks=context.masks,
+            device=context.device,
+            threads=context.threads,
+            cache=cache,
+            also=movable_classes(filters),
+        )
+        masks = None if segmenter is None else MaskScheduler(settings.segmentation, segmenter)
+    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
+    if segmenter is None and needing:
+        fault, cure = "segmentation.source is 'none'", f"sources: {SOURCES}"
+        if not isinstance(settings, SemanticSystemSettings):
+            fault = f"{type(settings).__name__} has no group segmentation"
+            cure = "derive it from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)"
+        raise SegmentationError(f"filter '{needing[0]}' needs masks, but {fault}", cure)
+    if segmenter is not None and isinstance(segmenter.inner, CachedSegmenter):
+        cached["segmentation"] = segmenter.inner
     return SlamPipeline(
         extractor=extractor,
         masks=masks,
@@ -178,43 +193,6 @@ def compose(
         settings=settings,
         cached=cached,
     )
-
-
-def _mask_stage(
-    settings: SystemSettings, context: TrackerContext, filters: Sequence[DynamicFilter], *, deferred: bool
-) -> MaskScheduler | None:
-    """The segmentation stage; None without a source.
-
-    Raises:
-        SegmentationError: A filter needs masks, and there is no source of them.
-    """
-    from dynslam_bench.segmentation.build_segmenter import build_segmenter
-    from dynslam_bench.segmentation.schedule import MaskScheduler
-
-    segmenter = None
-    if isinstance(settings, SemanticSystemSettings):
-        segmenter = build_segmenter(
-            settings.segmentation,
-            sequence_id=context.sequence_id,
-            masks=context.masks,
-            device=context.device,
-            threads=context.threads,
-            deferred=deferred,
-            also=movable_classes(filters),
-        )
-        if segmenter is not None:
-            return MaskScheduler(settings.segmentation, segmenter)
-    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
-    if needing and not isinstance(settings, SemanticSystemSettings):
-        raise SegmentationError(
-            f"filter '{needing[0]}' needs masks, but {type(settings).__name__} has no group segmentation",
-            "derive the system's settings from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)",
-        )
-    if needing:
-        raise SegmentationError(
-            f"filter '{needing[0]}' needs masks, but segmentation.source is 'none'", f"sources: {SOURCES}"
-        )
-    return None
 
 
 # Sentences of the specs are made from the settings, so that a spec states the numbers in force.

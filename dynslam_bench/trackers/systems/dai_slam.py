@@ -1,7 +1,5 @@
 """Dai et al. (TPAMI 2020): point correlations on a Delaunay graph, no semantics."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.flow.settings import FlowMethodSettings

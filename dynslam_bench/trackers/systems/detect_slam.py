@@ -1,7 +1,5 @@
 """Detect-SLAM (Zhong et al. 2018): a moving probability for every feature, fed by boxes on keyframes."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.trackers.systems.composition import (

@@ -1,7 +1,5 @@
 """DGS-SLAM (Yan et al. 2022): clusters of high residual move, people more readily."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import ResidualSettings
 from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks

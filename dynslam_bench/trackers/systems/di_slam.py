@@ -1,7 +1,5 @@
 """DI-SLAM (Wei et al. 2025): boxes, epipolar test, multi-view geometry."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.guard import GuardSettings
 from dynslam_bench.culling.settings import BoxEpipolarSettings, MultiViewSettings

@@ -1,7 +1,5 @@
 """DS-SLAM (Yu et al. 2018): if a moving corner lies near a person, the people go."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import MovingVoteSettings
 from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks

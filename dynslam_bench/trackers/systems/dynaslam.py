@@ -1,7 +1,5 @@
 """DynaSLAM (Bescos et al. 2018): masks of a-priori dynamic classes, multi-view geometry, or both."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from dynslam_bench.contracts.tracker import TrackerSpec
@@ -40,11 +38,7 @@ class DynaSlamGeometrySettings(SystemSettings):
     multiview: MultiViewSettings = MultiViewSettings()
 
 
-MASKS = ("semantic:SemanticFilter", "segmentation")
-MULTIVIEW = ("multiview_depth:MultiViewFilter", "multiview")
-build = composed(MASKS, MULTIVIEW)
-build_masks_only = composed(MASKS)
-build_geometry_only = composed(MULTIVIEW)
+build = composed(("semantic:SemanticFilter", "segmentation"), ("multiview_depth:MultiViewFilter", "multiview"))
 GEOMETRY = (
     "a seed needs a neighbourhood of nearly one depth (variance below 0.001 m^2, missing depth as 0), as in the code",
     "the next pixel of a region is the one nearest to its mean to 5 mm",
@@ -59,29 +53,24 @@ BORDER = "the further 15 px at the border of the semantic masks, whose features 
 UNION = "the masks of N and G are united, as in the code (the paper keeps G's where both find an object)"
 
 
-def _assumptions(settings: SystemSettings, *, as_in_code: bool) -> tuple[str, ...]:
-    sentences: list[str] = []
-    if isinstance(settings, SemanticSystemSettings):
-        sentences += [describe_masks(settings.segmentation), CFPN, PEOPLE, GROWN, BORDER]
-    if isinstance(settings, DynaSlamSettings | DynaSlamGeometrySettings):
-        sentences += GEOMETRY if as_in_code else [*GEOMETRY, START, NO_BORDER]
-    if isinstance(settings, DynaSlamSettings):
-        sentences.append(UNION)
-    return tuple(sentences)
-
-
 def _spec(
     suffix: str,
     variant: str,
     settings: type[SystemSettings],
-    factory: str,
     provenance: Literal["faithful-code", "faithful-paper", "inspired"],
     published_as: tuple[str, ...],
     falls_short: str = "",
 ) -> TrackerSpec:
+    defaults, assumptions = settings(), []
+    if isinstance(defaults, SemanticSystemSettings):
+        assumptions += [describe_masks(defaults.segmentation), CFPN, PEOPLE, GROWN, BORDER]
+    if "multiview" in settings.model_fields:
+        assumptions += GEOMETRY if provenance == "faithful-code" else [*GEOMETRY, START, NO_BORDER]
+    if isinstance(defaults, DynaSlamSettings):
+        assumptions.append(UNION)
     return TrackerSpec(
         id=f"dynaslam{suffix}",
-        entry_point=f"{__name__}:{factory}",
+        entry_point=f"{__name__}:build",
         label=f"DynaSLAM {variant} (our back end)",
         settings=settings,
         summary=f"DynaSLAM, variant {variant}",
@@ -90,7 +79,7 @@ def _spec(
         published_as=published_as,
         license="MIT (re-implemented from the description; the authors' code is GPL-3.0)",
         citation="Bescos et al., DynaSLAM, IEEE RA-L 2018",
-        assumptions=_assumptions(settings(), as_in_code=provenance == "faithful-code"),
+        assumptions=tuple(assumptions),
         remarks="background inpainting is left out: it rejects nothing" + falls_short,
     )
 
@@ -101,8 +90,8 @@ G_FALLS_SHORT = (
 )
 BOTH = ("DynaSLAM N+G", "DynaSLAM")
 SPECS = [
-    _spec("", "N+G", DynaSlamSettings, "build", "faithful-paper", BOTH),
-    _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "build", "faithful-code", BOTH),
-    _spec("-n", "N", DynaSlamMasksSettings, "build_masks_only", "faithful-code", ("DynaSLAM N",)),
-    _spec("-g", "G", DynaSlamGeometrySettings, "build_geometry_only", "inspired", ("DynaSLAM G",), G_FALLS_SHORT),
+    _spec("", "N+G", DynaSlamSettings, "faithful-paper", BOTH),
+    _spec("-code", "N+G (code's constants)", DynaSlamCodeSettings, "faithful-code", BOTH),
+    _spec("-n", "N", DynaSlamMasksSettings, "faithful-code", ("DynaSLAM N",)),
+    _spec("-g", "G", DynaSlamGeometrySettings, "inspired", ("DynaSLAM G",), G_FALLS_SHORT),
 ]

@@ -1,7 +1,5 @@
 """DynaTM-SLAM (Zhong et al. 2024): template matching over a window inside boxes."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import TemplateSettings
 from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks

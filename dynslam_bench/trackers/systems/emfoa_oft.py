@@ -7,12 +7,9 @@ moth-flame algorithm, matches the remaining ORB points with the previous image; 
 culls points off their epipolar lines; the rest is tracked and mapped. `docs/method.md` lists who runs which equation.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
-from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
-from dynslam_bench.core.plugins import load_object
+from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, RigidMotionSettings
 from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 from dynslam_bench.trackers.systems.composition import (
@@ -23,7 +20,7 @@ from dynslam_bench.trackers.systems.composition import (
     ObjectSettings,
     SemanticSystemSettings,
     SystemSettings,
-    compose,
+    composed,
     describe_dilation,
     describe_masks,
 )
@@ -106,30 +103,14 @@ class EmfoaOftMonoSettings(MonocularSemanticSettings, EpipolarTestSettings):
     """This project's system without depth: the paper calls itself monocular in half of its text."""
 
 
-def build(settings: SystemSettings, context: TrackerContext) -> Tracker:
-    """Masks, epipolar test, rigid motion in depth, free space: those that the settings have a group for."""
-    return _build(settings, context, masks=isinstance(settings, SemanticSystemSettings))
-
-
-def build_vote(settings: SystemSettings, context: TrackerContext) -> Tracker:
-    """Ablation without mask culling: the epipolar vote of its points decides on an object (`EpipolarFilter`)."""
-    return _build(settings, context, masks=False)
-
-
-def _build(settings: SystemSettings, context: TrackerContext, *, masks: bool) -> Tracker:
-    blocks = (
-        ("semantic:SemanticFilter", "segmentation", masks),
-        ("epipolar:EpipolarFilter", "epipolar", True),
-        ("ego_motion:RigidMotionFilter", "motion", True),
-        ("free_space:FreeSpaceFilter", "free_space", True),
-    )
-    filters = []
-    for name, group, wanted in blocks:
-        own = getattr(settings, group, None)
-        if wanted and own is not None and getattr(own, "enabled", True):
-            filters.append(load_object(f"dynslam_bench.culling.{name}")(own))
-    return compose(settings, context, filters, getattr(settings, "flow", None))
-
+TESTS = (
+    ("epipolar:EpipolarFilter", "epipolar"),
+    ("ego_motion:RigidMotionFilter", "motion"),
+    ("free_space:FreeSpaceFilter", "free_space"),
+)
+build = composed(("semantic:SemanticFilter", "segmentation"), *TESTS)
+build_vote = composed(*TESTS)
+"""Without mask culling: the epipolar vote of its points decides on an object (`EpipolarFilter`)."""
 
 WHOSE = (
     "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; ours are the flow at the "
@@ -151,20 +132,21 @@ DEPTH = "rigid motion in depth and free space seen before are tested as well (ou
 
 
 def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
-    paper = isinstance(settings, PaperTestSettings)
+    monocular = isinstance(settings, EmfoaOftMonoSettings)
     sentences: list[str] = []
     if isinstance(settings, SemanticSystemSettings):
         sentences += [describe_masks(settings.segmentation), CFPN]
         if settings.segmentation.dilation_px:
             sentences.append(describe_dilation(settings.segmentation))
-    if not isinstance(settings, EpipolarTestSettings):
-        return (*sentences, SENSOR)
-    monocular = isinstance(settings, EmfoaOftMonoSettings)
-    sentences += [NOT_STATED] if monocular else [NOT_STATED, SENSOR]
-    if settings.flow.method == "daisy":
+    if isinstance(settings, EpipolarTestSettings):
+        sentences.append(NOT_STATED)
+    if not monocular:
+        sentences.append(SENSOR)
+    if isinstance(settings, PaperTestSettings):
         sentences += [SPARSE] if isinstance(settings.flow, FlowSettings) else DENSE
-    if not paper:
-        sentences += [SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
+    elif isinstance(settings, EpipolarTestSettings):
+        own_flow = [SPARSE] if settings.flow.method == "daisy" else []
+        sentences += [*own_flow, SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
     if isinstance(settings, DepthTestSettings):
         sentences.append(DEPTH)
     return (*sentences, BACKEND) if monocular else tuple(sentences)

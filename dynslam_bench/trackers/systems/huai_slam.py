@@ -1,7 +1,5 @@
 """Huai et al. (Sensors 2025): missed masks bridged, split by depth, moving probability of keypoints."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.segmentation.settings import SegmentationSettings

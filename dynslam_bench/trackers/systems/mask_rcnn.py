@@ -1,7 +1,5 @@
 """Masks of people as the only filter; `dynaslam-n` is the published system with the same rule."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.trackers.systems.composition import (
     CFPN,

@@ -1,7 +1,5 @@
 """MOR-SLAM (Yao et al. 2023): repaired masks, F from outside them, epipolar test."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import BoxEpipolarSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings

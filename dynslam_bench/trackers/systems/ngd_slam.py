@@ -1,7 +1,5 @@
 """NGD-SLAM (Zhang et al. 2024): boxes cut out by depth, propagated between detections."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import BoxDepthSettings, ReseedingSettings
 from dynslam_bench.features.settings import FeatureSettings

@@ -1,7 +1,5 @@
 """OPF-SLAM: named in the paper without a citation; nobody knows what it is."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import EpipolarSettings
 from dynslam_bench.trackers.systems.composition import PublishedFlowSettings, SystemSettings, composed

@@ -3,8 +3,6 @@
 No dynamic handling beyond the robust kernel and the chi-square tests of the pose optimiser.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from dynslam_bench.contracts.tracker import TrackerSpec

@@ -1,7 +1,5 @@
 """SEG-SLAM (Cong et al. 2024): three rules: class, depth, epipolar line."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import ClassRuleSettings
 from dynslam_bench.trackers.systems.composition import (

@@ -1,7 +1,5 @@
 """SGC-VSLAM (Yang et al. 2020): F from the points outside the boxes, the test for all."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import BoxEpipolarSettings
 from dynslam_bench.trackers.systems.composition import (

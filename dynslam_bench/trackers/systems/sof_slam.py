@@ -1,7 +1,5 @@
 """SOF-SLAM (Cui and Ma 2019): F from static-labelled points, tested on movable things; people go."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import ClassRuleSettings
 from dynslam_bench.trackers.systems.composition import (

@@ -1,7 +1,5 @@
 """YOLO-SLAM (Wu et al. 2022): depth RANSAC among the features of a person's box."""
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.culling.settings import DepthRansacSettings
 from dynslam_bench.trackers.systems.composition import ObjectSettings, SemanticSystemSettings, composed, describe_masks

@@ -71,12 +71,11 @@ class Scripted(FrameToFrame):
     """Frames carry their number in a pixel; a motion of 1 along x each, or none where the script says so."""
 
     def __init__(self, failing):
-        super().__init__("scripted")
         self.failing = failing
         self.asked = []
 
-    def make_aligner(self, camera):
-        return self
+    def start(self, camera):
+        """Nothing to set up."""
 
     def prepare(self, rgb, depth):
         return int(rgb[0, 0, 0])

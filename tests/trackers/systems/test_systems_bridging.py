@@ -95,12 +95,3 @@ def test_a_missed_person_is_bridged_for_as_long_as_promised(
     if spec.id in ONLY_MASKS:
         culled = [result.stats["culled"] > 0 for result in results]
         assert culled == [True] * (SEEN + promised) + [False] * (FRAMES - SEEN - promised)
-
-
-def test_the_promise_may_be_changed(frames: list[Frame], recorded: Path) -> None:
-    for promised in (0, 2, 4):
-        settings = {"segmentation.source": f"recorded:{recorded}", "segmentation.compensate": promised}
-        tracker = build_tracker("mask-rcnn", settings, TrackerContext())
-        tracker.reset(CAMERA, rng=np.random.default_rng(0))
-        culled = [tracker.track(frame).stats["culled"] > 0 for frame in frames]
-        assert culled == [True] * (SEEN + promised) + [False] * (FRAMES - SEEN - promised)

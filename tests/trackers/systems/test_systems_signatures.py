@@ -60,15 +60,15 @@ def test_published_classes(tracker: str, sequence: str, expected: str | None) ->
 
 def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
     store = RunStore(tmp_path)
-    twin = "synthetic/walking_rpy"
+    replica = "synthetic/walking_rpy"
     for seed in (0, 1):
-        fake.add_run(store, "mask-rcnn", twin, seed, error=0.004, overrides={"segmentation.source": "oracle"})
-        fake.add_run(store, "dynaslam-n", twin, seed, error=0.005, provenance="faithful-code")
-        fake.add_run(store, "orb-slam2", twin, seed, error=0.5, provenance="faithful-code")
-        fake.add_run(store, "yolo-slam", twin, seed, error=0.005)
-        fake.add_run(store, "cfp-slam", twin, seed, error=0.005, provenance="inspired")
-        fake.add_run(store, "dai-slam", twin, seed, error=0.005, lost=range(90))
-        fake.add_run(store, "di-slam", twin, seed, error=0.005, provenance="inspired")
+        fake.add_run(store, "mask-rcnn", replica, seed, error=0.004, overrides={"segmentation.source": "oracle"})
+        fake.add_run(store, "dynaslam-n", replica, seed, error=0.005, provenance="faithful-code")
+        fake.add_run(store, "orb-slam2", replica, seed, error=0.5, provenance="faithful-code")
+        fake.add_run(store, "yolo-slam", replica, seed, error=0.005)
+        fake.add_run(store, "cfp-slam", replica, seed, error=0.005, provenance="inspired")
+        fake.add_run(store, "dai-slam", replica, seed, error=0.005, lost=range(90))
+        fake.add_run(store, "di-slam", replica, seed, error=0.005, provenance="inspired")
     text = signatures.report(tmp_path)
     verdicts = {
         line.split("|")[1].strip(): line.rsplit("|", 2)[1].strip()
@@ -86,7 +86,7 @@ def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
     assert "yolo-slam on walking_rpy: survives" in text and "published fails" in text
 
 
-def test_a_store_without_the_yardstick_is_a_clear_error(tmp_path: Path) -> None:
+def test_a_store_without_the_reference_system_is_a_clear_error(tmp_path: Path) -> None:
     fake.add_run(RunStore(tmp_path), "orb-slam2", "synthetic/walking_xyz", 0)
     with pytest.raises(DynslamError, match=r"exact masks on synthetic/walking_xyz.*suite 'dynamic'"):
         signatures.report(tmp_path)
