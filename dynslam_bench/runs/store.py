@@ -111,7 +111,7 @@ class RunStore:
             raise RunError(str(error.args[0]), "name another folder with --results") from error
         if not self._swept:
             self._swept = True
-            for pattern in ("", "runs", "sequences/*"):
+            for pattern in (".*", "runs/.*", "sequences/*/.*"):
                 sweep_temporary(self.root, pattern)
             for left in self.runs.glob(".*.claim"):
                 with claimed(left):  # if no process holds it, it is removed
