@@ -11,7 +11,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -214,16 +214,16 @@ class _Partial:
         version = headers.get("Last-Modified") if etag.startswith("W/") else etag  # a weak one validates no range
         with contextlib.suppress(OSError):  # without notes the next call begins again, which is safe
             self._notes.write_text(json.dumps({"url": without_passwords(self.url), "version": version}))
-        length, free = headers.get("Content-Length", ""), shutil.disk_usage(self.part.parent).free
-        if not length.isdigit():
+        if not headers.get("Content-Length", "").isdigit():
             return None
-        self._check(self._size() + int(length))
-        if int(length) > free:
+        missing, free = int(headers["Content-Length"]), shutil.disk_usage(self.part.parent).free
+        self._check(self._size() + missing)
+        if missing > free:
             raise DownloadError(
-                f"{self.part.parent} has {free / 1e9:.2f} GB free, but {int(length) / 1e9:.2f} GB are still to download",
+                f"{self.part.parent} has {free / 1e9:.2f} GB free, but {missing / 1e9:.2f} GB are still to download",
                 "make room, or name another folder",
             )
-        return self._size() + int(length)
+        return self._size() + missing
 
     def _receive(self, response: Any, total: int | None) -> bool:
         """Append the body to the file; True if it came to its announced end."""

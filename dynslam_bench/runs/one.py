@@ -18,7 +18,7 @@ from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, check_unchanged, resolve
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
-from dynslam_bench.runs.process.supervisor import LogFile, Verdict, supervise
+from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
 from dynslam_bench.runs.record import LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
 from dynslam_bench.runs.spec import RunSpec, place_of
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
@@ -46,7 +46,7 @@ def run_one(
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
     progress_every: int = PROGRESS_EVERY,
-    cancelled: Callable[[], bool] | None = None,
+    cancelled: Callable[[], bool] = lambda: False,
     at_a_time: int = 1,
 ) -> RunRecord:
     """Make a run in a child process and store it, whatever becomes of it.
@@ -88,21 +88,22 @@ def run_one(
             protocol=get_protocol(protocol).model_dump(mode="json"),
             progress_every=progress_every,
         )
-        log = LogFile(work / LOG_FILE)
-        watched: dict[str, Any] = {"cancelled": cancelled, "tick": log.look, "at_a_time": at_a_time}
+        log = work / LOG_FILE
+        watched: dict[str, Any] = {"tick": lambda: bound_log(log, LONGEST_YET), "at_a_time": at_a_time}
         child = Child()
         try:
-            verdict = supervise(child, job, resolved.spec.limits, report, **watched)
+            verdict = supervise(child, job, resolved.spec.limits, report, cancelled, **watched)
         except InfrastructureError:
             if not child.lost:
                 raise
-            verdict = supervise(Child(), job, resolved.spec.limits, report, **watched)  # with a new fork server
+            child = Child()  # of a new fork server
+            verdict = supervise(child, job, resolved.spec.limits, report, cancelled, **watched)
         if verdict.refused:
             raise RunError(
                 f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
             )
         try:
-            log.finish()
+            bound_log(log, LONGEST_LOG)
             frames = FrameLog.read(work / FRAMES_FILE)
             title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
             frames.write(work, title, exact_stamps(resolved.sequence))

@@ -46,8 +46,7 @@ from test_runs_infrastructure import STRAYS  # noqa: E402
 
 from dynslam_bench.cli import main as main_of_the_command_line  # noqa: E402
 from dynslam_bench.core.files import SHARED_MEMORY  # noqa: E402
-from dynslam_bench.runs.process.fork_server import SERVERS  # noqa: E402
-from dynslam_bench.runs.process.tree import process_tree  # noqa: E402
+from dynslam_bench.runs.process.fork_server import SERVERS, process_tree  # noqa: E402
 
 SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
 STUDY = (

@@ -40,7 +40,7 @@ from dynslam_bench.core.errors import (
 )
 from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
-from dynslam_bench.runs.process.tree import adopt_orphans, die_with_parent
+from dynslam_bench.runs.process.fork_server import adopt_orphans, die_with_parent
 
 LOG_FILE = "log.txt"
 _LONGEST = 400
