@@ -20,8 +20,8 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.runs.exchange.export import digest_of, stated_provenance
 from dynslam_bench.runs.exchange.formats import read_trajectory
-from dynslam_bench.runs.one import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.record import RunRecord, TrackerInfo
+from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore
 from dynslam_bench.sequences.catalogue import parse_frames

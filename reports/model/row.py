@@ -22,8 +22,7 @@ from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
-from dynslam_bench.runs.run_index import part_words
-from dynslam_bench.runs.store import RunStore, score
+from dynslam_bench.runs.store import RunStore, part_words, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
 K = TypeVar("K", bound=Hashable)

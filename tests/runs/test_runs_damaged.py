@@ -17,7 +17,7 @@ from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs import RunStore, score
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
-from dynslam_bench.runs.many import pack, unpack
+from dynslam_bench.runs.running import pack, unpack
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "before_rebuild" / "results"
 GOOD, BAD = "e7f8d4df9db4bb16", "a7abe04996a79cc4"

@@ -11,7 +11,7 @@ from faults import survey, tree
 
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs import RunRecord, RunStore
-from dynslam_bench.runs.run_index import RUN_FILE
+from dynslam_bench.runs.store import RUN_FILE
 
 RECORD = RunRecord.read(Path(__file__).parent / "data" / "run.json")
 FAILED = RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})

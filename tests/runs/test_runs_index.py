@@ -17,8 +17,7 @@ from reports_fake_store import add_run
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunStore
 from dynslam_bench.runs import store as store_module
-from dynslam_bench.runs.run_index import FIELDS, run_row
-from dynslam_bench.runs.store import list_runs, rescore
+from dynslam_bench.runs.store import FIELDS, list_runs, rescore, run_row
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 
@@ -63,7 +62,7 @@ def test_rows_are_those_of_the_records_and_are_read_once(filled, reads: list[str
 def test_what_changed_is_read_again(filled, reads: list[str]) -> None:
     store, ids = filled
     list_runs(store)
-    store.relabel(store.read_whole(ids[0]), "another")
+    store.rewrite(store.read_whole(ids[0]), study="another")
     record = store.folder(ids[1]) / "run.json"
     record.write_text(json.dumps(json.loads(record.read_text()) | {"reason": "edited by hand"}))
     store.remove(ids[2])

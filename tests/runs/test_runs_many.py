@@ -16,7 +16,7 @@ from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunErro
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
 from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
-from dynslam_bench.runs.many import pack, unpack
+from dynslam_bench.runs.running import pack, unpack
 
 
 def specs(folder: str, seeds: range, **change) -> list[RunSpec]:
