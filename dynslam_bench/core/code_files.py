@@ -18,7 +18,6 @@ _TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".y
 _LARGEST_TEXT = 1 << 20
 _WORD = re.compile(rb"[\w./~+\-]+")
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
-_IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([A-Za-z_]\w*)|import[ \t]+([A-Za-z_][\w., \t]*))", re.MULTILINE)
 _SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
 _STORE = ("index.sqlite", "sequences", "latest")
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
@@ -81,12 +80,9 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
     """
     modules: set[str] = set()
     for file in filter(is_python, files):
-        source = file.read_bytes()
         try:
-            nodes = list(ast.walk(ast.parse(source)))
+            nodes = list(ast.walk(ast.parse(file.read_bytes())))
         except (SyntaxError, ValueError, RecursionError):  # of another version of Python
-            for single, several in _IMPORT.findall(source):
-                modules |= {name.strip() for name in (single or several).decode().split(",")}
             continue
         for node in nodes:
             if isinstance(node, ast.Import):

@@ -157,7 +157,7 @@ def test_points_of_images_are_skipped(tmp_path: Path) -> None:
 def test_a_changed_file_has_lost_its_provenance(store: RunStore, run: RunRecord) -> None:
     folder = export_run(run, "tum", results=store).folder
     assert stated_provenance(folder / "trajectory.txt").startswith("final trajectory of run")
-    assert Provenance.read(folder / "provenance.json").overrides == run.overrides
+    assert Provenance.read(folder / "provenance.json").run.overrides == run.overrides
     (folder / "trajectory.txt").write_text((folder / "trajectory.txt").read_text() + "# edited\n")
     assert stated_provenance(folder / "trajectory.txt") == ""
     (folder / "provenance.json").write_text(json.dumps({"run_id": "../../x"}))
