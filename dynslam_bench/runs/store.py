@@ -304,11 +304,9 @@ class RunStore:
     def _with_alarm(self, record: RunRecord, work: Path) -> RunRecord:
         """The record, with a note where an earlier run of its id, which should be equal, gave another trajectory."""
         earlier = self.get(record.run_id)
-        if earlier is None or not record.tracker.deterministic or record.realtime:
+        if earlier is None or not record.tracker.deterministic or record.realtime or earlier.status != "ok":
             return record
-        if earlier.status != "ok" or record.status != "ok":
-            return record
-        if _content(work / ONLINE) == _content(self.folder(record.run_id) / ONLINE):
+        if record.status != "ok" or _content(work / ONLINE) == _content(self.folder(record.run_id) / ONLINE):
             return record
         note = (
             f"an earlier run with this id, started {earlier.started}, gave another trajectory, although tracker "
@@ -376,12 +374,10 @@ class RunStore:
 
     def get(self, run_id: str) -> RunRecord | None:
         """The record of a run by its full id, None if it is not stored or damaged."""
-        if not (self.folder(run_id) / RUN_FILE).is_file():
-            return None
-        try:
-            return self.read_whole(run_id)
-        except DynslamError:
-            return None
+        is_stored = (self.folder(run_id) / RUN_FILE).is_file()
+        with contextlib.suppress(DynslamError):
+            return self.read_whole(run_id) if is_stored else None
+        return None
 
     def read_whole(self, run_id: str) -> RunRecord:
         """The record of a run by its full id.
@@ -418,9 +414,9 @@ class RunStore:
         Raises:
             RunError: No run, or more than one, begins so.
         """
-        run_ids = self.ids()
         if prefix == "latest" and (self.root / "latest").exists():
             return (self.root / "latest").resolve().name
+        run_ids = self.ids()
         matching = [run_id for run_id in run_ids if run_id.startswith(prefix)] if prefix else []
         if len(matching) == 1:
             return matching[0]
@@ -460,15 +456,11 @@ class RunStore:
         Metrics hold for one version of the evaluation code and one state of the trajectories and the ground truth.
         """
         text = self.index.get(_metrics_of(protocol), evaluation_code(), record.run_id)
-        if text is None:
-            return None
-        try:
-            metrics = MetricRecord.parse(text, f"metrics of run {record.run_id}")
-        except DynslamError as error:
-            LOGGER.warning("run %s is scored again: %s", record.run_id, error)
-            return None
-        is_right = (metrics.run_id, metrics.protocol_digest) == (record.run_id, protocol.digest())
-        return metrics if is_right else None
+        with contextlib.suppress(DynslamError):  # damaged: the run is scored again
+            metrics = None if text is None else MetricRecord.parse(text, f"metrics of run {record.run_id}")
+            if metrics and (metrics.run_id, metrics.protocol_digest) == (record.run_id, protocol.digest()):
+                return metrics
+        return None
 
     def add_metrics(self, record: RunRecord, metrics: MetricRecord, state: str = "") -> None:
         """Keep a run's metrics under a protocol, for its state when they were computed or, without one, the present."""
