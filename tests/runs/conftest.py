@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / package) for package in ("envs", "core", "reports")]
+sys.path.extend(str(Path(__file__).resolve().parents[1] / package) for package in ("envs", "core", "reports"))
 
 from envs_toys import write_folder
 
