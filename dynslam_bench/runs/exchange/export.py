@@ -92,7 +92,9 @@ def export_run(
     record = store.read(run) if isinstance(run, str) else run
     chosen, trajectory = _trajectory(store, record, which)
     target = store.root / "exports" / record.run_id / form if folder is None else Path(folder).expanduser().absolute()
-    _check_target(target)
+    is_free = target.is_dir() and (not any(target.iterdir()) or (target / PROVENANCE_FILE).is_file())
+    if target.exists() and not is_free:  # only a folder that an export made, or an empty one, is replaced
+        raise RunError(f"{target} exists and is no export", "name a folder that does not exist, with -o")
     with atomic_folder(target) as work:
         notes = FORMATS[form](_Job(store, record, chosen, trajectory, data_root, camera), work)
         digests = {path.name: digest_of(path) for path in sorted(work.iterdir()) if path.is_file()}
@@ -101,18 +103,6 @@ def export_run(
         provenance = Provenance(format=form, files=digests, which=chosen, run=public, written_by=written_by)
         write_atomic(work / PROVENANCE_FILE, provenance.to_json())
     return Exported(target, (*digests, PROVENANCE_FILE), chosen, tuple(notes))
-
-
-def _check_target(target: Path) -> None:
-    """Only a folder that an export made, or an empty one, is replaced.
-
-    Raises:
-        RunError: It holds something else, or is a file.
-    """
-    if target.is_dir() and (not any(target.iterdir()) or (target / PROVENANCE_FILE).is_file()):
-        return
-    if target.exists():
-        raise RunError(f"{target} exists and is no export", "name a folder that does not exist, with -o")
 
 
 def _trajectory(store: RunStore, record: RunRecord, which: Which | None) -> tuple[Which, Trajectory]:
@@ -158,7 +148,8 @@ def _mcap(job: _Job, work: Path) -> list[str]:
 def _colmap(job: _Job, work: Path) -> list[str]:
     sequence = open_stored(job.record, job.data_root, job.camera)
     at, poses = associate(sequence.timestamps, job.trajectory.timestamps, _STAMP_TOLERANCE_S)
-    names = image_names(sequence)
+    files: dict[float, str] = getattr(sequence, "colour_files", {})  # without files they are named as TUM names them
+    names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]
     cloud = job.store.folder(job.record.run_id) / "map.ply"
     write_colmap(
         work,
@@ -275,9 +266,3 @@ def open_stored(record: RunRecord, data_root: str | Path | None = None, camera: 
     if part_of(sequence, record.offset).content != record.sequence.content:
         raise RunError(f"the content of {record.sequence.id} has changed since the run")
     return sequence
-
-
-def image_names(sequence: Sequence) -> list[str]:
-    """The colour image of every frame, relative to the sequence's folder; TUM's way of naming where it has no files."""
-    colour_files: dict[float, str] = getattr(sequence, "colour_files", {})
-    return [colour_files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]

@@ -288,9 +288,9 @@ def bound_log(log: Path, most: int) -> None:
     """Keep of a log that is longer than `most` bytes its beginning and its end; processes may append to it."""
     if not log.is_file() or log.stat().st_size <= most:
         return
-    with log.open("r+b") as file:
+    with contextlib.suppress(OSError), log.open("r+b") as file:  # a full disk: the log stays as far as it came
         file.seek(-_KEPT, os.SEEK_END)
         end = file.read()
-        file.truncate(_KEPT)  # the processes append, so that they go on at the new end
-    with log.open("ab") as file:
+        file.truncate(_KEPT)
+        file.seek(0, os.SEEK_END)  # the processes append, so that they go on behind it
         file.write(b"\n\n[... the middle of the log was cut here ...]\n\n" + end)
