@@ -201,7 +201,7 @@ def finish(
 ) -> None:
     """Make runs, show them, and exit with 3 if some failed, were lost or cannot be made, or lack a requested map."""
     from dynslam_bench.runs import RunStore
-    from dynslam_bench.runs.many import pictures_asked
+    from dynslam_bench.runs.running import pictures_asked
     from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
     from dynslam_bench.segmentation.networks.checkpoints import fetch_checkpoint
     from dynslam_bench.slam.map_files import MAP_FILE
@@ -328,7 +328,7 @@ def dask_executor(address: str) -> Any:
 
 def describe_plan(runs: Collection[ResolvedRun], store: RunStore, jobs: int) -> str:
     """How many frames will be tracked, and the expected time by stored runs of the same trackers."""
-    from dynslam_bench.runs.one import PROGRESS_EVERY
+    from dynslam_bench.runs.running import PROGRESS_EVERY
 
     frames = sum(len(run.sequence) for run in runs)
     text = f"{len(runs)} run{'s' * (len(runs) != 1)}, {frames} frames"

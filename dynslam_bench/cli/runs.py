@@ -27,7 +27,7 @@ from dynslam_bench.core.toml import label_text
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import MetricRecord, RunRecord, RunSpec, RunStore
-    from dynslam_bench.runs.run_index import Row
+    from dynslam_bench.runs.store import Row
 
 TITLES = {
     "run_id": "run",
@@ -194,7 +194,7 @@ def rm(
 def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
     from dynslam_bench.core.toml import assignments
-    from dynslam_bench.runs.run_index import part_words
+    from dynslam_bench.runs.store import part_words
 
     return {
         "run": record.run_id,
@@ -243,7 +243,7 @@ def closed_loops(store: RunStore, run_id: str) -> int | None:
 
 def show_runs(records: Sequence[RunRecord], store: RunStore, protocol: str, reused: Collection[str] = ()) -> None:
     """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are marked as from the store."""
-    from dynslam_bench.runs.run_index import run_row
+    from dynslam_bench.runs.store import run_row
 
     scored = [(record, None if record.status == "stopped" else store.score(record, protocol)) for record in records]
     show_rows([run_row(*pair) | {"from_store": pair[0].run_id in reused} for pair in scored], store, protocol)

@@ -18,7 +18,6 @@ _TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".y
 _LARGEST_TEXT = 1 << 20
 _WORD = re.compile(rb"[\w./~+\-]+")
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
-_IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([A-Za-z_]\w*)|import[ \t]+([A-Za-z_][\w., \t]*))", re.MULTILINE)
 _SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
 _STORE = ("index.sqlite", "sequences", "latest")
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
@@ -81,12 +80,9 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
     """
     modules: set[str] = set()
     for file in filter(is_python, files):
-        source = file.read_bytes()
         try:
-            nodes = list(ast.walk(ast.parse(source)))
+            nodes = list(ast.walk(ast.parse(file.read_bytes())))
         except (SyntaxError, ValueError, RecursionError):  # of another version of Python
-            for single, several in _IMPORT.findall(source):
-                modules |= {name.strip() for name in (single or several).decode().split(",")}
             continue
         for node in nodes:
             if isinstance(node, ast.Import):
@@ -145,7 +141,7 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
     files = [] if program is None or not _is_file(program) else [program, *_linked_libraries(program.resolve())]
     for word in command[1:]:
         for path in {base / Path(text).expanduser() for text in (word, word.partition("=")[2]) if text}:
-            files += files_below(path) if _is_folder(path) else [path] if _is_file(path) else []
+            files += files_below(path) if os.path.isdir(path) else [path] if _is_file(path) else []  # noqa: PTH112
     if program is not None and program.name.startswith("python") and "-m" in command[:-1]:
         files += _module_files(command[command.index("-m") + 1], base)
     named = _with_named_files(files, base)
@@ -183,9 +179,6 @@ def _linked_libraries(program: Path) -> list[Path]:
     """The shared libraries of a program that are none of the operating system's, as ``ldd`` finds them."""
     if _is_of_system(program) or shutil.which("ldd") is None:
         return []
-    with program.open("rb") as file:
-        if file.read(4) != b"\x7fELF":
-            return []
     listed = subprocess.run(["ldd", str(program)], capture_output=True, text=True, check=False).stdout
     paths = [Path(match) for match in re.findall(r"=> (/.+) \(0x", listed)]
     return [path for path in paths if not _is_of_system(path) and path.is_file()]
@@ -240,17 +233,7 @@ def _is_of_system(path: Path) -> bool:
 
 
 def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file() and os.access(path, os.R_OK)
-    except (OSError, ValueError):  # a word that cannot be a path
-        return False
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):
-        return False
+    return os.path.isfile(path) and os.access(path, os.R_OK)  # noqa: PTH113 - it takes words that cannot be a path
 
 
 def leads_back(entry: Path) -> bool:

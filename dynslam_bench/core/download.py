@@ -1,4 +1,4 @@
-"""Resumable download of one file over HTTP, bounded in size and time.
+"""Resumable download of one file over HTTP, bounded in size.
 
 Nothing heavy is imported before something is downloaded.
 """
@@ -11,7 +11,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 CHUNK = 1 << 18
 MOST_BYTES = 32 * 2**30
-DEADLINE_S = 24 * 3600.0
 _LONGEST_PAUSE_S = 30.0
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EIO)
 _GO_ON = "run the same command again, it goes on from there"
@@ -70,7 +69,6 @@ def download(
     wait_s: float = 1.0,
     timeout_s: float = 30.0,
     most_bytes: int = MOST_BYTES,
-    deadline_s: float = DEADLINE_S,
 ) -> str:
     """Download a file; what an earlier call got is kept, and the download goes on where that stopped.
 
@@ -85,56 +83,45 @@ def download(
         wait_s: Pause before the second attempt, doubled before each further one.
         timeout_s: How long a connection may be silent.
         most_bytes: A longer file is refused.
-        deadline_s: How long all of it may take.
 
     Returns:
         SHA-256 of the file.
 
     Raises:
         DownloadError: The address is none; the server cannot be reached, refuses, redirects to something else than the
-            web, or announces another length than it sends; the file is too long or takes too long; the disk is full;
-            the checksum is wrong (then the bytes are thrown away), or another process downloads the same file.
+            web, or announces another length than it sends; the file is too long; the disk is full; the checksum is
+            wrong (then the bytes are thrown away), or another process downloads the same file.
+        DynslamError: The folder cannot be written.
     """
     check_address(url, checked=sha256 is not None)
     part = target.with_name(target.name + ".part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            if not stack.enter_context(_claimed(part.with_name(part.name + ".lock"))):
+            if not stack.enter_context(claimed(part.with_name(part.name + ".lock"))):
                 raise DownloadError(
                     f"another process is downloading {url}", "wait for it, then run the same command again"
                 )
             if progress is None:
                 progress = stack.enter_context(_display[0](target.name)) if _display else lambda _: None
-            partial = _Partial(url, part, progress, timeout_s, most_bytes, deadline_s)
-            whole = target.is_file()
-            if not whole:
+            partial = _Partial(url, part, progress, timeout_s, most_bytes)
+            if not target.is_file():
                 partial.complete(attempts, wait_s)
-            checksum = file_sha256(target if whole else part, progress)
+            file = target if target.is_file() else part
+            checksum = file_sha256(file, progress)
             if sha256 is not None and not checksum.startswith(sha256):
-                size = (target if whole else part).stat().st_size
-                target.unlink(missing_ok=True)
+                size = file.stat().st_size
+                file.unlink()
                 partial.forget()
                 raise DownloadError(
                     f"{url} has the checksum {checksum} ({size} bytes), expected {sha256}",
                     "the bytes were thrown away; fetch again, or skip the checksum if the publisher changed the file",
                 )
-            if not whole:
-                part.replace(target)
+            file.replace(target)
             partial.forget()  # also what a process left that was killed between these two lines
             return checksum
     except OSError as error:
         raise DownloadError(f"cannot write {target}: {error.strerror or error}", "name another folder") from error
-
-
-@contextlib.contextmanager
-def _claimed(lock: Path) -> Iterator[bool]:
-    with contextlib.ExitStack() as stack:
-        try:
-            mine = stack.enter_context(claimed(lock))
-        except DynslamError as error:
-            raise DownloadError(str(error.args[0]), error.hint) from error
-        yield mine
 
 
 def file_sha256(path: Path, progress: Report | None = None) -> str:
@@ -149,16 +136,15 @@ def file_sha256(path: Path, progress: Report | None = None) -> str:
     return value.hexdigest()
 
 
+@dataclass(frozen=True)
 class _Partial:
-    """A partial download with its notes: where it came from, its length, and what the server calls that version."""
+    """A partial download with its notes: where it came from, and what the server calls that version."""
 
-    def __init__(
-        self, url: str, part: Path, report: Report, timeout_s: float, most_bytes: int, deadline_s: float
-    ) -> None:
-        self.url, self.part, self.report, self.timeout_s = url, part, report, timeout_s
-        self.most_bytes, self.deadline_s = most_bytes, deadline_s
-        self._notes = part.with_name(part.name + ".json")
-        self._end = time.monotonic() + deadline_s
+    url: str
+    part: Path
+    report: Report
+    timeout_s: float
+    most_bytes: int
 
     def complete(self, attempts: int, wait_s: float) -> None:
         """Connect until the file is whole.
@@ -169,28 +155,29 @@ class _Partial:
         import http.client
         import urllib.error
 
-        fruitless, pause_s, best, reason = 0, wait_s, self._size(), ""
+        fruitless, best, total, reason = 0, self._size(), None, ""
         while fruitless < attempts:
-            self._check(self._size())
             try:
-                if self._connect():
-                    return
+                with self._connect() as response:
+                    total = self._total(response)
+                    if self._receive(response, total):
+                        return
                 reason = "the server closed the connection early"
             except urllib.error.HTTPError as error:
+                if error.code == 416 and self._size():
+                    if error.headers.get("Content-Range", "").rpartition("/")[2] == str(self._size()):
+                        return
+                    self.forget()  # longer than the file on the server, or the server does not say: begin again
                 reason = f"the server answers {error.code} {error.reason}"
-                if error.code < 500 and error.code not in (408, 429):
+                if error.code < 500 and error.code not in (408, 416, 429):
                     raise DownloadError(f"{reason} for {self.url}") from error
             except (OSError, http.client.HTTPException, ValueError) as error:  # no route, time-out, TLS, odd redirect
                 reason = str(getattr(error, "reason", "") or error) or type(error).__name__
-            if self._size() > best:
-                fruitless, pause_s, best = 0, wait_s, self._size()
-                continue
-            fruitless += 1
-            if fruitless < attempts:
-                time.sleep(pause_s)
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-        announced = self._read_notes().get("total")
-        expected = f" of {announced}" if announced else ""
+            fruitless = 0 if self._size() > best else fruitless + 1
+            best = max(best, self._size())
+            if 0 < fruitless < attempts:
+                time.sleep(min(2 ** (fruitless - 1) * wait_s, _LONGEST_PAUSE_S))
+        expected = f" of {total}" if total else ""
         raise DownloadError(f"download of {self.url} stopped at {self._size()}{expected} bytes: {reason}", _GO_ON)
 
     def forget(self) -> None:
@@ -198,57 +185,54 @@ class _Partial:
         self.part.unlink(missing_ok=True)
         self._notes.unlink(missing_ok=True)
 
-    def _connect(self) -> bool:
-        """One request from where the file ends; True if it is whole afterwards."""
-        from urllib.error import HTTPError
+    def _connect(self) -> Any:
+        """Ask for what is missing, if the server still has the version that the file was begun with."""
         from urllib.request import Request
 
-        start, notes = self._size(), self._read_notes()
-        if start and notes.get("url") != without_passwords(self.url):
-            self.forget()
-            start, notes = 0, {}
-        request = Request(self.url, headers={"User-Agent": "dynslam-bench", "Accept-Encoding": "identity"})
-        if start:
-            request.add_header("Range", f"bytes={start}-")
-            if validator := notes.get("etag") or notes.get("modified"):
-                request.add_header("If-Range", validator)
         try:
-            response = connect(request, self.timeout_s)
-        except HTTPError as error:
-            if error.code != 416 or not start:
-                raise
-            if (error.headers.get("Content-Range") or "").rpartition("/")[2] == str(start):
-                return True
-            self.forget()  # longer than the file on the server, or the server does not say: begin again
-            return False
-        with response:
-            if start and response.status == 206:
-                if not (response.headers.get("Content-Range") or "").startswith(f"bytes {start}-"):
-                    self.forget()  # another range than was asked for
-                    return False
-            elif start:
-                start = 0  # the whole file comes: the server knows no ranges, or the file has changed
-            length = response.headers.get("Content-Length")
-            total = start + int(length) if length is not None and length.isdigit() else None
-            self._write_notes(total, response.headers)
-            self._check(total or start)
-            free = shutil.disk_usage(self.part.parent).free
-            if total is not None and total - start > free:
-                raise DownloadError(
-                    f"{self.part.parent} has {free / 1e9:.2f} GB free, but {(total - start) / 1e9:.2f} GB are still to "
-                    "download",
-                    "make room, or name another folder",
-                )
-            return self._receive(response, start, total)
+            notes = dict(read_json(self._notes))
+        except (DynslamError, TypeError, ValueError):
+            notes = {}
+        if notes.get("url") != without_passwords(self.url):
+            self.forget()
+        request = Request(self.url, headers={"User-Agent": "dynslam-bench", "Accept-Encoding": "identity"})
+        if self._size():
+            request.add_header("Range", f"bytes={self._size()}-")
+            if notes.get("version"):
+                request.add_header("If-Range", notes["version"])
+        return connect(request, self.timeout_s)
 
-    def _receive(self, response: Any, start: int, total: int | None) -> bool:
+    def _total(self, response: Any) -> int | None:
+        """The length of the whole file, if the server says it; an answer that does not go on begins the file again."""
+        headers = response.headers
+        is_rest = headers.get("Content-Range", "").startswith(f"bytes {self._size()}-")
+        if response.status != 206 or not is_rest:
+            self.forget()  # the server knows no ranges, or the file has changed
+        if response.status == 206 and not is_rest:
+            raise ValueError("the server sends another range than was asked for")
+        etag = headers.get("ETag") or "W/"
+        version = headers.get("Last-Modified") if etag.startswith("W/") else etag  # a weak one validates no range
+        with contextlib.suppress(OSError):  # without notes the next call begins again, which is safe
+            self._notes.write_text(json.dumps({"url": without_passwords(self.url), "version": version}))
+        if not headers.get("Content-Length", "").isdigit():
+            return None
+        missing, free = int(headers["Content-Length"]), shutil.disk_usage(self.part.parent).free
+        self._check(self._size() + missing)
+        if missing > free:
+            raise DownloadError(
+                f"{self.part.parent} has {free / 1e9:.2f} GB free, but {missing / 1e9:.2f} GB are still to download",
+                "make room, or name another folder",
+            )
+        return self._size() + missing
+
+    def _receive(self, response: Any, total: int | None) -> bool:
         """Append the body to the file; True if it came to its announced end."""
         from http.client import IncompleteRead
 
-        done = start
+        done = self._size()
         try:
-            with self.part.open("r+b" if start else "wb") as file:
-                file.seek(start)
+            with self.part.open("r+b" if done else "wb") as file:
+                file.seek(done)
                 while True:
                     try:
                         block = response.read1(CHUNK)
@@ -257,9 +241,9 @@ class _Partial:
                         return False
                     if not block:
                         return total is None or done == total
-                    self._check(done + len(block))
-                    file.write(block)
                     done += len(block)
+                    self._check(done)
+                    file.write(block)
                     self.report(Progress("download", done, total))
         except OSError as error:
             if error.errno not in _DISK_ERRORS:
@@ -270,37 +254,18 @@ class _Partial:
             ) from error
 
     def _check(self, size: int) -> None:
-        """Refuse what is too long, and throw away what came of it; end what takes too long, and keep it."""
+        """Refuse what is too long, and throw away what came of it."""
         if size > self.most_bytes:
             self.forget()
             expected = f"the {self.most_bytes / 1e9:.2f} GB that are expected"
             raise DownloadError(f"{self.url} is longer than {expected}, refused")
-        if time.monotonic() > self._end:
-            raise DownloadError(
-                f"download of {self.url} stopped at {self._size()} bytes: it took longer than {self.deadline_s:g} s",
-                _GO_ON,
-            )
 
     def _size(self) -> int:
         return self.part.stat().st_size if self.part.exists() else 0
 
-    def _read_notes(self) -> dict[str, Any]:
-        try:
-            notes = read_json(self._notes)
-        except DynslamError:
-            return {}
-        return notes if isinstance(notes, dict) else {}
-
-    def _write_notes(self, total: int | None, headers: Any) -> None:
-        etag = headers.get("ETag")
-        notes = {
-            "url": without_passwords(self.url),
-            "total": total,
-            "etag": None if etag is None or etag.startswith("W/") else etag,  # a weak one cannot validate a range
-            "modified": headers.get("Last-Modified"),
-        }
-        with contextlib.suppress(OSError):  # without notes the next call begins again, which is safe
-            self._notes.write_text(json.dumps(notes))
+    @property
+    def _notes(self) -> Path:
+        return self.part.with_name(self.part.name + ".json")
 
 
 def check_address(url: str, *, checked: bool) -> SplitResult:
@@ -352,17 +317,7 @@ def connect(request: Request, timeout_s: float) -> Any:
                 )
             return super().redirect_request(req, fp, code, msg, headers, newurl)
 
-    opener = urllib.request.OpenerDirector()
-    for handler in (
-        urllib.request.ProxyHandler,
-        urllib.request.HTTPHandler,
-        urllib.request.HTTPSHandler,
-        urllib.request.HTTPDefaultErrorHandler,
-        urllib.request.HTTPErrorProcessor,
-        Redirect,
-    ):
-        opener.add_handler(handler())
-    return opener.open(request, timeout=timeout_s)
+    return urllib.request.build_opener(Redirect).open(request, timeout=timeout_s)
 
 
 def _is_loopback(host: str) -> bool:

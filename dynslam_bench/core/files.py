@@ -134,18 +134,18 @@ def _reserve(path: Path, make: Callable[[Path], None]) -> tuple[Path, int]:
     return fresh.rename(fresh.with_suffix(".tmp")), lock
 
 
-def sweep_temporary(folder: Path, pattern: str = "") -> int:
+def sweep_temporary(folder: Path, pattern: str = ".*") -> int:
     """Remove the temporary files and folders that killed processes left in a folder; returns how many.
 
     Args:
         folder: Where; nothing happens if it is missing.
-        pattern: Of folders below it to look into instead, e.g. ``*/*``.
+        pattern: Of the paths below it to look at, e.g. ``runs/.*``.
     """
     removed = 0
-    for path in folder.glob(f"{pattern}/.*" if pattern else ".*"):
+    for path in folder.glob(pattern):
         if not _TEMPORARY.fullmatch(path.name) or not is_abandoned(path):
             continue
-        with contextlib.suppress(OSError):  # another process was faster
+        with contextlib.suppress(OSError):  # another process was faster, or it is another user's
             if path.suffix == ".tmp" or time.time() - path.stat().st_mtime > _NEW_S:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
                 removed += 1
@@ -266,7 +266,7 @@ def _lock(handle: int) -> bool | None:
 
 # -- private temporary folders, which are removed with the process that made them, also when that is killed ------------
 
-_PREFIX = "dynslam-held-"
+_PRIVATE = "dynslam-private"
 SHARED_MEMORY = Path("/dev/shm")
 
 
@@ -283,9 +283,8 @@ class TemporaryFolder:
     """
 
     def __init__(self, base: Path | None = None) -> None:
-        fresh = Path(tempfile.mkdtemp(prefix=f"new-{_PREFIX}", dir=base))
-        lock = hold(fresh)
-        self.path = fresh.rename(fresh.with_name(fresh.name.removeprefix("new-")))  # from now on `sweep` sees it
+        parent = Path(tempfile.gettempdir()) if base is None else base
+        self.path, lock = _reserve(parent / _PRIVATE, lambda fresh: fresh.mkdir(mode=0o700))
         self._remove = weakref.finalize(self, _remove, self.path, lock, os.getpid())
 
     def close(self) -> None:
@@ -294,23 +293,8 @@ class TemporaryFolder:
 
 
 def sweep() -> int:
-    """Remove this user's folders whose process is no more; returns how many there were."""
-    abandoned = [
-        folder
-        for base in {Path(tempfile.gettempdir()), SHARED_MEMORY}
-        for folder in base.glob(f"{_PREFIX}*")
-        if _is_mine(folder) and is_abandoned(folder)
-    ]
-    for folder in abandoned:
-        shutil.rmtree(folder, ignore_errors=True)
-    return len(abandoned)
-
-
-def _is_mine(folder: Path) -> bool:
-    try:
-        return folder.is_dir() and folder.stat().st_uid == os.getuid()
-    except OSError:  # its process has just removed it
-        return False
+    """Remove this user's `TemporaryFolder`s whose process is no more; returns how many there were."""
+    return sum(sweep_temporary(base, f".{_PRIVATE}.*") for base in {Path(tempfile.gettempdir()), SHARED_MEMORY})
 
 
 def _remove(path: Path, lock: int, owner: int) -> None:

@@ -39,43 +39,35 @@ _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""
 _OWN = "dynslam_bench"
 _FILE_PREFIXES = ("onnx", "weights", "recorded")
-_LONGEST_PATH = 1000
 
 
 # -- what settings name ------------------------------------------------------------------------------------------------
 
 
-def named_files(settings: Settings) -> dict[str, Path]:
-    """The files and folders that settings name, by the setting's name, where they are there.
+def named_digests(settings: Settings) -> dict[str, str]:
+    """Digest of the content of every file and folder that settings name and that is there, by the setting's name.
 
     A setting counts that is declared to name a file (`core.settings.names`, or of type `Path`), that carries one of the
     prefixes ``onnx:``, ``weights:`` and ``recorded:``, or that is written as the path of a file: with a separator. A
     bare word is a word, whatever lies in the working folder.
-    """
-    texts = {name: value for name, (kind, value) in named(settings).items() if kind == "file"}
-    for name, value in flatten(settings).items():
-        for path, text in _texts(name, value):
-            prefix, _, argument = text.partition(":")
-            if path in texts:
-                continue
-            if prefix in _FILE_PREFIXES and argument:
-                texts[path] = argument
-            elif os.sep in text and len(text) < _LONGEST_PATH and Path(text).expanduser().is_file():
-                texts[path] = text
-    paths = {name: Path(text).expanduser() for name, text in texts.items()}
-    return {name: path for name, path in paths.items() if path.exists()}
-
-
-def named_digests(settings: Settings) -> dict[str, str]:
-    """Digest of the content of every file and folder that settings name, by the setting's name.
 
     Raises:
         PluginError: One cannot be read.
     """
+    texts = {name: value for name, (kind, value) in named(settings).items() if kind == "file"}
+    for name, value in flatten(settings).items():
+        for setting, text in _texts(name, value):
+            prefix, _, argument = text.partition(":")
+            if prefix in _FILE_PREFIXES and argument:
+                texts.setdefault(setting, argument)
+            elif os.sep in text and os.path.isfile(Path(text).expanduser()):  # noqa: PTH113 - any text
+                texts.setdefault(setting, text)
     digests = {}
-    for name, path in named_files(settings).items():
+    for name, text in texts.items():
+        path = Path(text).expanduser()
         try:
-            digests[name] = path_digest(path)[:16]
+            if path.exists():
+                digests[name] = path_digest(path)[:16]
         except OSError as error:
             raise PluginError(f"cannot read {path}, which the setting '{name}' names: {error.strerror}") from error
     return digests

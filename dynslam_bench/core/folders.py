@@ -1,7 +1,7 @@
 """Every folder outside the working directory that this package reads or writes, and the variable that moves it.
 
 Below the user's cache folder lie ``data/`` (sequences), ``stages/`` (the stage cache), ``digests/`` (digests of file
-contents, see `core.digests`), ``weights/`` (downloaded checkpoints) and ``vocabularies/`` (decompressed ORB
+contents, see `core.fingerprint`), ``weights/`` (downloaded checkpoints) and ``vocabularies/`` (decompressed ORB
 vocabularies). Compiled kernels lie where numba puts them: beside the source, or in its own folder
 (``NUMBA_CACHE_DIR``).
 """

@@ -111,32 +111,28 @@ class Registry(Generic[P]):
         self._failures = []
 
     def _discover(self) -> dict[str, Found[P]]:
-        if self._found is not None:
-            return self._found
-        plugins: dict[str, Found[P]] = {}
-        self._failures = []
+        if self._found is None:
+            self._found = {}
+            for spec in self._builtin():
+                self._add(spec, "built in")
+            for target in _environment_targets(self.kind):
+                self._add(target, f"{ENVIRONMENT_VARIABLE}: {target}")
+            for point in sorted(entry_points(group=f"dynslam_bench.{self.kind}"), key=attrgetter("name")):
+                distribution = point.dist.name if point.dist else "unknown distribution"
+                self._add(f"{point.module}:{point.attr}", f"entry point '{point.name}' of {distribution}")
+        return self._found
 
-        def add(load: Callable[[], object], source: str) -> None:
-            try:
-                spec = self._check(load(), source)
-            except Exception as error:  # a foreign plug-in may raise anything; the reason is kept
-                self._failures.append(Failure(source, _reason(error)))
-                return
-            if spec.id in plugins:
-                self._failures.append(Failure(source, f"id '{spec.id}' is already taken by {plugins[spec.id].source}"))
-                return
-            plugins[spec.id] = Found(spec, source)
-
-        for spec in self._builtin():
-            add(lambda spec=spec: spec, "built in")  # type: ignore[misc]
-        for target in _environment_targets(self.kind):
-            add(lambda target=target: load_object(target), f"{ENVIRONMENT_VARIABLE}: {target}")  # type: ignore[misc]
-        for point in sorted(entry_points(group=f"dynslam_bench.{self.kind}"), key=lambda point: point.name):
-            distribution = point.dist.name if point.dist else "unknown distribution"
-            target = f"{point.module}:{point.attr}"
-            add(lambda target=target: load_object(target), f"entry point '{point.name}' of {distribution}")  # type: ignore[misc]
-        self._found = plugins
-        return plugins
+    def _add(self, plugin: P | str, source: str) -> None:
+        """Take a spec, or the object that a target names; keep the reason if that is not possible."""
+        assert self._found is not None
+        try:
+            spec = self._check(load_object(plugin) if isinstance(plugin, str) else plugin, source)
+            if spec.id in self._found:
+                raise PluginError(f"id '{spec.id}' is already taken by {self._found[spec.id].source}")
+        except Exception as error:  # a foreign plug-in may raise anything
+            self._failures.append(Failure(source, _reason(error)))
+        else:
+            self._found[spec.id] = Found(spec, source)
 
     def _not_built_in(self, spec: P, source: str) -> P:
         """Refuse a plug-in under the id of a built-in one: tables could not tell them apart."""

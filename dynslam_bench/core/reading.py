@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,40 +121,21 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
     Raises:
         DynslamError: Of the given kind: it cannot be read, is damaged, or holds or claims more than `MOST_BYTES`.
     """
+    import numpy as np
+
     data = read_bytes(path, limit=MOST_BYTES, kind=kind)
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            entries = archive.infolist()
-            claimed = sum(entry.file_size for entry in entries)
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            claimed = sum(entry.file_size for entry in archive.zip.infolist())
             if claimed > MOST_BYTES:
-                raise kind(f"{path} claims {claimed / 1e6:.0f} MB of arrays, at most {MOST_BYTES / 1e6:.0f} are read")
-            return {entry.filename.removesuffix(".npy"): _array(archive.read(entry)) for entry in entries}
-    except DynslamError:
-        raise
+                raise ValueError(f"it claims {claimed / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read")
+            arrays = dict(archive)
     except Exception as error:  # zipfile and numpy raise almost anything over damaged files
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise kind(f"{path} holds no arrays: {reason}") from error
-
-
-def _array(content: bytes) -> NDArray[Any]:
-    """One array; its header is read first, because numpy takes the memory that it claims.
-
-    Raises:
-        ValueError: It claims more than it holds, or holds objects.
-    """
-    import numpy as np
-
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = header(stream)
-    claimed = dtype.itemsize
-    for size in shape:
-        claimed *= int(size)
-    if claimed != len(content) - stream.tell():
-        raise ValueError(f"it claims {dtype} of shape {str(shape)[:60]}, which it does not hold")
-    array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    return array
+    if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise kind(f"{path} holds something else than arrays")
+    return arrays
 
 
 def _reason(error: OSError | ValueError) -> str:

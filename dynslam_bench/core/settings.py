@@ -111,6 +111,8 @@ def tunable(
         online: True if the field may change in mid-episode.
         choices: The values that studies try, for fields that accept more than these (e.g. free text).
     """
+    if scale == "log" and (low is None or low <= 0):
+        raise ValueError(f"a log scale needs low > 0, got {low=}")
     annotation: dict[str, Any] = {
         "low": low,
         "high": high,
@@ -119,15 +121,8 @@ def tunable(
         "online": online,
         "choices": list(choices or ()),
     }
-    if scale == "log" and (low is None or low <= 0):
-        raise ValueError(f"a log scale needs low > 0, got {low=}")
-    accepted = limits if limits is not None else (low, high)
-    bounds: dict[str, Any] = {}
-    if accepted[0] is not None:
-        bounds["ge"] = accepted[0]
-    if accepted[1] is not None:
-        bounds["le"] = accepted[1]
-    return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, **bounds)
+    least, most = (low, high) if limits is None else limits
+    return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most)
 
 
 def names(default: str, kind: Literal["file", "features", "flow"], *, meaning: str, otherwise: str = "") -> Any:
@@ -187,12 +182,15 @@ def apply_overrides(settings: S, overrides: Mapping[str, Any]) -> S:
     values = settings.model_dump()
     leaves = {name: field for name, field, _ in _leaves(type(settings))}
     for name, value in overrides.items():
-        node, *rest = _walk(values, name.split("."))
-        if name not in leaves or rest:
+        if name not in leaves:
             if any(field.startswith(f"{name}.") for field in leaves):
                 raise SettingsError(f"setting '{name}' is a group", f"set one of {name}.*")
             raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, leaves))
-        node[name.split(".")[-1]] = _parse(value, leaves[name].annotation)
+        *groups, field_name = name.split(".")
+        group = values
+        for key in groups:
+            group = group[key]
+        group[field_name] = _parse(value, leaves[name].annotation)
     return build(type(settings), values)
 
 
@@ -304,7 +302,8 @@ def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
         "online": note["online"],
         "meaning": field.description or "",
     }
-    base = _strip_optional(field.annotation)
+    kinds = [kind for kind in _alternatives(field.annotation) if kind is not type(None)]
+    base = kinds[0] if len(kinds) == 1 else field.annotation
     if note["choices"]:
         return Parameter(kind="categorical", choices=tuple(note["choices"]), **common)
     if base is bool:
@@ -317,22 +316,10 @@ def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
     return Parameter(kind=kind, low=note["low"], high=note["high"], scale=note["scale"], **common)
 
 
-def _strip_optional(annotation: Any) -> Any:
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        inner = [part for part in typing.get_args(annotation) if part is not type(None)]
-        if len(inner) == 1:
-            return inner[0]
-    return annotation
-
-
-def _walk(values: dict[str, Any], path: list[str]) -> tuple[Any, ...]:
-    """The deepest mapping along the path, followed by the part of the path that was not found."""
-    node: Any = values
-    for depth, key in enumerate(path[:-1]):
-        if not isinstance(node, dict) or key not in node:
-            return (node, *path[depth:])
-        node = node[key]
-    return (node,) if isinstance(node, dict) else (node, path[-1])
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
+    """The types that a union allows; another type alone."""
+    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return typing.get_args(annotation) if is_union else (annotation,)
 
 
 def value_of(settings: Settings, name: str) -> Any:
@@ -347,8 +334,7 @@ def _parse(value: Any, annotation: Any) -> Any:
     """A text becomes the JSON value that it spells, unless the field takes the text itself; all else stays as it is."""
     if not isinstance(value, str):
         return value
-    is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
-    kinds = typing.get_args(annotation) if is_union else (annotation,)
+    kinds = _alternatives(annotation)
     texts = [choice for kind in kinds if typing.get_origin(kind) is Literal for choice in typing.get_args(kind)]
     if (str in kinds or Path in kinds or value in texts) and not (value == "null" and type(None) in kinds):
         return value

@@ -9,8 +9,6 @@ over its bound.
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import io
 import os
 from collections import Counter
 from collections.abc import Mapping
@@ -25,13 +23,12 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.folders import STAGES_VARIABLE, stage_cache_folder
+from dynslam_bench.core.reading import read_npz
 
 DEFAULT_MAX_BYTES = 8 * 2**30
 _PRUNE_EVERY = 512
 """Writes between two looks at the cache's size."""
 _SHRINK_TO = 0.8
-_DIGEST = 16
-"""Bytes of the checksum at the beginning of an entry."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -75,15 +72,12 @@ class StageCache:
         """The stored result, or None; a damaged entry is deleted and counts as missing."""
         path = self._path(stage, key)
         try:
-            data = path.read_bytes()
-        except OSError:
-            return None
-        arrays = _unpack(data)
-        if arrays is None:
+            arrays = read_npz(path)
+            cost = float(arrays.pop("cost_s"))
+        except (DynslamError, KeyError):
             with contextlib.suppress(OSError):  # a cache that can only be read keeps its damaged entries
-                path.unlink(missing_ok=True)
+                path.unlink()
             return None
-        cost = float(arrays.pop("cost_s"))
         with contextlib.suppress(OSError):  # evicted by another process meanwhile: the content is in hand
             os.utime(path)
         return Entry(arrays, cost)
@@ -95,13 +89,9 @@ class StageCache:
             DynslamError: The folder cannot be written, e.g. a full disk; nothing is left behind.
         """
         path = self._path(stage, key)
-        buffer = io.BytesIO(bytes(_DIGEST))
-        buffer.seek(_DIGEST)
-        np.savez(buffer, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
-        buffer.getbuffer()[:_DIGEST] = _digest_of(buffer.getbuffer())
         try:
-            with replacing(path) as temporary:
-                temporary.write_bytes(buffer.getbuffer())
+            with replacing(path) as temporary, temporary.open("wb") as file:
+                np.savez(file, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
         except OSError as error:
             raise DynslamError(
                 f"cannot write the stage cache {self.folder}: {error.strerror}",
@@ -149,15 +139,3 @@ class StageCache:
                 status = path.stat()
                 entries.append((status.st_mtime, path, status.st_size))
         return entries
-
-
-def _unpack(data: bytes) -> Arrays | None:
-    """The arrays of an entry, None if a single bit of it is not as it was written."""
-    if data[:_DIGEST] != _digest_of(memoryview(data)):
-        return None
-    with np.load(io.BytesIO(data[_DIGEST:]), allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
-
-
-def _digest_of(entry: memoryview) -> bytes:
-    return hashlib.blake2b(entry[_DIGEST:], digest_size=_DIGEST).digest()

@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
     from dynslam_bench.runs.imported import import_trajectory
-    from dynslam_bench.runs.many import RunEvent, run_many
-    from dynslam_bench.runs.one import run_one
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
+    from dynslam_bench.runs.running import RunEvent, run_many, run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
     from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, score
 
@@ -33,9 +32,9 @@ _HOMES = {
     "read_trajectory": "exchange.formats",
     "resolve": "identity",
     "ResolvedRun": "identity",
-    "run_many": "many",
-    "run_one": "one",
-    "RunEvent": "many",
+    "run_many": "running",
+    "run_one": "running",
+    "RunEvent": "running",
     "RunRecord": "record",
     "RunSpec": "spec",
     "RunStore": "store",

@@ -95,11 +95,9 @@ class FrameRow:
     @classmethod
     def of(cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None) -> FrameRow:
         """The row of a frame that an environment has tracked."""
-        error = outcome.error
-        pose = None
+        error, pose = outcome.error, None
         if outcome.T_world_cam is not None:
-            position, quaternion = se3.to_quaternion(outcome.T_world_cam)
-            pose = [*position.tolist(), *quaternion.tolist()]
+            pose = np.concatenate(se3.to_quaternion(outcome.T_world_cam)).tolist()
         return cls(
             index=outcome.index,
             timestamp=outcome.timestamp,
@@ -193,8 +191,7 @@ class FrameLog:
 
         A line that a dying process left unfinished is not taken, and no damage.
         """
-        log = cls()
-        rows = log.rows
+        rows: list[FrameRow] = []
         try:
             for line in read_lines(path, kind=RunError) if path.is_file() else ():
                 if line.endswith("\n"):
@@ -204,17 +201,12 @@ class FrameLog:
                     rows.append(row)
         except (DynslamError, ValueError) as error:
             reason = " ".join(str(error).split())[:200]
-            log.damage = f"row {len(rows) + 1} of {path.name} is damaged ({type(error).__name__}: {reason})"
-        return log
-
-    def count(self, state: str) -> int:
-        """Frames of a state."""
-        return sum(row.state == state for row in self.rows)
+            return cls(rows, f"row {len(rows) + 1} of {path.name} is damaged ({type(error).__name__}: {reason})")
+        return cls(rows)
 
     def lost_streak(self) -> int:
         """Frames lost in a row at the end."""
-        lost = takewhile(lambda row: row.state == "lost", reversed(self.rows))
-        return sum(1 for _ in lost)
+        return len(list(takewhile(lambda row: row.state == "lost", reversed(self.rows))))
 
     def trajectory(self) -> Trajectory:
         """The online trajectory."""
@@ -300,6 +292,6 @@ def _file(run: RunRecord | Path | str, results: RunStore | Path | str) -> Path:
     if isinstance(run, RunRecord):
         return store.folder(run.run_id) / CSV_FILE
     path = Path(run).expanduser()
-    if path.is_dir():
-        return path / CSV_FILE
-    return path if path.is_file() or isinstance(run, Path) else store.folder(store.find(run)) / CSV_FILE
+    if isinstance(run, str) and not path.exists():
+        path = store.folder(store.find(run))
+    return path / CSV_FILE if path.is_dir() else path

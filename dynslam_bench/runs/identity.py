@@ -96,13 +96,20 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     )
     check_frames(sequence)
     check_sensors(tracker, sequence)
-    _check_degradation(spec.degrade)
+    strengths = set(Degradation.__dataclass_fields__) - {"seed"}
+    for unknown in sorted(set(spec.degrade) - strengths):
+        raise RunError(f"unknown degradation '{unknown}'", did_you_mean(unknown, strengths))
+    Degradation(seed=0, **spec.degrade)  # checks the strengths
     device = resolve_device(spec.device)
     source = segmentation_source(settings, sequence)
     weights = weights_of(settings, source)
     start_map = start_map_of(settings, sequence.camera, tracker.sensors, weights)
     by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
     part = part_of(sequence, spec.offset)
+    try:
+        files = contents_digest(load_object(tracker.files)(settings)) if tracker.files else ""
+    except OSError as error:
+        raise PluginError(f"cannot read a file of tracker '{tracker.id}': {error}") from error
     installed = versions()  # another version of what computes with the run's data may give other bits
     datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
     dataset = datasets.get(spec.sequence.partition("/")[0])
@@ -117,7 +124,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
         "settings": flatten(settings) | by_content,
         "segmentation": source,
         "weights": weights,
-        **({"files": _files_digest(tracker, settings)} if tracker.files else {}),
+        **({"files": files} if files else {}),
         "sequence": part.id,
         "content": part.content,
         "camera": part.camera,
@@ -158,12 +165,10 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
         PluginError: A plug-in is unknown, or its code cannot be read.
     """
     registries: dict[str, Registry[Any]] = {"features": FEATURES, "flow": FLOWS}
-    names = {} if settings is None else named(settings)
-    plugins = {
-        name: plugin_digest(registries[kind].get(value).entry_point)
-        for name, (kind, value) in sorted(names.items())
-        if kind in registries
-    }
+    plugins = {}
+    for name, (kind, value) in sorted(named(settings).items() if settings is not None else ()):
+        if kind in registries:
+            plugins[name] = plugin_digest(registries[kind].get(value).entry_point)
     prefix, _, segmenter = source.partition(":")
     if prefix == "plugin":
         plugins["segmentation.source"] = plugin_digest(SEGMENTERS.get(segmenter).entry_point)
@@ -181,26 +186,6 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
         digests[source] = weights_digest(group.model_copy(update={"source": source}))
     return digests
-
-
-def _files_digest(tracker: TrackerSpec, settings: Settings) -> str:
-    """Digest of the files that, by the tracker's spec, decide its results beside its settings.
-
-    Raises:
-        PluginError: One of the files cannot be read.
-    """
-    try:
-        return contents_digest(load_object(tracker.files)(settings))
-    except OSError as error:
-        raise PluginError(f"cannot read a file of tracker '{tracker.id}': {error}") from error
-
-
-def _check_degradation(strengths: dict[str, float]) -> None:
-    fields = set(Degradation.__dataclass_fields__) - {"seed"}
-    unknown = sorted(set(strengths) - fields)
-    if unknown:
-        raise RunError(f"unknown degradation '{unknown[0]}'", did_you_mean(unknown[0], fields))
-    Degradation(seed=0, **strengths)
 
 
 def check_unchanged(start_map: StartMap | None, settings: Settings) -> None:

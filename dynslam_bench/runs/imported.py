@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
+from dynslam_bench.contracts.sequence import timestamps_ns
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import digest
@@ -20,8 +20,8 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.runs.exchange.export import digest_of, stated_provenance
 from dynslam_bench.runs.exchange.formats import read_trajectory
-from dynslam_bench.runs.one import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.record import RunRecord, TrackerInfo
+from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore
 from dynslam_bench.sequences.catalogue import parse_frames
@@ -78,35 +78,35 @@ def import_trajectory(
     loaded = read_trajectory(file, timestamps, topic)
     opened = open_frames(sequence, data_root, camera, frames, stride)
     covered, odd, last = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
-    notes = loaded.notes.describe()
+    notes, total = loaded.notes.describe(), len(opened)
     if odd:
         notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
-    asked = {
-        "tracker": TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        **{"frames": _pair(frames), "stride": stride, "place": place_of(sequence)},
-        **{"stamps_match": not odd, "provenance": provenance or stated_provenance(file) or str(file), "notes": notes},
+    status, reason = judge_coverage(covered, total, total - 1 - last, total)
+    part = part_of(opened)
+    identity = {
+        "kind": "imported",
+        "tracker": tracker,
+        "which": which,
+        "file": digest_of(file),
+        "sequence": part.id,
+        "content": part.content,
+        "frames": [part.start, part.stop],
+        "offset": 0,
+        "stride": part.stride,
+        **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
+        **({} if topic is None else {"topic": topic}),
     }
-    asked["status"], asked["reason"] = judge_coverage(covered, len(opened), len(opened) - 1 - last, len(opened))
-    record = _record(_identity(file, tracker, which, opened, timestamps, topic), opened, covered, asked)
-    _keep(results if isinstance(results, RunStore) else RunStore(results), record, opened, loaded.trajectory, which)
-    return record
-
-
-def _keep(store: RunStore, record: RunRecord, sequence: Sequence, trajectory: Trajectory, which: str) -> None:
-    store.prepare()
-    with store.work_folder(record.run_id) as work:
-        comment = f"imported: {record.tracker.id} on {sequence.id}"
-        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
-        store.add_sequence(record.sequence.part, timestamps_ns(sequence), sequence.ground_truth)
-        store.publish(work, record)
-
-
-def _record(identity: dict[str, Any], sequence: Sequence, covered: int, asked: dict[str, Any]) -> RunRecord:
-    total = len(sequence)
-    return RunRecord(
+    if isinstance(frames, tuple):
+        frames = (frames[0] or 0, frames[1])
+    record = RunRecord(
         kind="imported",
         run_id=digest(identity, 16),
-        sequence=sequence_info(sequence, identity["content"], part_digest(identity)),
+        status=status,
+        reason=reason,
+        tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
+        sequence=sequence_info(opened, part.content, part_digest(identity)),
+        frames=None if frames is None else parse_frames(frames),
+        stride=stride,
         n_frames=total,
         n_tracked=covered,
         n_lost=total - covered,
@@ -114,8 +114,18 @@ def _record(identity: dict[str, Any], sequence: Sequence, covered: int, asked: d
         started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(),
         identity=identity,
-        **asked,
+        provenance=provenance or stated_provenance(file) or str(file),
+        place=place_of(sequence),
+        stamps_match=not odd,
+        notes=notes,
     ).normalised()
+    store = results if isinstance(results, RunStore) else RunStore(results)
+    store.prepare()
+    with store.work_folder(record.run_id) as work:
+        write_tum(work / f"trajectory_{which}.txt", loaded.trajectory, comment=f"imported: {tracker} on {opened.id}")
+        store.add_sequence(record.sequence.part, timestamps_ns(opened), opened.ground_truth)
+        store.publish(work, record)
+    return record
 
 
 def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int, int]:
@@ -134,28 +144,3 @@ def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name
         )
     odd = len(trajectory) - len(exact)
     return (len(near) if odd else len(exact)), odd, int(near[-1])
-
-
-def _identity(
-    file: Path, tracker: str, which: str, sequence: Sequence, timestamps: str | Path | None, topic: str | None
-) -> dict[str, Any]:
-    part = part_of(sequence)
-    return {
-        "kind": "imported",
-        "tracker": tracker,
-        "which": which,
-        "file": digest_of(file),
-        "sequence": part.id,
-        "content": part.content,
-        "frames": [part.start, part.stop],
-        "offset": 0,
-        "stride": part.stride,
-        **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
-        **({} if topic is None else {"topic": topic}),
-    }
-
-
-def _pair(frames: Frames) -> tuple[int, int | None] | None:
-    if frames is None:
-        return None
-    return parse_frames(frames if isinstance(frames, str) else (frames[0] or 0, frames[1]))

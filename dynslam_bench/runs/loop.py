@@ -74,9 +74,12 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     if spec.realtime or spec.drop_share:
         env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
     total = len(base.sequence)
+
+    def position() -> str:
+        return f"frame {base.episode.next_index} of {total}"
+
     send({"type": "started", "frames": total})
     recorder = _Recorder(base, spec, Path(job["folder"]))
-    position = _Position(base)
     with contextlib.closing(recorder):
         with at(position):
             env.reset(seed=spec.seed)
@@ -84,7 +87,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         reported = 0
         while True:
             done = base.episode.next_index
-            with at(f"frame {done - 1} of {total}"):
+            with at(lambda: f"frame {base.episode.next_index - 1} of {total}"):
                 recorder.add()
             send({"type": "frame", "index": done - 1})
             if done - reported >= job["progress_every"] or over:
@@ -98,20 +101,10 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             with at(position):
                 _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
-        with at("after the last frame"):
+        with at(lambda: "after the last frame"):
             outcome = recorder.finish()
             env.close()
     return {"type": "done", **outcome}
-
-
-class _Position:
-    """Says which frame is being tracked."""
-
-    def __init__(self, env: SlamEnv) -> None:
-        self._env = env
-
-    def __str__(self) -> str:
-        return f"frame {self._env.episode.next_index} of {len(self._env.sequence)}"
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:

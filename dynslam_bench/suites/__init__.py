@@ -168,8 +168,8 @@ class Suite(Record):
 
 def suite_names() -> list[str]:
     """Names of the suites that come with the package."""
-    here = files(__package__)
-    return sorted(entry.name.removesuffix(".toml") for entry in here.iterdir() if entry.name.endswith(".toml"))
+    names = [entry.name for entry in files(__package__).iterdir()]
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
 def load_suite(name: str | Path) -> Suite:
@@ -180,30 +180,24 @@ def load_suite(name: str | Path) -> Suite:
             (with the first fault).
         PluginError: One of its trackers is not known.
     """
-    text, where = _read(str(name))
+    path = Path(name).expanduser()
+    if str(name) in suite_names():
+        text, where = files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8"), f"{name}.toml"
+    elif path.suffix == ".toml":
+        text, where = read_text(path, kind=RunError), str(path)
+    else:
+        hint = did_you_mean(str(name), suite_names())
+        raise RunError(f"unknown suite '{name}'", f"{hint} Or name a .toml file")
     document = parse_toml(text, where, kind=RunError)
     document.setdefault("name", Path(where).stem)
     try:
         suite = Suite.model_validate(document)
     except ValidationError as error:
-        raise _explain(error, where) from error
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            raise RunError(f"{where}: unknown key '{key}'", did_you_mean(key, Suite.model_fields)) from error
+        raise RunError(f"{where}: {key}: {first['msg'][0].lower()}{first['msg'][1:]}") from error
     for tracker in (*suite.trackers, *suite.optional):
         TRACKERS.get(tracker)
     return suite
-
-
-def _read(name: str) -> tuple[str, str]:
-    if name in suite_names():
-        return files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8"), f"{name}.toml"
-    path = Path(name).expanduser()
-    if path.suffix != ".toml":
-        raise RunError(f"unknown suite '{name}'", did_you_mean(name, suite_names()) + " Or name a .toml file")
-    return read_text(path, kind=RunError), str(path)
-
-
-def _explain(error: ValidationError, where: str) -> RunError:
-    first = error.errors()[0]
-    key = ".".join(map(str, first["loc"]))
-    if first["type"] == "extra_forbidden":
-        return RunError(f"{where}: unknown key '{key}'", did_you_mean(key, Suite.model_fields))
-    return RunError(f"{where}: {key}: {first['msg'][0].lower()}{first['msg'][1:]}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import errors
@@ -16,7 +17,7 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
-from dynslam_bench.runs.process.supervisor import LogFile, Verdict, supervise
+from dynslam_bench.runs.process.supervisor import LONGEST_YET, Verdict, bound_log, supervise
 from dynslam_bench.runs.spec import Limits
 from dynslam_bench.testing.report import OBSERVER, Check, ConformanceReport, Observer
 
@@ -81,10 +82,9 @@ def isolated_tracker_report(
             return True
 
         with contextlib.closing(TemporaryFolder()) as folder:
-            log = LogFile(folder.path / LOG_FILE)
 
-            def tick(log: LogFile = log) -> None:
-                log.look()
+            def tick(log: Path = folder.path / LOG_FILE) -> None:
+                bound_log(log, LONGEST_YET)
                 if running:  # noqa: B023
                     on_wait(running)  # noqa: B023
 

@@ -1,13 +1,10 @@
 """Kills and faults, counted: the command line is disturbed, then does the same again, and has to end as if undisturbed.
 
-    python tests/benchmarks/kills.py files
     python tests/benchmarks/kills.py operations [--every 1] [--fault kill full read-only gone]
     python tests/benchmarks/kills.py moments [--times 20]
     python tests/benchmarks/kills.py signals
 
-`files`: every fault at every file operation of the run store, the stage cache, a download, a study's journal and the
-files and folders beneath them, each gone on from (the surveys of `tests/core/test_core_faults.py`,
-`tests/runs/test_runs_faults.py` and `tests/tuning/test_study_journal.py`). `operations`: two runs through
+`operations`: two runs through
 `dynslam-bench bench` with a fault at every file operation of the parent (by `tests/core/faults.py`); the command
 line is entered in a fork that has imported it before, and starts a fork server of its own. `moments`: `bench` and
 `tune run` killed (SIGKILL, to the whole group) and interrupted (SIGINT) after random times. `signals`: a foreign
@@ -21,7 +18,6 @@ gone within 2 s; nothing left in shared memory.
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import os
 import random
@@ -34,20 +30,17 @@ import time
 import traceback
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / room) for room in ("core", "envs", "runs", "tuning"))]
 
-import faults  # noqa: E402
 from envs_toys import write_folder  # noqa: E402
 from faults import Injector  # noqa: E402
-from test_runs_infrastructure import STRAYS  # noqa: E402
+from test_runs_hostile import STRAYS  # noqa: E402
 
 from dynslam_bench.cli import main as main_of_the_command_line  # noqa: E402
 from dynslam_bench.core.files import SHARED_MEMORY  # noqa: E402
-from dynslam_bench.runs.process.fork_server import SERVERS  # noqa: E402
-from dynslam_bench.runs.process.tree import process_tree  # noqa: E402
+from dynslam_bench.runs.process.fork_server import SERVERS, process_tree  # noqa: E402
 
 SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
 STUDY = (
@@ -90,31 +83,6 @@ def go_on(work: Path, arguments: list[str], expected: object | None) -> tuple[ob
     if expected is not None and there != expected:
         return there, "other runs than undisturbed"
     return there, f"left: {left}" if left else ""
-
-
-def files(work: Path) -> Counter[str]:
-    """The surveys of the tests, each fault of which is gone on from; what fails says where."""
-    counted: Counter[str] = Counter()
-
-    def survey(*arguments: Any, **named: Any) -> faults.Survey:
-        found = faults.survey(*arguments, **named)
-        counted["tried"] += found.faults
-        for (fault, _), times in found.ends.items():
-            counted[fault] += times
-        return found
-
-    for name in ("core.test_core_faults", "runs.test_runs_faults", "tuning.test_study_journal"):
-        module = importlib.import_module(name.partition(".")[2])
-        module.survey = survey  # type: ignore[attr-defined]
-        for test, made in vars(module).copy().items():
-            if test.startswith("test_") and "survey" in made.__code__.co_names:
-                before = counted["tried"]
-                (work / test).mkdir()
-                made(work / test)
-                counted["survived"] += counted["tried"] - before
-                sys.stdout.write(f"{test}: {counted['tried'] - before} faults\n")
-                sys.stdout.flush()
-    return counted
 
 
 def operations(work: Path, which: list[str], every: int) -> Counter[str]:
@@ -285,16 +253,14 @@ def note(counted: Counter[str], what: str, wrong: str) -> None:
 def main() -> int:
     """Disturb, and print the counts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("files", "operations", "moments", "signals"))
+    parser.add_argument("what", choices=("operations", "moments", "signals"))
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument("--fault", nargs="+", default=["kill", "full", "read-only", "gone"])
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="kills-") as folder:
         work = Path(folder)
-        if options.what == "files":
-            counted = files(work)
-        elif options.what == "operations":
+        if options.what == "operations":
             counted = operations(work, options.fault, options.every)
         elif options.what == "moments":
             counted = moments(work, options.times)

@@ -1,20 +1,22 @@
-"""A kill, a full or read-only disk, a removed folder at every file operation: one clear error, then all goes on."""
+"""Files, the stage cache and downloads: whole or absent, under a fault at every file operation and odd addresses."""
 
 from __future__ import annotations
 
 import http.server
+import multiprocessing
 import os
 import signal
 import tempfile
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from faults import survey, tree
 
-from dynslam_bench.core.download import download
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.download import check_address, download
+from dynslam_bench.core.errors import DownloadError, DynslamError
 from dynslam_bench.core.files import (
     TemporaryFolder,
     atomic_folder,
@@ -170,3 +172,158 @@ def test_temporary_folders_go_with_their_process(tmp_path: Path, monkeypatch: py
 
 def _one_of(found: object, *allowed: object) -> None:
     assert found in allowed
+
+
+def test_arrays_and_cost_come_back_bit_for_bit(tmp_path: Path) -> None:
+    cache = StageCache(tmp_path)
+    arrays = {"a": np.random.default_rng(0).normal(size=(3, 4)), "b": np.array(["person", "chair"])}
+    cache.put("masks", "ab12", arrays, 0.25)
+    entry = cache.get("masks", "ab12")
+    assert entry is not None and entry.cost_s == 0.25
+    for name, value in arrays.items():
+        np.testing.assert_array_equal(entry.arrays[name], value)
+    assert cache.get("masks", "ab13") is None and cache.get("features", "ab12") is None
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"not an archive"])
+def test_a_damaged_entry_counts_as_missing_and_goes(tmp_path: Path, damage: bytes) -> None:
+    cache = StageCache(tmp_path)
+    cache.put("masks", "ab12", {"a": np.arange(9)}, 0.1)
+    (path,) = tmp_path.rglob("*.npz")
+    path.write_bytes(damage)
+    assert cache.get("masks", "ab12") is None
+    assert not path.exists()
+
+
+def test_the_least_recently_used_entries_go_first(tmp_path: Path) -> None:
+    cache = StageCache(tmp_path, max_bytes=50_000)
+    for number in range(10):
+        cache.put("features", f"{number:02d}", {"a": np.zeros(1000)}, 0.0)
+        (path,) = tmp_path.rglob(f"{number:02d}.npz")
+        os.utime(path, (number, number))
+    assert cache.get("features", "00") is not None  # now the latest used
+    assert cache.prune() > 0
+    assert cache.get("features", "00") is not None and cache.get("features", "01") is None
+    assert sum(cache.info().bytes_by_stage.values()) <= 50_000
+
+
+def test_info_and_clear(tmp_path: Path) -> None:
+    cache = StageCache(tmp_path)
+    cache.put("features", "aa", {"a": np.zeros(10)}, 0.0)
+    cache.put("masks", "bb", {"a": np.zeros(10)}, 0.0)
+    assert dict(cache.info().entries_by_stage) == {"features": 1, "masks": 1}
+    held = sum(cache.info().bytes_by_stage.values())
+    assert cache.clear() == held > 0
+    assert dict(cache.info().entries_by_stage) == {}
+
+
+def _write_many(folder: str, start: int) -> None:
+    cache = StageCache(Path(folder), max_bytes=10**9)
+    for number in range(start, start + 40):
+        cache.put("features", f"{number % 50:03d}", {"a": np.full(500, number % 50)}, 0.0)
+
+
+def test_many_processes_share_a_cache(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_write_many, args=(str(tmp_path), start)) for start in (0, 10, 30)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+        assert writer.exitcode == 0
+    cache = StageCache(tmp_path)
+    for number in range(50):
+        entry = cache.get("features", f"{number:03d}")
+        assert entry is not None
+        np.testing.assert_array_equal(entry.arrays["a"], np.full(500, number))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".npz"]
+
+
+def test_an_unwritable_folder_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DynslamError, match="cannot write the stage cache"):
+        StageCache(tmp_path / "file").put("features", "aa", {"a": np.zeros(1)}, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("ftp://host/x.tgz", "has to begin with http:// or https://"),
+        ("file:///etc/passwd", "has to begin with http:// or https://"),
+        ("https://[::1/x", "Invalid IPv6 URL"),
+        ("https:///x.tgz", "it is no web address"),
+        ("https://host:99999/x", "Port out of range"),
+        ("https://host/a b", "it is no web address"),
+        ("https://host/\n", "it is no web address"),
+        ("https://" + "a" * 70 + ".org/x", "cannot download"),
+        ("https://me:s3cret@host/x", "holds a name or password"),
+        ("http://host/x.tgz", "http without a known checksum"),
+    ],
+)
+def test_odd_addresses_are_one_clear_line(url: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(DownloadError, match=words) as caught:
+        download(url, tmp_path / "x", attempts=1)
+    assert "s3cret" not in str(caught.value) and not list(tmp_path.iterdir())
+
+
+def test_http_is_taken_where_the_content_is_checked_or_on_this_machine() -> None:
+    assert check_address("http://host/x.tgz", checked=True).hostname == "host"
+    assert check_address("http://127.0.0.1:80/x", checked=False).port == 80
+    assert check_address("https://host/x.tgz", checked=False).scheme == "https"
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    """``/to?URL`` redirects there; ``/endless`` sends for ever; ``/big`` announces 1 TB."""
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+    def do_GET(self) -> None:
+        kind, _, target = self.path.partition("?")
+        self.send_response(302 if kind == "/to" else 200)
+        if kind == "/to":
+            self.send_header("Location", target)
+        if kind == "/big":
+            self.send_header("Content-Length", str(10**12))
+        self.end_headers()
+        try:
+            while kind == "/endless":
+                self.wfile.write(bytes(1 << 16))
+        except OSError:
+            self.close_connection = True
+
+
+@pytest.fixture(scope="module")
+def here() -> Iterator[str]:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize("target", ["ftp://127.0.0.1/x", "file:///etc/passwd", "gopher://h/x", "data:,x"])
+def test_redirects_to_other_schemes_are_refused(here: str, target: str, tmp_path: Path) -> None:
+    with pytest.raises(DownloadError, match=r"the server redirects .*, refused|is not allowed"):
+        download(f"{here}/to?{target}", tmp_path / "x", attempts=1, timeout_s=5)
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("target", ["https://[::1", "https://host:x/", "http://" + "a" * 70 + "/"])
+def test_redirects_to_odd_addresses_are_one_clear_line(here: str, target: str, tmp_path: Path) -> None:
+    with pytest.raises(DownloadError, match=r"stopped at 0 bytes|refused"):
+        download(f"{here}/to?{target}", tmp_path / "x", attempts=1, timeout_s=5)
+
+
+@pytest.mark.parametrize("kind", ["endless", "big"])
+def test_a_download_has_a_largest_size(here: str, kind: str, tmp_path: Path) -> None:
+    with pytest.raises(DownloadError, match=r"is longer than the 0\.00 GB that are expected"):
+        download(f"{here}/{kind}", tmp_path / "x", most_bytes=1 << 20, timeout_s=5)
+    assert not (tmp_path / "x.part").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_line(here: str, tmp_path: Path) -> None:
+    (tmp_path / "x.part.lock").mkdir()
+    with pytest.raises(DynslamError, match=r"cannot write .*: Is a directory"):
+        download(f"{here}/big", tmp_path / "x")

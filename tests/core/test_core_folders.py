@@ -1,13 +1,16 @@
-"""Where data, stages, weights and vocabularies lie: the environment's word, else the user's cache folder."""
+"""Where data, stages, weights and vocabularies lie, and the version of the package."""
 
 from __future__ import annotations
 
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+import dynslam_bench
 from dynslam_bench.core import folders
+from dynslam_bench.core import version as versions
 
 FOLDERS = {
     "data": folders.find_data_root,
@@ -41,3 +44,39 @@ def test_a_variable_moves_one_of_them(name: str, home: Path, monkeypatch) -> Non
     assert FOLDERS[name]() == (home / "mine" / "stages" if name == "stages" else home / "mine")
     for other in FOLDERS.keys() - {name}:
         assert FOLDERS[other]() == folders.user_cache() / other
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch: pytest.MonkeyPatch):
+    versions.version.cache_clear()
+    yield
+    monkeypatch.undo()
+    versions.version.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("installed", "release"),
+    [
+        ("0.1.0", "0.1.0"),
+        ("0.1.1.dev5+g1a2b3c4.d20261122", "0.1.1"),
+        ("0.1.dev1520+gabc", "0.1.0"),
+        ("2.0", "2.0.0"),
+        ("1.2rc1", "1.2.0"),
+    ],
+)
+def test_the_release_of_a_version(installed: str, release: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", lambda name: installed)
+    assert (dynslam_bench.__version__, versions.release()) == (installed, release)
+
+
+def test_a_checkout_that_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", missing)
+    assert (dynslam_bench.__version__, versions.release()) == ("0+unknown", "0.0.0")
+
+
+def test_other_names_of_the_package_are_missing_as_ever() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
+        dynslam_bench.nonsense  # noqa: B018

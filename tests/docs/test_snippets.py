@@ -43,7 +43,7 @@ BEFORE = {
 }
 """What a reader has done already: a run is stored."""
 ELSEWHERE = {
-    "docs/environments.md": (2, "tests/runs/test_runs_tables.py"),
+    "docs/environments.md": (2, "tests/runs/test_runs_index.py"),
     "docs/plugins.md": (7, "tests/trackers/adapters/test_adapter_docs.py"),
     "docs/reports.md": (1, "tests/reports/test_reports_tables.py"),
     "docs/tuning.md": (2, "tests/tuning/test_python_study.py"),

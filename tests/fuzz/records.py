@@ -21,10 +21,9 @@ from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.runs import RunStore
 from dynslam_bench.runs import artifacts as snapshots
 from dynslam_bench.runs import frames as rows
-from dynslam_bench.runs import many as packing
+from dynslam_bench.runs import running as packing
 from dynslam_bench.runs.frames import FrameLog, load_frames
-from dynslam_bench.runs.run_index import INDEX_FILE
-from dynslam_bench.runs.store import list_runs
+from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.sequences.fetch import Receipt
 from dynslam_bench.tuning import Study, StudySummary, samplers
 

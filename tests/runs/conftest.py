@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "envs"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "core"))
+sys.path.extend(str(Path(__file__).resolve().parents[1] / package) for package in ("envs", "core", "reports"))
 
 from envs_toys import write_folder
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -11,13 +12,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reports_fake_store import add_run
 
-from dynslam_bench.core.errors import DynslamError, ReportError, RunError
+from dynslam_bench.core.errors import DynslamError, ReportError, RunError, StudyError
+from dynslam_bench.core.files import claimed
 from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs import RunStore, score
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
-from dynslam_bench.runs.many import pack, unpack
+from dynslam_bench.runs.running import pack, unpack
+from dynslam_bench.runs.store import list_runs
+from dynslam_bench.tuning.storage import JournalFile
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "results"
 GOOD, BAD = "e7f8d4df9db4bb16", "a7abe04996a79cc4"
@@ -145,26 +150,81 @@ def test_a_reason_with_half_a_character_is_stored(store: RunStore) -> None:
     assert record.normalised().command == ["run", "\\udcff"]
 
 
-def test_packed_runs_that_claim_or_hold_too_much_are_refused(store: RunStore, tmp_path: Path) -> None:
-    import io
-    import zipfile
-
-    def zipped(name: str, content: bytes, how: int) -> bytes:
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", how) as archive:
-            archive.writestr(name, content)
-        return buffer.getvalue()
-
+def test_packed_runs_that_are_damaged_are_refused(store: RunStore, tmp_path: Path) -> None:
     target = RunStore(tmp_path / "target")
-    run = f"runs/{GOOD}/run.json"
-    with pytest.raises(RunError, match="GB, at most"):
-        unpack(zipped(run, bytes(64 << 20), zipfile.ZIP_DEFLATED), target)
-    with pytest.raises(RunError, match="compressed in a way"):
-        unpack(zipped(run, b"{}", zipfile.ZIP_LZMA), target)
-    with pytest.raises(DynslamError, match="is not a text file"):
-        unpack(zipped(run, b"\xff", zipfile.ZIP_STORED), target)
     damaged = bytearray(pack(store, store.read(GOOD)))
     damaged[60] ^= 0xFF
     with pytest.raises(DynslamError):
         unpack(bytes(damaged), target)
     assert target.ids() == [] and list(target.runs.iterdir()) == []
+
+
+SECRET = "the user's own words"
+
+
+@pytest.fixture
+def secret(tmp_path: Path) -> Path:
+    path = tmp_path / "secret.txt"
+    path.write_text(SECRET)
+    return path
+
+
+@pytest.fixture
+def filled(tmp_path: Path) -> tuple[RunStore, str]:
+    store = RunStore(tmp_path / "results")
+    return store, add_run(store, "a", "s/a", n=20)
+
+
+@pytest.mark.parametrize("name", ["log.txt", "run.json", "trajectory_online.txt", "video.mp4"])
+def test_a_run_with_a_link_to_elsewhere_is_one_unreadable_record(
+    filled: tuple[RunStore, str], secret: Path, name: str
+) -> None:
+    store, run = filled
+    (store.folder(run) / name).unlink(missing_ok=True)
+    (store.folder(run) / name).symlink_to(secret)
+    for found, (bad,) in (store.all(), list_runs(store)):
+        assert found == [] and "is a link that leads out" in bad.reason and SECRET not in bad.reason
+    assert store.get(run) is None
+
+
+def test_links_within_the_store_are_followed(filled: tuple[RunStore, str]) -> None:
+    store, run = filled
+    kept = store.root / "kept.txt"
+    (store.folder(run) / "log.txt").rename(kept)
+    (store.folder(run) / "log.txt").symlink_to(kept)
+    assert store.read_whole(run).run_id == run
+
+
+def test_a_pipe_hangs_nothing(filled: tuple[RunStore, str]) -> None:
+    store, run = filled
+    record = store.folder(run) / "run.json"
+    record.unlink()
+    os.mkfifo(record)
+    found, (bad,) = store.all()
+    assert found == [] and bad.reason.endswith("run.json is no plain file")
+
+
+@pytest.mark.parametrize("file", ["groundtruth.txt", "timestamps.txt"])
+def test_the_truth_of_a_part_is_no_link_to_elsewhere(filled: tuple[RunStore, str], secret: Path, file: str) -> None:
+    store, run = filled
+    (part,) = (store.root / "sequences").iterdir()
+    (part / file).unlink()
+    (part / file).symlink_to(secret)
+    metrics = store.score(store.read_whole(run))
+    assert metrics.online is None and "leads out" in metrics.reasons["online"]
+    with pytest.raises(RunError, match="leads out"):
+        store.timestamps(part.name)
+
+
+def test_nothing_is_written_through_links(filled: tuple[RunStore, str], secret: Path, tmp_path: Path) -> None:
+    store, run = filled
+    claim = store.runs / f".{run}.claim"
+    claim.symlink_to(tmp_path / "new")
+    with pytest.raises(DynslamError, match="cannot write"), claimed(claim):
+        raise AssertionError("it is held")
+    assert not (tmp_path / "new").exists()
+    journal = tmp_path / "journal.log"
+    journal.symlink_to(secret)
+    with pytest.raises(StudyError, match="is a link"):
+        JournalFile(journal)
+    assert secret.read_text() == SECRET

@@ -1,24 +1,31 @@
-"""The index of a store: what was computed once is taken from it while its files are the same, and never when not."""
+"""The index of a store, and runs and frames as lists and tables: never stale, and one vocabulary."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import sqlite3
-import sys
+from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reports"))
-
 from reports_fake_store import add_run
 
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.envs.episode import FrameOutcome
+from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.runs import RunStore
+from dynslam_bench.reports import load_frame
+from dynslam_bench.runs import RunStore, load_frames, score
 from dynslam_bench.runs import store as store_module
-from dynslam_bench.runs.run_index import FIELDS, run_row
-from dynslam_bench.runs.store import list_runs, rescore
+from dynslam_bench.runs.artifacts import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
+from dynslam_bench.runs.frames import FIXED, FrameLog, FrameRow, read_csv, write_csv
+from dynslam_bench.runs.store import FIELDS, list_runs, rescore, run_row
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 
@@ -63,7 +70,7 @@ def test_rows_are_those_of_the_records_and_are_read_once(filled, reads: list[str
 def test_what_changed_is_read_again(filled, reads: list[str]) -> None:
     store, ids = filled
     list_runs(store)
-    store.relabel(store.read_whole(ids[0]), "another")
+    store.rewrite(store.read_whole(ids[0]), study="another")
     record = store.folder(ids[1]) / "run.json"
     record.write_text(json.dumps(json.loads(record.read_text()) | {"reason": "edited by hand"}))
     store.remove(ids[2])
@@ -188,3 +195,188 @@ def test_a_link_in_a_folder_is_seen_behind_its_back(filled, tmp_path: Path) -> N
     (store.folder(ids[0]) / "video.webm").symlink_to(tmp_path)
     assert set(store.index.read(name, version, ids)) == set(ids)
     assert set(store.index.read(name, version, ids, check_links=True)) == set(ids[1:])
+
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "tests" / "fixtures" / "results"
+ROWS = [
+    FrameRow(0, 1.5, "ok", None, None, 0.0, 0.0, -0.0, 0.25, {"total": 0.1}, {"culled": 3.0}, [0.0] * 6 + [1.0]),
+    FrameRow(1, 1.625, "dropped"),
+    FrameRow(
+        2, 1.75, "lost", 0.1, 0.2, 0.30000000000000004, 0.4, -0.1, None, {"total": 1e-9, "flow": 2.0}, {"f_s": 1.0}
+    ),
+]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> RunStore:
+    return RunStore(shutil.copytree(RESULTS, tmp_path / "results"))
+
+
+def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path: Path) -> None:
+    (tmp_path / "log").write_text("".join(row.to_json() for row in ROWS) + ROWS[0].to_json()[:40])
+    assert FrameLog.read(tmp_path / "log") == FrameLog(ROWS)
+    assert FrameLog.read(tmp_path / "none") == FrameLog()
+
+
+def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
+    write_csv(tmp_path / "frames.csv", ROWS)
+    head = (tmp_path / "frames.csv").read_text().splitlines()[0]
+    assert head.split(",")[-4:] == ["total_s", "flow_s", "stat_culled", "stat_f_s"]
+    found = read_csv(tmp_path / "frames.csv")
+    assert [row.cells() for row in found] == [row.cells() for row in ROWS]
+    assert [row.pose for row in found] == [None] * 3
+
+
+@pytest.mark.parametrize("text", ["run,tracker\n1,x\n", "index,timestamp,state,reward_m\n0,1.0,asleep,0\n"])
+def test_another_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "frames.csv").write_text(text)
+    with pytest.raises(RunError, match="is no table of frames: row 1 is damaged"):
+        read_csv(tmp_path / "frames.csv")
+
+
+def test_frames_of_a_run_by_record_id_and_path(store: RunStore) -> None:
+    record = store.read("a7")
+    frame = load_frames(record, store)
+    assert [str(kind) for kind in frame.dtypes[:4]] == ["int64", "float64", "string", "Float64"]
+    assert {str(kind) for kind in frame.dtypes[8:]} == {"Float64"}
+    assert frame["frame_error_trans_m"].isna().tolist() == [True] + [False] * 7 and frame["mask_iou"].isna().all()
+    folder = store.folder(record.run_id)
+    for name in (load_frames("a7abe", store), load_frames(folder), load_frames(str(folder / "frames.csv"))):
+        pd.testing.assert_frame_equal(name, frame)
+    with pytest.raises(RunError, match="there is no run 'b'"):
+        load_frames("b", store)
+    with pytest.raises(RunError, match="cannot read"):
+        load_frames(store.root)
+
+
+def test_a_row_a_run(store: RunStore) -> None:
+    frame = store.frame()
+    records, _ = store.all()
+    assert frame["run_id"].tolist() == [record.run_id for record in records]
+    assert frame["ate_rmse_m"].tolist() == [score(store, record).metrics["ate_rmse_m"] for record in records]
+    assert frame["frame_ms"][1] == 1000 * records[1].frame_time_s and frame["frames"].tolist() == ["0:8"] * 2
+    kinds = {
+        name: str(frame[name].dtype) for name in ("label", "seed", "keyframes", "ate_rmse_m", "mask_iou", "started")
+    }
+    assert list(kinds.values()) == ["string", "Int64", "Int64", "Float64", "Float64", "datetime64[us, UTC]"]
+    missing = frame[["keyframes", "mask_iou", "reason", "noise", "settings"]]
+    assert missing.isna().all(axis=None) and missing.notna().sum().sum() == 0
+    other = store.frame("evo-default")
+    assert set(other["protocol_id"]) == {"evo-default"} and set(frame["protocol_id"]) == {"tum-rgbd/v1"}
+
+
+def test_trials_of_studies_are_left_out_unless_asked_for(store: RunStore) -> None:
+    records, _ = store.all()
+    trial = records[0].model_copy(update={"study": "thresholds", "overrides": {"frames": 3}})
+    (store.folder(trial.run_id) / "run.json").write_text(trial.to_json())
+    assert store.frame()["run_id"].tolist() == [records[1].run_id]
+    everything = store.frame(trials=True)
+    assert everything["study"].tolist() == ["thresholds", pd.NA] and everything["study"].dtype == "string"
+    assert store.frame()["study"].isna().all()
+
+
+def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
+    listed, table = set(list_runs(store)[0][0]), set(store.frame(trials=True).columns)
+    reported = set(load_frame(store).columns)
+    assert listed - table == {"seen_in_training"} and "seen_in_training" in reported
+    assert listed - reported == {"identity", "reason", "started"}
+    shared = {
+        "run_id",
+        "frames",
+        "segmentation",
+        "study",
+        "static_camera_ate_rmse_m",
+        "ate_rmse_m",
+        "coverage",
+        "frame_ms",
+    }
+    assert shared <= listed & table & reported
+    by_id = {row["run_id"]: row for row in list_runs(store)[0]}
+    for line in store.frame().astype(object).to_dict("records"):
+        row = by_id[line["run_id"]]
+        assert all(row[name] == (None if line[name] is pd.NA else line[name]) or row[name] == "" for name in shared)
+
+
+def test_from_results_to_a_plot_in_three_lines(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's examples are run as they stand."""
+    page = (ROOT / "docs" / "environments.md").read_text()
+    section = page[page.index("### From `results/` to a plot") :]
+    first, second = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    (store.root / "latest").symlink_to("runs/a7abe04996a79cc4")
+    monkeypatch.chdir(store.root.parent)
+    for text, names in (
+        (first, ("ate.html", "Old Slam", "never move")),
+        (second, ("frames.html", "pose_error_trans_m")),
+    ):
+        assert len([line for line in text.splitlines() if line]) == 3
+        exec(compile(text, "environments.md", "exec"), {})
+        plot = Path(names[0]).read_text()
+        assert all(name in plot for name in names[1:])
+
+
+SHAPE = (48, 65, 3)
+
+
+def outcome(index: int, error_m: float) -> FrameOutcome:
+    sample = OnlineSample(trans_m=0.0, rot_deg=0.0, frame_trans_m=error_m, frame_rot_deg=0.0)
+    return FrameOutcome(index, float(index), "ok", np.eye(4), {}, {}, sample, 0.0)
+
+
+def result(index: int) -> TrackResult:
+    rng = np.random.default_rng(index)
+    points = rng.uniform(0, 48, (index % 7, 2)).astype(np.float32)
+    mask = None if index % 2 else rng.random(SHAPE[:2]) > 0.5
+    kept = np.asarray(rng.random(len(points)) > 0.5)
+    return TrackResult(np.eye(4), "ok", dynamic_mask=mask, keypoints_xy=points, keypoints_keep=kept)
+
+
+def test_the_spread_and_the_worst_frames_come_back_as_they_were(tmp_path: Path) -> None:
+    bad = [11, 50, 51, 99, 150, 151, 152, 198]
+    writer = SnapshotWriter(tmp_path, 200)
+    for index in range(200):
+        writer.add(outcome(index, 1.0 + index if index in bad else 0.01), SHAPE, result(index))
+    writer.write()
+    size, shots = read_snapshots(tmp_path)
+    assert size == SHAPE[:2]
+    even = spread(200)
+    assert len(even) == SPREAD and {0, 199} <= set(even)
+    assert [shot.index for shot in shots] == sorted({*even, *[b for b in bad if b not in even][-WORST:]})
+    for shot, true in zip(shots, [result(shot.index) for shot in shots], strict=True):
+        assert true.keypoints_xy is not None and shot.points.tolist() == true.keypoints_xy.round().tolist()
+        assert np.array_equal(shot.kept, np.asarray(true.keypoints_keep))
+        assert (shot.mask is None) == (true.dynamic_mask is None)
+        assert shot.mask is None or np.array_equal(shot.mask, np.asarray(true.dynamic_mask))
+    assert any(shot.mask is None for shot in shots) and any(shot.mask is not None for shot in shots)
+
+
+def test_trackers_that_show_nothing_leave_no_file(tmp_path: Path) -> None:
+    writer = SnapshotWriter(tmp_path, 2)
+    for index in range(2):
+        writer.add(outcome(index, 0.1), SHAPE, TrackResult(np.eye(4), "ok"))
+    writer.write()
+    assert not (tmp_path / SNAPSHOTS_FILE).exists()
+    assert read_snapshots(tmp_path) == ((0, 0), [])
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 half of one"])
+def test_a_damaged_file_is_one_clear_line(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / SNAPSHOTS_FILE).write_bytes(content)
+    with pytest.raises(RunError, match=r"holds no (snapshots|arrays)"):
+        read_snapshots(tmp_path)
+
+
+def test_the_dynamic_share_is_a_column_where_it_is_known(tmp_path: Path) -> None:
+    known = [FrameRow(0, 1.0, "ok", dynamic_share=0.25), FrameRow(1, 2.0, "ok", dynamic_share=0.0)]
+    write_csv(tmp_path / "known.csv", known)
+    assert [row.dynamic_share for row in read_csv(tmp_path / "known.csv")] == [0.25, 0.0]
+    write_csv(tmp_path / "unknown.csv", [FrameRow(0, 1.0, "ok")])
+    assert "dynamic_share" not in (tmp_path / "unknown.csv").read_text()
+
+
+def test_a_row_comes_back_whole_from_the_log_of_a_run(tmp_path: Path) -> None:
+    numbers = {name: 0.25 + at for at, name in enumerate((*FIXED[3:], "dynamic_share"))}
+    row = FrameRow(3, 1.5, "ok", **numbers, timings={"read": 0.1}, stats={"culled": 7}, pose=[0.0] * 6 + [1.0])
+    assert None not in [getattr(row, each.name) for each in fields(row)]
+    (tmp_path / "log").write_text(row.to_json())
+    assert FrameLog.read(tmp_path / "log") == FrameLog([row])

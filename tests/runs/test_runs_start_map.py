@@ -18,7 +18,7 @@ from dynslam_bench.reports.model.row import make_row, run_command
 from dynslam_bench.runs import RunSpec, RunStore, run_many
 from dynslam_bench.runs.artifacts import keep_map
 from dynslam_bench.runs.identity import check_unchanged, resolve, start_map_of
-from dynslam_bench.runs.run_index import run_row, runs_frame
+from dynslam_bench.runs.store import run_row, runs_frame
 from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 

@@ -7,16 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 import dynslam_bench
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
-from dynslam_bench.core.records import Digest, Record
+from dynslam_bench.core.records import Record
 from dynslam_bench.envs.arguments import open_frames
 from dynslam_bench.geometry.association import associate
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -93,24 +92,17 @@ def export_run(
     record = store.read(run) if isinstance(run, str) else run
     chosen, trajectory = _trajectory(store, record, which)
     target = store.root / "exports" / record.run_id / form if folder is None else Path(folder).expanduser().absolute()
-    _check_target(target)
+    is_free = target.is_dir() and (not any(target.iterdir()) or (target / PROVENANCE_FILE).is_file())
+    if target.exists() and not is_free:  # only a folder that an export made, or an empty one, is replaced
+        raise RunError(f"{target} exists and is no export", "name a folder that does not exist, with -o")
     with atomic_folder(target) as work:
         notes = FORMATS[form](_Job(store, record, chosen, trajectory, data_root, camera), work)
-        provenance = provenance_of(record, form, chosen, work)
+        digests = {path.name: digest_of(path) for path in sorted(work.iterdir()) if path.is_file()}
+        public = record.model_copy(update={"command": [], "place": ""})
+        written_by = dynslam_bench.__version__
+        provenance = Provenance(format=form, files=digests, which=chosen, run=public, written_by=written_by)
         write_atomic(work / PROVENANCE_FILE, provenance.to_json())
-    return Exported(target, (*provenance.files, PROVENANCE_FILE), chosen, tuple(notes))
-
-
-def _check_target(target: Path) -> None:
-    """Only a folder that an export made, or an empty one, is replaced.
-
-    Raises:
-        RunError: It holds something else, or is a file.
-    """
-    if target.is_dir() and (not any(target.iterdir()) or (target / PROVENANCE_FILE).is_file()):
-        return
-    if target.exists():
-        raise RunError(f"{target} exists and is no export", "name a folder that does not exist, with -o")
+    return Exported(target, (*digests, PROVENANCE_FILE), chosen, tuple(notes))
 
 
 def _trajectory(store: RunStore, record: RunRecord, which: Which | None) -> tuple[Which, Trajectory]:
@@ -156,7 +148,8 @@ def _mcap(job: _Job, work: Path) -> list[str]:
 def _colmap(job: _Job, work: Path) -> list[str]:
     sequence = open_stored(job.record, job.data_root, job.camera)
     at, poses = associate(sequence.timestamps, job.trajectory.timestamps, _STAMP_TOLERANCE_S)
-    names = image_names(sequence)
+    files: dict[float, str] = getattr(sequence, "colour_files", {})  # without files they are named as TUM names them
+    names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]
     cloud = job.store.folder(job.record.run_id) / "map.ply"
     write_colmap(
         work,
@@ -202,63 +195,25 @@ class Provenance(Record):
         schema_version: Of this record.
         format: Name of the format.
         files: SHA-256 of every file by its name.
-        run_id: The run.
-        tracker: Its tracker's id.
-        tracker_version: And version.
-        tracker_provenance: ``own``, ``faithful-code``, ... or ``external`` for a trajectory that had been imported.
-        sequence: Id of the sequence.
-        frames: Part of it; None for all.
-        offset: So many leading frames of that part were left out.
-        stride: Every so many frames.
-        seed: Seed.
         which: Which trajectory: ``online`` or ``final``.
-        overrides: The settings that were asked for.
-        origin: For a run that was imported: where its trajectory had come from.
+        run: The record of the run, without the command line and the folders of the machine that made it.
         written_by: Version of this package.
     """
 
     schema_version: int = PROVENANCE_SCHEMA
     format: str
     files: dict[str, str]
-    run_id: Digest
-    tracker: str
-    tracker_version: str = ""
-    tracker_provenance: str = ""
-    sequence: str
-    frames: tuple[int, int | None] | None = None
-    offset: int = 0
-    stride: int = 1
-    seed: int = 0
-    which: Literal["online", "final"]
-    overrides: dict[str, Any] = Field(default_factory=dict)
-    origin: str = ""
+    which: Which
+    run: RunRecord
     written_by: str = ""
 
     def describe(self) -> str:
         """One line, for the record of an import."""
-        origin = f", which came from {self.origin}" if self.origin else ""
+        tracker, origin = self.run.tracker, f", which came from {self.run.provenance}" if self.run.provenance else ""
         return (
-            f"{self.which} trajectory of run {self.run_id} of {self.tracker} {self.tracker_version} on {self.sequence}"
-            f"{origin}, exported as {self.format} by dynslam-bench {self.written_by}"
+            f"{self.which} trajectory of run {self.run.run_id} of {tracker.id} {tracker.version} on "
+            f"{self.run.sequence.id}{origin}, exported as {self.format} by dynslam-bench {self.written_by}"
         )
-
-
-def provenance_of(record: RunRecord, form: str, which: Literal["online", "final"], folder: Path) -> Provenance:
-    """The provenance of the files of an export that lie in a folder."""
-    files = sorted(path for path in folder.iterdir() if path.is_file())
-    same = ("run_id", "frames", "offset", "stride", "seed", "overrides")
-    return Provenance(
-        format=form,
-        files={path.name: digest_of(path) for path in files},
-        tracker=record.tracker.id,
-        tracker_version=record.tracker.version,
-        tracker_provenance=record.tracker.provenance,
-        sequence=record.sequence.id,
-        which=which,
-        origin=record.provenance,
-        written_by=dynslam_bench.__version__,
-        **{name: getattr(record, name) for name in same},
-    )
 
 
 def stated_provenance(file: Path) -> str:
@@ -311,9 +266,3 @@ def open_stored(record: RunRecord, data_root: str | Path | None = None, camera: 
     if part_of(sequence, record.offset).content != record.sequence.content:
         raise RunError(f"the content of {record.sequence.id} has changed since the run")
     return sequence
-
-
-def image_names(sequence: Sequence) -> list[str]:
-    """The colour image of every frame, relative to the sequence's folder; TUM's way of naming where it has no files."""
-    colour_files: dict[float, str] = getattr(sequence, "colour_files", {})
-    return [colour_files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]

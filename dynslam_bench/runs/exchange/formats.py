@@ -64,8 +64,6 @@ def _stamps_by_name(path: Path) -> dict[str, float]:
 
 
 EUROC_HEADING = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
-_EUROC_ORDER = [1, 2, 3, 5, 6, 7, 4]
-_W_FIRST = "w"
 
 
 def is_pose_table(path: Path) -> bool:
@@ -87,8 +85,8 @@ def read_pose_table(path: Path) -> Trajectory:
     heading, rows = read_rows(path)
     if POSE[0] in heading:
         order = [column(heading, name, path) for name in POSE]
-    elif len(heading) >= 8 and _W_FIRST in heading[4].lower():
-        order = [0, *_EUROC_ORDER]
+    elif len(heading) >= 8 and "w" in heading[4].lower():
+        order = [0, 1, 2, 3, 5, 6, 7, 4]
     else:
         raise TrajectoryError(
             f"{path} has the columns {', '.join(heading)[:200]}: neither EuRoC's nor VSLAM-LAB's",
@@ -131,7 +129,6 @@ def _write(path: Path, heading: str, trajectory: Trajectory, rows: list[list[flo
 
 
 IMAGES = "images.txt"
-_HALF = 0.5
 
 
 def write_colmap(
@@ -149,7 +146,10 @@ def write_colmap(
     Raises:
         DynslamError: A file cannot be written.
     """
-    model, values = _camera_model(camera)
+    values = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]  # the corner of the first pixel is at 0
+    k1, k2, p1, p2, k3 = camera.distortion
+    model = ("FULL_OPENCV" if k3 else "OPENCV") if camera.is_distorted else "PINHOLE"
+    values += {"PINHOLE": [], "OPENCV": [k1, k2, p1, p2], "FULL_OPENCV": [k1, k2, p1, p2, k3, 0, 0, 0]}[model]
     numbers = " ".join(f"{value:.12g}" for value in values)
     write_atomic(folder / "cameras.txt", f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {model} {camera.width} "
                  f"{camera.height} {numbers}\n")  # fmt: skip
@@ -164,15 +164,6 @@ def write_colmap(
         rows = zip(cloud.positions.tolist(), cloud.colours.tolist(), strict=True)
         points += [f"{i} {x:.7g} {y:.7g} {z:.7g} {r} {g} {b} 0" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1)]
     write_atomic(folder / "points3D.txt", "\n".join(points) + "\n")
-
-
-def _camera_model(camera: Camera) -> tuple[str, list[float]]:
-    """Name and parameters of COLMAP's model that holds the camera exactly."""
-    pinhole = [camera.fx, camera.fy, camera.cx + _HALF, camera.cy + _HALF]
-    k1, k2, p1, p2, k3 = camera.distortion
-    if not camera.is_distorted:
-        return "PINHOLE", pinhole
-    return ("FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]) if k3 else ("OPENCV", [*pinhole, k1, k2, p1, p2])
 
 
 def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Trajectory:
@@ -225,8 +216,6 @@ def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
 
 
 POSE_MESSAGE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
-BAG = "trajectory"
-_BILLION = 1_000_000_000
 
 
 def read_bag_trajectory(path: Path, topic: str | None = None) -> Trajectory:
@@ -263,8 +252,8 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory], frame_id: st
     except ImportError as error:
         raise RunError("MCAP is written with rosbags, which is not installed", install_hint("bags")) from error
     store = get_typestore(Stores.LATEST)
-    with temporary_folder(folder / BAG) as work:
-        bag = work / BAG
+    with temporary_folder(folder / "trajectory") as work:
+        bag = work / "trajectory"
         try:
             with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 for name, trajectory in trajectories.items():
@@ -276,30 +265,19 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory], frame_id: st
 
 
 def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory, frame_id: str) -> None:
-    poses = _messages(store.types, trajectory, frame_id)
+    types, poses = store.types, []
     topic = writer.add_connection(f"/{name}/pose", POSE_MESSAGE, typestore=store)
-    for pose in poses:
-        writer.write(topic, _at(pose), store.serialize_cdr(pose, POSE_MESSAGE))
-    if poses:
-        whole = store.types[PATH](header=poses[0].header, poses=poses)
-        topic = writer.add_connection(f"/{name}/path", PATH, typestore=store)
-        writer.write(topic, _at(poses[0]), store.serialize_cdr(whole, PATH))
-
-
-def _at(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec * _BILLION + stamp.nanosec)
-
-
-def _messages(types: Mapping[str, Any], trajectory: Trajectory, frame_id: str) -> list[Any]:
-    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
-    made = []
-    for ns, p, q in zip(trajectory.timestamps_ns.tolist(), position.tolist(), quaternion.tolist(), strict=True):
-        sec, nanosec = divmod(ns, _BILLION)
+    rows = np.concatenate(se3.to_quaternion(trajectory.T_world_cam), axis=1).tolist()
+    for ns, row in zip(trajectory.timestamps_ns.tolist(), rows, strict=True):
+        sec, nanosec = divmod(ns, 1_000_000_000)
         time = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+        position = types["geometry_msgs/msg/Point"](*row[:3])
+        orientation = types["geometry_msgs/msg/Quaternion"](*row[3:])
+        pose = types["geometry_msgs/msg/Pose"](position=position, orientation=orientation)
         header = types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
-        where = types["geometry_msgs/msg/Point"](*p)
-        turned = types["geometry_msgs/msg/Quaternion"](*q)
-        pose = types["geometry_msgs/msg/Pose"](position=where, orientation=turned)
-        made.append(types[POSE_MESSAGE](header=header, pose=pose))
-    return made
+        poses.append(types[POSE_MESSAGE](header=header, pose=pose))
+        writer.write(topic, ns, store.serialize_cdr(poses[-1], POSE_MESSAGE))
+    if poses:
+        whole = types[PATH](header=poses[0].header, poses=poses)
+        topic = writer.add_connection(f"/{name}/path", PATH, typestore=store)
+        writer.write(topic, int(trajectory.timestamps_ns[0]), store.serialize_cdr(whole, PATH))

@@ -23,7 +23,7 @@ import sysconfig
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -40,7 +40,7 @@ from dynslam_bench.core.errors import (
 )
 from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
-from dynslam_bench.runs.process.tree import adopt_orphans, die_with_parent
+from dynslam_bench.runs.process.fork_server import adopt_orphans, die_with_parent
 
 LOG_FILE = "log.txt"
 _LONGEST = 400
@@ -161,12 +161,12 @@ class FailedAt(Exception):
 
 
 @contextmanager
-def at(where: object) -> Iterator[None]:
-    """Note where the run was for what is raised inside; `where` is formatted only then."""
+def at(where: Callable[[], str]) -> Iterator[None]:
+    """Note where the run was for what is raised inside; `where` is asked only then."""
     try:
         yield
     except (Exception, SystemExit) as error:
-        raise FailedAt(str(where)) from error
+        raise FailedAt(where()) from error
 
 
 def describe_failure(error: BaseException) -> dict[str, Any]:

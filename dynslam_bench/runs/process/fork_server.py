@@ -7,6 +7,9 @@ socket closes, because the parent has ended, the server kills its children and e
 that signals of a terminal do not reach it before.
 
 Where forking is not safe (macOS) the server starts each child in a fresh interpreter instead.
+
+A tracker may start processes, put them into sessions of their own and forget them. On Linux the fork server and each
+run are subreapers (``prctl(2)``): they become the parents of the orphans below them, so that the tree stays complete.
 ``multiprocessing``'s own fork server re-imports the caller's main script and may not be used in daemonic processes, see
 ``docs/decisions/fork-server.md``.
 """
@@ -15,6 +18,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import importlib
 import json
 import os
@@ -25,6 +29,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Collection, Iterable
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
 from typing import Any
@@ -33,7 +38,6 @@ import psutil
 
 from dynslam_bench.core.errors import InfrastructureError
 from dynslam_bench.core.files import sweep
-from dynslam_bench.runs.process.tree import adopt_orphans, end_children, end_processes, end_tree
 
 _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (
@@ -47,6 +51,8 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_T
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
+_SET_PARENT_DEATH_SIGNAL, _SET_CHILD_SUBREAPER = 1, 36
+_END_S = 5.0
 _REAP_S = 10.0
 """How long `Child.close` waits for the report of the child's end."""
 
@@ -86,11 +92,9 @@ class ForkServer:
                     self._close()
                     socket.send_fds(self._connected(), [b"c"], [child_fd, write_fd])
             return read_fd
-        except BaseException as error:
+        except OSError as error:
             os.close(read_fd)
-            if isinstance(error, OSError):
-                raise InfrastructureError(f"the fork server does not answer: {error}") from error
-            raise
+            raise InfrastructureError(f"the fork server cannot be started or does not answer: {error}") from error
         finally:
             os.close(write_fd)
 
@@ -105,19 +109,15 @@ class ForkServer:
         if self._socket is not None and self._process is not None and self._process.poll() is None:
             return self._socket
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
+        path = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
+        with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", __name__, str(theirs.fileno()), self._start],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                env=child_environment(),
+                env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1") | path,
                 start_new_session=True,
             )
-        except OSError as error:
-            ours.close()
-            raise InfrastructureError(f"cannot start {sys.executable}: {error.strerror}") from error
-        finally:
-            theirs.close()
         self._socket, self._owner = ours, os.getpid()
         return ours
 
@@ -137,13 +137,6 @@ for _server in SERVERS.values():
     atexit.register(_server.close)
 
 
-def child_environment() -> dict[str, str]:
-    """The environment of a fresh interpreter: BLAS on one thread, and this process's import path."""
-    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
-    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-    return environment
-
-
 class Child:
     """A child of the fork server, which waits for its job.
 
@@ -160,13 +153,8 @@ class Child:
     def __init__(self) -> None:
         start = os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
         self.connection, theirs = Pipe()
-        try:
+        with theirs:
             self.status_fd = SERVERS[start].spawn(theirs.fileno())
-        except BaseException:
-            self.connection.close()
-            raise
-        finally:
-            theirs.close()
         os.set_blocking(self.status_fd, False)
         self.pid = 0
         self.lost = ""
@@ -332,8 +320,6 @@ def serve(fd: int, start: str) -> None:
     for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     for name in PRELOADED if start == "fork" else ():
-        if _is_closed(control):
-            return
         with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
             importlib.import_module(name)
     if start == "fork":
@@ -343,13 +329,59 @@ def serve(fd: int, start: str) -> None:
     _Server(control, start).run()
 
 
-def _is_closed(control: socket.socket) -> bool:
+# -- process trees -----------------------------------------------------------------------------------------------------
+
+
+def die_with_parent() -> None:
+    """Ask Linux to kill this process when the thread that forked it ends; elsewhere the closed connection has to do."""
+    _prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of every descendant whose own parent ends, on Linux."""
+    _prctl(_SET_CHILD_SUBREAPER, 1)
+
+
+def _prctl(option: int, value: int) -> None:
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+
+
+def process_tree(pid: int) -> list[psutil.Process]:
+    """A process, first, and all its descendants; empty if it has ended."""
     try:
-        return control.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
+        top = psutil.Process(pid)
+        return [top, *top.children(recursive=True)]
+    except psutil.Error:
+        return []
+
+
+def end_processes(processes: Iterable[psutil.Process]) -> None:
+    """Kill those that still run; a process that has taken the number of one that ended is left alone."""
+    for process in processes:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+
+
+def end_tree(pid: int) -> None:
+    """Kill a process with its process group and all its descendants, whatever their groups."""
+    members = process_tree(pid)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(pid, signal.SIGKILL)
+    end_processes(members)
+
+
+def end_children(keep: Collection[int] = ()) -> None:
+    """Kill and reap all descendants of this process but the children in `keep` and their descendants."""
+    deadline = time.monotonic() + _END_S
+    while time.monotonic() < deadline:
+        ending = [child for child in psutil.Process().children() if child.pid not in keep]
+        if not ending:
+            return
+        for child in ending:
+            end_processes(process_tree(child.pid))
+        psutil.wait_procs(ending, timeout=0.1)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""The supervisor of a child: its messages, its limits, its end, and the size of its log."""
+"""The supervisor of a child: its messages, its limits, its memory, its end, and the size of its log."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -12,9 +13,10 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from dynslam_bench.core.errors import InfrastructureError
-from dynslam_bench.runs.process.fork_server import Child
-from dynslam_bench.runs.process.tree import memory_limit, memory_mb, process_tree
+from dynslam_bench.runs.process.fork_server import Child, process_tree
 from dynslam_bench.runs.record import Status
 from dynslam_bench.runs.spec import Limits
 
@@ -28,6 +30,9 @@ _FIRST_WARM = 1
 _END_GRACE_S = 10.0
 _SIGNAL_GRACE_S = 0.5
 _GO_ON = "the run is not stored; the same command goes on from there"
+DEFAULT_SHARE = 0.8
+"""Share of the machine's memory that all runs at a time may take together where no limit was given."""
+_CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
 @dataclass
@@ -54,10 +59,10 @@ def supervise(
     child: Child,
     job: Message,
     limits: Limits,
-    on_progress: Callable[[Message], bool] | None = None,
-    cancelled: Callable[[], bool] | None = None,
+    on_progress: Callable[[Message], bool] = lambda _: True,
+    cancelled: Callable[[], bool] = lambda: False,
     *,
-    tick: Callable[[], None] | None = None,
+    tick: Callable[[], None] = lambda: None,
     at_a_time: int = 1,
     located: bool = True,
 ) -> Verdict:
@@ -79,13 +84,11 @@ def supervise(
     Raises:
         InfrastructureError: The child could not do its work, through no fault of that.
     """
-    supervisor = _Supervisor(child, limits, on_progress, cancelled, tick, located)
-    supervisor.memory_mb, supervisor.memory_source = memory_limit(limits.memory_mb, at_a_time)
+    memory = memory_limit(limits.memory_mb, at_a_time)
     try:
-        child.connection.send_bytes(json.dumps(job).encode())
-        return supervisor.run()
-    except BrokenPipeError:
-        return supervisor.verdict_of_end()
+        with contextlib.suppress(BrokenPipeError):  # it has ended, which its status tells
+            child.connection.send_bytes(json.dumps(job).encode())
+        return _Supervisor(child, limits, on_progress, cancelled, tick, located, *memory).run()
     finally:
         child.close()
 
@@ -94,12 +97,12 @@ def supervise(
 class _Supervisor:
     child: Child
     limits: Limits
-    on_progress: Callable[[Message], bool] | None
-    cancelled: Callable[[], bool] | None
-    tick: Callable[[], None] | None
+    on_progress: Callable[[Message], bool]
+    cancelled: Callable[[], bool]
+    tick: Callable[[], None]
     located: bool
-    memory_mb: float | None = None
-    memory_source: str = ""
+    memory_mb: float | None
+    memory_source: str
     began: float | None = None
     """When the child said that it was ready."""
     last_message: float = field(default_factory=time.monotonic)
@@ -144,27 +147,16 @@ class _Supervisor:
             verdict = self._verdict(final["status"], final["reason"])
             verdict.refused = final.get("data", False) or (final.get("refused", False) and self.frame < 0)
             return verdict
-        code = self._exit_code()
-        if code < 0 and self._is_cancelled(_SIGNAL_GRACE_S):  # the signal that ends this process ended the child first
+        code = self.child.poll()
+        assert code is not None
+        if code < 0 and not self.cancelled():  # the signal that ends this process may have ended the child first
+            time.sleep(_SIGNAL_GRACE_S)
+        if code < 0 and self.cancelled():
             return self._verdict("stopped", f"cancelled{self._where()}")
         if self.child.lost or self.began is None:
             lost = self.child.lost or f"the process that was to make it ended with code {code}"
             raise InfrastructureError(f"the run could not go on: {lost}", _GO_ON)
         return self._verdict("crashed", _reason_of_exit(code) + self._where())
-
-    def _exit_code(self) -> int:
-        deadline = time.monotonic() + 5
-        while (code := self.child.poll()) is None and time.monotonic() < deadline:
-            time.sleep(0.1)
-        return -signal.SIGKILL if code is None else code
-
-    def _is_cancelled(self, wait_s: float = 0.0) -> bool:
-        end = time.monotonic() + wait_s
-        while self.cancelled is not None and not self.cancelled():
-            if time.monotonic() >= end:
-                return False
-            time.sleep(0.02)
-        return self.cancelled is not None
 
     def _receive(self) -> bool:
         """Take a message; False if the connection is closed."""
@@ -183,19 +175,17 @@ class _Supervisor:
         elif kind != "progress":
             self.final = message
             self.peak_mb = max(self.peak_mb, message["peak_memory_mb"])
-        elif self.on_progress is not None and not self.on_progress(message) and self.stop_sent is None:
+        elif not self.on_progress(message) and self.stop_sent is None:
             self.stop_sent = time.monotonic()
-            try:
+            with contextlib.suppress(OSError):  # it has ended, which its status tells
                 self.child.connection.send_bytes(b"stop")
-            except OSError:
-                return True  # it has ended, which its status tells
         return True
 
     def _over_limit(self) -> Verdict | None:
         now, limits, silent_s = time.monotonic(), self.limits, time.monotonic() - self.last_message
         if self.final:
             return self.verdict_of_end() if silent_s > _END_GRACE_S else None
-        if self._is_cancelled():
+        if self.cancelled():
             return self._verdict("stopped", f"cancelled{self._where()}")
         if self.stop_sent is not None and now - self.stop_sent > _STOP_GRACE_S:
             return self._verdict("stopped", f"stopped on request after frame {self.frame}")
@@ -211,8 +201,7 @@ class _Supervisor:
         if now < self.next_look:
             return None
         self.next_look = now + _POLL_S
-        if self.tick is not None:
-            self.tick()
+        self.tick()
         if now >= self.next_tree:
             self.next_tree = now + _TREE_S
             self.child.members = process_tree(self.child.pid) or self.child.members
@@ -236,72 +225,72 @@ class _Supervisor:
         return Verdict(status, reason, self.final, self.peak_mb)
 
 
-_SIGNALS = {
-    "SIGSEGV": "segmentation fault",
-    "SIGABRT": "aborted by a library",
-    "SIGFPE": "arithmetic error",
-    "SIGILL": "illegal instruction",
-    "SIGBUS": "bus error",
-    "SIGKILL": "killed from outside; on Linux often because memory ran out",
-}
-
-
 def _reason_of_exit(code: int) -> str:
     if code >= 0:
         return f"the process left with exit code {code}"
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:  # a real-time signal
-        name = f"signal {-code}"
-    return f"{name} ({_SIGNALS[name]})" if name in _SIGNALS else name
+    name = {number.value: number.name for number in signal.Signals}.get(-code, f"signal {-code}")
+    hint = ", on Linux often because memory ran out" if -code == signal.SIGKILL else ""
+    return f"{name} ({str(signal.strsignal(-code)).lower()}{hint})"
 
 
-WHOLE = 1 << 20
-"""A log of up to so many bytes is kept as it is."""
-KEPT = 1 << 18
-"""Bytes kept of the beginning and of the end of a longer one."""
-_MOST = 1 << 23
-"""While the run lasts the file is emptied when it is longer."""
+def memory_mb(members: list[psutil.Process]) -> float:
+    """Memory in MB of a process tree, each page counted once.
+
+    Of one process this is its resident memory. Of several it is the larger of two lower bounds: the resident memory of
+    the first, and the sum of the proportional memories (a page that n processes share counts 1/n in each). Where the
+    system states no proportional memory, resident memory is summed.
+    """
+    resident, proportional = [], []
+    for process in members:
+        with contextlib.suppress(psutil.Error):  # it has ended
+            memory = process.memory_info() if len(members) == 1 else process.memory_full_info()
+            resident.append(memory.rss)
+            proportional.append(getattr(memory, "pss", memory.rss))
+    return float(max([sum(proportional), *resident[:1]]) / 1e6)
 
 
-class LogFile:
-    """Bounds a file that other processes append to: of a long one its beginning and its end are kept.
+def machine_memory_mb() -> float:
+    """Main memory in MB: the machine's, or the container's if that is less."""
+    amounts = [float(psutil.virtual_memory().total)]
+    for file in _CGROUP_LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # there is none, or it says "max"
+            amounts.append(float(file.read_text()))
+    return min(amounts) / 1e6
+
+
+def memory_limit(asked_mb: float | None, at_a_time: int = 1) -> tuple[float | None, str]:
+    """The limit in MB that is in force, and where it comes from.
 
     Args:
-        path: The file; it may not exist yet.
+        asked_mb: What was asked for; None for the default, 0 for no limit.
+        at_a_time: Runs that share the machine, for the default.
+
+    Returns:
+        None and "" without a limit.
     """
+    if asked_mb is not None:
+        return (asked_mb or None), ""
+    machine_mb = machine_memory_mb()
+    shared = f", shared by {at_a_time} runs at a time" if at_a_time > 1 else ""
+    source = f"by default {100 * DEFAULT_SHARE:.0f} % of this machine's {machine_mb:.0f} MB{shared}"
+    return DEFAULT_SHARE * machine_mb / at_a_time, source
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._head = self._tail = b""
-        self._taken = 0
 
-    def look(self) -> None:
-        """Empty the file if it has become long, after its first and last bytes were taken; call it often."""
-        if self._size() > _MOST:
-            self._take()
-            os.truncate(self.path, 0)  # the processes append, so that they go on at the new end
+LONGEST_LOG = 1 << 20
+"""A log of up to so many bytes is kept as it is."""
+LONGEST_YET = 1 << 23
+"""A log is shortened to its ends while the run lasts when it is longer."""
+_KEPT = 1 << 18
+"""Bytes kept of the beginning and of the end of a longer one."""
 
-    def finish(self) -> None:
-        """Write the log as it is kept; no process may write any more."""
-        if not self._taken and self._size() <= WHOLE:
-            return
-        self._take()
-        cut = self._taken - len(self._head) - len(self._tail)
-        note = f"\n\n[... about {cut / 1e6:.1f} of {self._taken / 1e6:.1f} MB were cut here ...]\n\n"
-        self.path.write_bytes(self._head + note.encode() + self._tail)
 
-    def _size(self) -> int:
-        try:
-            return self.path.stat().st_size
-        except OSError:
-            return 0
-
-    def _take(self) -> None:
-        size = self._size()
-        with self.path.open("rb") as file:
-            if not self._taken:
-                self._head = file.read(KEPT)
-            file.seek(max(size - KEPT, 0 if self._taken else len(self._head)))
-            self._tail = (self._tail + file.read())[-KEPT:]
-        self._taken += size
+def bound_log(log: Path, most: int) -> None:
+    """Keep of a log that is longer than `most` bytes its beginning and its end; processes may append to it."""
+    if not log.is_file() or log.stat().st_size <= most:
+        return
+    with contextlib.suppress(OSError), log.open("r+b") as file:  # a full disk: the log stays as far as it came
+        file.seek(-_KEPT, os.SEEK_END)
+        end = file.read()
+        file.truncate(_KEPT)
+        file.seek(0, os.SEEK_END)  # the processes append, so that they go on behind it
+        file.write(b"\n\n[... the middle of the log was cut here ...]\n\n" + end)

@@ -1,4 +1,4 @@
-"""Many runs: resumable, parallel, here or on any executor; runs as bytes for workers."""
+"""Making runs: one in a child process; many, resumable and parallel, here or on any executor; runs as bytes."""
 
 from __future__ import annotations
 
@@ -6,31 +6,240 @@ import contextlib
 import io
 import re
 import shutil
+import sys
 import threading
 import time
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from dynslam_bench.contracts.sequence import exact_stamps, timestamps_ns
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, SequenceError, TrajectoryError
-from dynslam_bench.core.files import TemporaryFolder
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core.files import TemporaryFolder, write_atomic
+from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
+from dynslam_bench.core.records import digest
+from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.artifacts import SHEET_FILE, VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
-from dynslam_bench.runs.identity import ResolvedRun, resolve
-from dynslam_bench.runs.one import OnProgress, run_one
-from dynslam_bench.runs.record import FAILED, RunRecord
-from dynslam_bench.runs.run_index import RUN_FILE
-from dynslam_bench.runs.spec import RunSpec
-from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
+from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
+from dynslam_bench.runs.identity import ResolvedRun, check_unchanged, resolve
+from dynslam_bench.runs.process.child import LOG_FILE
+from dynslam_bench.runs.process.fork_server import Child, make_job
+from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
+from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
+from dynslam_bench.runs.spec import RunSpec, place_of
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RUN_FILE, RunStore
+from dynslam_bench.sequences.view import part_of
 from dynslam_bench.slam.map_files import MAP_FILE
 
 T = TypeVar("T")
+WORK = "dynslam_bench.runs.loop:run_loop"
+"""What the child does."""
+PROGRESS_EVERY = 50
+CACHED_TIMES = "times of features and masks are those of the stage cache's entries, not of this run"
+LOST_AT_END = 10
+"""A run whose coverage is below `LOST_COVERAGE`, or that is lost on so many frames at its end, has status ``lost``."""
+
+OnProgress = Callable[[str, dict[str, Any]], bool]
+"""Called as ``on_progress(run_id, partial)`` every `PROGRESS_EVERY` frames; returning False stops the run.
+
+`partial` holds ``frames_done``, ``frames``, ``metrics`` (of the frames so far under the protocol), ``frame_time_s`` and
+``pose_error_trans_m``.
+"""
+
+
+def run_one(
+    run: RunSpec | ResolvedRun,
+    store: RunStore,
+    *,
+    on_progress: OnProgress | None = None,
+    protocol: Protocol | str = DEFAULT_PROTOCOL,
+    progress_every: int = PROGRESS_EVERY,
+    cancelled: Callable[[], bool] = lambda: False,
+    at_a_time: int = 1,
+) -> RunRecord:
+    """Make a run in a child process and store it, whatever becomes of it.
+
+    A tracker that raises, hangs, breaks its contract, takes too much or dies gives a record with that status and the
+    reason; only a request that cannot begin at all is an error. A run that `on_progress` stopped is not stored.
+
+    Args:
+        run: What to run.
+        store: Where to keep it; an earlier run of the same id is replaced.
+        on_progress: Told of the partial metrics; may stop the run.
+        protocol: Protocol of the partial metrics.
+        progress_every: Frames between two of them.
+        cancelled: Asked many times a second; True ends the run at once, as stopped.
+        at_a_time: Runs that share this machine; the default memory limit is divided among them.
+
+    Returns:
+        The record.
+
+    Raises:
+        DynslamError: The request names something unknown or unfit, something other than the tracker's own code raised
+            (an image, a mask or a file that cannot be read), the store cannot be written, or what a run needs broke
+            (`InfrastructureError`); nothing is stored then.
+    """
+    resolved = resolve(run) if isinstance(run, RunSpec) else run
+    run_id = resolved.run_id
+    started = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+    clock = time.perf_counter()
+
+    def report(message: dict[str, Any]) -> bool:
+        partial = {key: value for key, value in message.items() if key != "type"}
+        return on_progress is None or on_progress(run_id, partial)
+
+    with store.work_folder(run_id) as work:
+        job = make_job(
+            WORK,
+            work,
+            spec=resolved.spec.model_dump(mode="json"),
+            protocol=get_protocol(protocol).model_dump(mode="json"),
+            progress_every=progress_every,
+        )
+        log = work / LOG_FILE
+        watched: dict[str, Any] = {"tick": lambda: bound_log(log, LONGEST_YET), "at_a_time": at_a_time}
+        child = Child()
+        try:
+            verdict = supervise(child, job, resolved.spec.limits, report, cancelled, **watched)
+        except InfrastructureError:
+            if not child.lost:
+                raise
+            child = Child()  # of a new fork server
+            verdict = supervise(child, job, resolved.spec.limits, report, cancelled, **watched)
+        if verdict.refused:
+            raise RunError(
+                f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
+            )
+        try:
+            bound_log(log, LONGEST_LOG)
+            frames = FrameLog.read(work / FRAMES_FILE)
+            title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
+            frames.write(work, title, exact_stamps(resolved.sequence))
+            (work / FRAMES_FILE).unlink(missing_ok=True)
+        except OSError as error:
+            raise InfrastructureError(f"cannot write {work}: {error.strerror}", "the run is not stored") from error
+        check_unchanged(resolved.start_map, resolved.settings)
+        record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
+        if record.status != "stopped":
+            store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)
+            record = store.publish(work, record)
+    return record
+
+
+def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
+    """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
+    input_part, stamps = part_of(sequence, offset), sequence.timestamps
+    return SequenceInfo(
+        id=sequence.id,
+        content=content,
+        part=part,
+        block=input_part.block,
+        noise=input_part.noise,
+        frames=len(sequence),
+        duration_s=float(stamps[-1] - stamps[0]),
+        fps=sequence.fps,
+        ground_truth=sequence.ground_truth is not None,
+        license=sequence.license,
+        citation=sequence.citation,
+        tags=sorted(getattr(sequence, "tags", ())),
+        split=getattr(sequence, "split", ""),
+    )
+
+
+def part_digest(identity: dict[str, Any]) -> str:
+    """Names what of the sequence a run saw: content and frames."""
+    return digest({key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16)
+
+
+def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: str, wall_s: float) -> RunRecord:
+    spec, tracker, identity, final = resolved.spec, resolved.tracker, resolved.identity, verdict.final
+    total, states = len(resolved.sequence), Counter(row.state for row in frames.rows)
+    status, reason, dropped = verdict.status, verdict.reason, states["dropped"]
+    if status == "ok" and frames.damage:
+        status, reason = "invalid", frames.damage
+    elif status == "ok":  # it may still have lost its way
+        status, reason = judge_coverage(states["ok"], total - dropped, frames.lost_streak(), total)
+    if status == "ok" and spec.realtime and dropped:
+        reason = f"{dropped} of {total} frames dropped while the tracker was busy"
+    notes = [CACHED_TIMES] if spec.cache else []
+    notes += [] if resolved.start_map is None else [resolved.start_map.describe()]
+    return RunRecord(
+        run_id=resolved.run_id,
+        status=status,
+        reason=reason,
+        tracker=TrackerInfo(
+            label=spec.label or tracker.label,
+            distribution=identity["distribution"],
+            given="" if spec.tracker == tracker.id else spec.tracker,
+            **{name: getattr(tracker, name) for name in _OF_THE_TRACKER},
+        ),
+        overrides=spec.settings,
+        settings=flatten(resolved.settings),
+        sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity), spec.offset),
+        **{name: getattr(spec, name) for name in _AS_ASKED},
+        device=resolved.device,
+        degrade=identity["degrade"],
+        segmentation=resolved.segmentation,
+        n_frames=total,
+        n_processed=len(frames.rows) - dropped,
+        n_tracked=states["ok"],
+        n_lost=states["lost"],
+        n_initialising=states["initialising"],
+        n_dropped=dropped,
+        coverage=states["ok"] / total,
+        **{name: final.get(name) for name in ("keyframes", "map_points", "maps", "finalize_s")},
+        start_map=resolved.start_map,
+        epipolar_skipped=frames.epipolar_skipped(),
+        mask_iou=frames.mask_iou(),
+        timings=frames.timings(),
+        started=started,
+        wall_s=wall_s,
+        peak_memory_mb=verdict.peak_memory_mb or None,
+        peak_gpu_memory_mb=final.get("gpu_memory_mb"),
+        machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}),
+        versions=versions(),
+        git=git_revision(),
+        command=list(sys.argv),
+        identity=identity,
+        notes=[*notes, *final.get("notes", [])],
+        place=place_of(spec.sequence),
+    )
+
+
+_AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share", "study")
+"""What a record takes from the request as it is."""
+_OF_THE_TRACKER = (
+    *("id", "version", "provenance", "ranked", "deterministic", "license", "citation", "remarks", "sensors"),
+)
+"""What a record takes from the tracker's spec as it is."""
+
+
+def judge_coverage(tracked: int, due: int, lost_at_end: int, total: int) -> tuple[Status, str]:
+    """Whether a trajectory that came to its end is that of a lost camera, with the reason.
+
+    Args:
+        tracked: Frames with a pose.
+        due: Frames that the tracker was to see.
+        lost_at_end: Frames without a pose after the last one with one.
+        total: All frames.
+    """
+    if tracked < LOST_COVERAGE * due:
+        return "lost", f"tracked on {tracked} of {due} frames"
+    if lost_at_end >= LOST_AT_END:
+        return "lost", f"lost from frame {total - lost_at_end} to the end, tracked on {tracked} of {due} frames"
+    return "ok", ""
+
+
+# -- many runs ---------------------------------------------------------------------------------------------------------
+
 OnFault = Callable[[RunSpec, DynslamError], None]
 """Called as ``on_fault(spec, error)`` for a run that cannot be made; nothing of it is stored."""
 _CLAIM_AGAIN_S = 0.2
@@ -69,7 +278,7 @@ def run_many(
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
-    cancelled: Callable[[], bool] | None = None,
+    cancelled: Callable[[], bool] = lambda: False,
     on_fault: OnFault | None = None,
 ) -> list[RunRecord]:
     """Make the runs that are not stored yet, and score all of them.
@@ -104,7 +313,11 @@ def run_many(
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
     protocol = get_protocol(protocol)
-    again = _statuses(retry)
+    again = set(FAILED).union(retry) - {"failed"} if "failed" in retry else set(retry)
+    outcomes = {"ok", "lost", *FAILED}
+    if not again <= outcomes:
+        known = ", ".join(sorted(outcomes))
+        raise RunError(f"unknown status '{min(again - outcomes)}' to retry", f"known: failed, {known}")
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
     resolved: list[ResolvedRun] = []
@@ -148,7 +361,7 @@ class _Bench:
     jobs: int
     on_event: Callable[[RunEvent], None] | None
     on_progress: OnProgress | None
-    cancelled: Callable[[], bool] | None
+    cancelled: Callable[[], bool]
     on_fault: OnFault | None
     before: dict[str, RunRecord | None] = field(default_factory=dict)
     """The records of the runs that are to be made, when the call began."""
@@ -158,7 +371,8 @@ class _Bench:
 
     def reuse(self, run: ResolvedRun, record: RunRecord) -> RunRecord:
         if run.spec.label not in ("", record.tracker.label):
-            record = self.store.relabel(record, run.spec.label)
+            labelled = record.tracker.model_copy(update={"label": run.spec.label})
+            record = self.store.rewrite(record, tracker=labelled)
         if record.study and not run.spec.study:
             record = self.store.rewrite(record, study="")
         self.store.score(record, self.protocol)
@@ -262,7 +476,7 @@ class _Bench:
         return {record.run_id: record for record in records if record is not None}
 
     def _is_cancelled(self) -> bool:
-        return self.aborted.is_set() or (self.cancelled is not None and self.cancelled())
+        return self.aborted.is_set() or self.cancelled()
 
     def _report(self, kind: EventKind, run: ResolvedRun, **details: Any) -> None:
         if self.on_event is not None:
@@ -300,20 +514,7 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
     return any(not (folder / name).is_file() for name in set(wanted) - excused)
 
 
-def _statuses(retry: Collection[str]) -> set[str]:
-    wanted = {retry} if isinstance(retry, str) else set(retry)
-    outcomes = {"ok", "lost", *FAILED}
-    unknown = sorted(wanted - outcomes - {"failed"})
-    if unknown:
-        raise RunError(f"unknown status '{unknown[0]}' to retry", "known: failed, " + ", ".join(sorted(outcomes)))
-    return (wanted - {"failed"}) | (set(FAILED) if "failed" in wanted else set())
-
-
 _ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16})/([A-Za-z0-9_]+\.[a-z0-9]+)")
-_LARGEST = 2**31
-_MAX_RATIO = 200
-"""Most bytes that a byte of the archive may unpack to."""
-_SLACK = 1 << 24
 
 
 def run_packed(spec_json: str, protocol_json: str) -> bytes:
@@ -354,21 +555,16 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return _take(archive, store, min(_LARGEST, _SLACK + _MAX_RATIO * len(data)))
+            return _take(archive, store)
     except DynslamError:
         raise
     except Exception as error:  # zipfile raises almost anything over damaged archives
         raise RunError(f"{len(data)} bytes from a worker are no packed run: {error}") from error
 
 
-def _take(archive: zipfile.ZipFile, store: RunStore, largest: int) -> RunRecord:
-    entries = archive.infolist()
-    size = sum(entry.file_size for entry in entries)
-    if size > largest:
-        raise RunError(f"a packed run holds {size / 1e9:.1f} GB, at most {largest / 1e9:.1f} GB are taken")
-    if any(entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for entry in entries):
-        raise RunError("a packed run is compressed in a way that pack() does not use")
-    names = [match.groups() for entry in entries if (match := _ENTRY.fullmatch(entry.filename))]
+def _take(archive: zipfile.ZipFile, store: RunStore) -> RunRecord:
+    entries = archive.namelist()
+    names = [match.groups() for match in map(_ENTRY.fullmatch, entries) if match]
     runs = {folder for kind, folder, _ in names if kind == "runs"}
     if len(names) != len(entries) or len(runs) != 1:
         raise RunError(f"a packed run holds {len(runs)} runs, and {len(entries) - len(names)} odd names")
