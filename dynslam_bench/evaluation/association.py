@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -42,48 +41,30 @@ class AssociationRecord(Record):
     largest_hole_s: float
     hole_at_s: float
 
-
-@dataclass(frozen=True, eq=False)
-class Association:
-    """Which estimated pose is compared with which true pose.
-
-    Attributes:
-        estimate: Indices into the estimate ``[K]``, ascending.
-        ground_truth: Indices into the ground truth ``[K]``.
-        record: What was dropped.
-    """
-
-    estimate: Index
-    ground_truth: Index
-    record: AssociationRecord
-
-    def __len__(self) -> int:
-        return len(self.estimate)
-
     def describe(self, max_dt: float) -> str:
         """One line with the measured numbers; empty if nothing was dropped."""
-        record = self.record
-        dropped = record.n_estimate - len(np.unique(self.estimate))
+        dropped = self.outside + self.in_holes + self.taken
         if not dropped:
             return ""
         reasons = [
-            (record.outside, f"{record.outside} outside the ground truth's time"),
-            (record.in_holes, f"{record.in_holes} in holes of it"),
-            (record.taken, f"{record.taken} not chosen, a closer one was there"),
+            (self.outside, f"{self.outside} outside the ground truth's time"),
+            (self.in_holes, f"{self.in_holes} in holes of it"),
+            (self.taken, f"{self.taken} not chosen, a closer one was there"),
         ]
         return (
-            f"no ground truth within {max_dt:g} s for {dropped} of {record.n_estimate} poses ("
+            f"no ground truth within {max_dt:g} s for {dropped} of {self.n_estimate} poses ("
             + ", ".join(text for count, text in reasons if count)
-            + f"; largest hole {record.largest_hole_s:.2f} s at t={record.hole_at_s:.6f}; median |dt| "
-            f"{record.median_dt_s:.4f} s)"
+            + f"; largest hole {self.largest_hole_s:.2f} s at t={self.hole_at_s:.6f}; median |dt| "
+            f"{self.median_dt_s:.4f} s)"
         )
 
 
-def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> Association:
+def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> tuple[Index, Index, AssociationRecord]:
     """Associate two trajectories under a protocol.
 
     Returns:
-        The association; its arrays are read-only, as equal stamps share one result.
+        Indices into the estimate and into the ground truth ``[K]``, ascending in the estimate, and what was dropped.
+        The arrays are read-only, as equal stamps share one result.
 
     Raises:
         EvaluationError: A trajectory is empty or no pair is close enough; the message carries the measured gap.
@@ -96,7 +77,9 @@ def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) ->
 
 
 @lru_cache(maxsize=256)
-def _matched(estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, one_to_one: bool) -> Association:
+def _matched(
+    estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, one_to_one: bool
+) -> tuple[Index, Index, AssociationRecord]:
     """`match`, once for equal stamps."""
     t_est, t_gt = np.frombuffer(estimate), np.frombuffer(ground_truth)
     if one_to_one:
@@ -110,7 +93,7 @@ def _matched(estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, 
     if not len(index_est):
         raise _nothing_matched(t_est, t_gt, max_dt)
     index_est.flags.writeable = index_gt.flags.writeable = False
-    return Association(index_est, index_gt, _record(t_est, t_gt, index_est, index_gt, max_dt, strict=strict))
+    return index_est, index_gt, _record(t_est, t_gt, index_est, index_gt, max_dt, strict=strict)
 
 
 def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) -> tuple[Index, Index]:
@@ -166,7 +149,6 @@ def _nothing_matched(t_est: Array, t_gt: Array, max_dt: float) -> EvaluationErro
         f"away; the estimate covers {t_est[0]:.3f} to {t_est[-1]:.3f} s, "
         f"the ground truth {t_gt[0]:.3f} to {t_gt[-1]:.3f} s"
     )
-    ratio = np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9)
-    if ratio > 1e5 or ratio < 1e-5:
-        return EvaluationError(message, "are the stamps of one file in nanoseconds or frame numbers?")
-    return EvaluationError(message, "check that the files belong together and that their clocks agree")
+    other_unit = not 1e-5 <= np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9) <= 1e5
+    hint = "are the stamps of one file in nanoseconds or frame numbers?"
+    return EvaluationError(message, hint if other_unit else "do the files belong together, and do their clocks agree?")
