@@ -10,11 +10,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 
+import numpy as np
 import optuna
 from optuna.trial import FrozenTrial
 
-from dynslam_bench.core.seeding import stream
-from dynslam_bench.tuning.instances import ProblemInstance, scenes
 from dynslam_bench.tuning.study_file import PrunerName
 
 FIRST_STEP = 3
@@ -22,14 +21,6 @@ FIRST_STEP = 3
 DOMINATED_SHARE = 0.1
 """With several objectives a trial ends once this share of the trials, at least two, beats it in all of them."""
 WILCOXON_LEVEL = 0.1
-
-
-def running_order(instances: Sequence[ProblemInstance], seed: int) -> list[ProblemInstance]:
-    """The instances in the order of all trials: one of each scene in turn, so that small sets hold different scenes."""
-    groups = list(scenes(instances).values())
-    stream(seed, "order").shuffle(groups)
-    longest = max(len(group) for group in groups)
-    return [group[turn] for turn in range(longest) for group in groups if turn < len(group)]
 
 
 def build_pruner(name: PrunerName) -> optuna.pruners.BasePruner:
@@ -61,12 +52,10 @@ def steps(name: PrunerName, count: int) -> list[int]:
 def is_dominated(trials: Sequence[FrozenTrial], number: int, step: int) -> bool:
     """Whether enough of the trials that came as far beat a trial in every objective at the same step."""
     name = step_name(step)
-    reported: dict[int, list[float]] = {
-        trial.number: trial.user_attrs[name] for trial in trials if name in trial.user_attrs
-    }
-    own, rivals = reported[number], list(reported.values())
-    better = sum(values != own and all(a <= b for a, b in zip(values, own, strict=True)) for values in rivals)
-    return better >= max(2, DOMINATED_SHARE * len(rivals))
+    reported = {trial.number: trial.user_attrs[name] for trial in trials if name in trial.user_attrs}
+    rivals, own = np.array(list(reported.values())), reported[number]
+    better = ((rivals <= own).all(axis=1) & (rivals != own).any(axis=1)).sum()
+    return bool(better >= max(2, DOMINATED_SHARE * len(rivals)))
 
 
 def step_name(step: int) -> str:

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import optuna
 from numpy.typing import NDArray
-from optuna.distributions import BaseDistribution, CategoricalDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
 from optuna.search_space import IntersectionSearchSpace
-from optuna.study import Study
-from optuna.study._study_direction import StudyDirection
+from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.errors import StudyError
@@ -207,27 +206,33 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
         """One flight of one moth."""
-        if study._is_multi_objective():
+        if len(study.directions) > 1:
             raise ValueError("EmfoaSampler takes one objective")
         if not search_space:
             return {}
-        finished = [trial for trial in _finished(study) if search_space.keys() <= trial.params.keys()]
-        if len(finished) < self._population:
-            return self._first_population(finished, search_space)
         names = sorted(search_space)
-        moths = np.array([[to_unit(trial.params[name], search_space[name]) for name in names] for trial in finished])
+        finished = []
+        for other in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)):
+            if not np.isnan(_value(other)) and search_space.keys() <= other.params.keys():
+                finished.append(other)
+        units = [[to_unit(other.params[name], search_space[name]) for name in names] for other in finished]
+        moths = np.array(units).reshape(-1, len(names))
+        if len(moths) < self._population:
+            drawn = zip(names, self._first_population(moths), strict=True)
+            return {name: from_unit(value, search_space[name]) for name, value in drawn}
         sign = 1.0 if study.direction == StudyDirection.MINIMIZE else -1.0
-        order = np.argsort([sign * _value(trial) for trial in finished], kind="stable")
+        order = np.argsort([sign * _value(other) for other in finished], kind="stable")
         flames = moths[order[: self._population]]
-        index = trial.number % self._population
+        index, at = trial.number % self._population, min(trial.number, self._n_trials)
         own = [row for row, other in enumerate(finished) if other.number % self._population == index]
         moth = moths[own[-1] if own else -1]
-        landed = self._fly(moth, flames, index, min(trial.number, self._n_trials))
-        best = [finished[row] for row in order[: self._population]]
-        flame = best[min(index, len(best) - 1)]
+        around = flames[min(index, flames_left(self._population, at, self._n_trials) - 1)]
+        now = flight(at / self._n_trials, EMFOA)
+        landed = moth_positions(np, moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
+        flame = finished[order[index]]
         return {
             name: self._land(value, search_space[name], flame.params[name])
-            for name, value in zip(names, landed, strict=True)
+            for name, value in zip(names, np.asarray(landed), strict=True)
         }
 
     def sample_independent(
@@ -236,23 +241,13 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         """Uniformly, for parameters outside the shared space."""
         return self._independent.sample_independent(study, trial, param_name, param_distribution)
 
-    def _first_population(self, finished: list[FrozenTrial], space: dict[str, BaseDistribution]) -> dict[str, Any]:
-        """A member of the first population: uniform, or the elite opposite of an earlier member."""
-        names = sorted(space)
-        unit = self._rng.random(len(names))
-        if len(finished) >= self._population // 2:
-            members = np.array([[to_unit(trial.params[name], space[name]) for name in names] for trial in finished])
+    def _first_population(self, members: Array) -> Array:
+        """A member of the first population in the unit cube: uniform, or the elite opposite of an earlier member."""
+        unit = self._rng.random(members.shape[1])
+        if len(members) >= self._population // 2:
             low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
-            unit = opposites(np, members[len(finished) % len(members)], low, high, low, high, self._rng.random)
-        return {name: from_unit(value, space[name]) for name, value in zip(names, unit, strict=True)}
-
-    def _fly(self, moth: Array, flames: Array, index: int, trial: int) -> Array:
-        """Where the moth of that index lands in a trial of the budget; `flames` best first."""
-        left = flames_left(self._population, trial, self._n_trials)
-        around, now = flames[min(index, left - 1)], flight(trial / self._n_trials, EMFOA)
-        return np.asarray(
-            moth_positions(np, moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
-        )
+            unit = opposites(np, members[0], low, high, low, high, self._rng.random)
+        return np.asarray(unit)
 
     def _land(self, value: float, distribution: BaseDistribution, flame: Any) -> Any:
         if isinstance(distribution, CategoricalDistribution):
@@ -260,12 +255,6 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
                 return flame
             return distribution.choices[int(self._rng.integers(len(distribution.choices)))]
         return from_unit(float(np.clip(value, 0.0, 1.0)), distribution)
-
-
-def _finished(study: Study) -> list[FrozenTrial]:
-    states = (TrialState.COMPLETE, TrialState.PRUNED)
-    trials = study._get_trials(deepcopy=False, states=states, use_cache=True)
-    return [trial for trial in trials if not np.isnan(_value(trial))]
 
 
 def _value(trial: FrozenTrial) -> float:
@@ -277,12 +266,9 @@ def _value(trial: FrozenTrial) -> float:
 
 def _scaled_bounds(distribution: Any) -> tuple[float, float]:
     """Ends of a numerical range, half a step wider for stepped ones, so that both ends are drawn as often."""
-    low, high = float(distribution.low), float(distribution.high)
-    if distribution.log:
-        half = 0.5 if isinstance(distribution.low, int) else 0.0
-        return float(np.log(low - half)), float(np.log(high + half))
-    half = 0.0 if distribution.step is None else distribution.step / 2
-    return low - half, high + half
+    half = (distribution.step or 0) / 2
+    low, high = distribution.low - half, distribution.high + half
+    return (float(np.log(low)), float(np.log(high))) if distribution.log else (low, high)
 
 
 def to_unit(value: Any, distribution: BaseDistribution) -> float:
@@ -302,11 +288,7 @@ def from_unit(unit: float, distribution: BaseDistribution) -> Any:
     value = low + unit * (high - low)
     if distribution.log:  # type: ignore[attr-defined]
         value = float(np.exp(value))
-    if isinstance(distribution, optuna.distributions.IntDistribution):
-        step = distribution.step
-        value = distribution.low + step * round((value - distribution.low) / step)
-        return int(np.clip(value, distribution.low, distribution.high))
-    assert isinstance(distribution, optuna.distributions.FloatDistribution)
-    if distribution.step is not None:
+    if distribution.step is not None:  # type: ignore[attr-defined]
         value = distribution.low + distribution.step * round((value - distribution.low) / distribution.step)
-    return float(np.clip(value, distribution.low, distribution.high))
+    value = np.clip(value, distribution.low, distribution.high)
+    return int(value) if isinstance(distribution, IntDistribution) else float(value)

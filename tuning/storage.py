@@ -10,7 +10,7 @@ import socket
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import optuna
@@ -30,7 +30,6 @@ Optuna unpickles what Redis holds."""
 _ATTEMPTS = 10
 _BEING_MADE = ("already exists", "duplicate", "unique constraint", "is locked")
 """What drivers say where another worker makes the tables at the same time."""
-_CHUNK = 1 << 16
 
 
 def study_folder(results: Path, spec: StudySpec) -> Path:
@@ -146,7 +145,7 @@ class JournalFile(JournalFileBackend):
         try:
             with self.path.open("r+b", buffering=0) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
-                end = _end_of_lines(file)
+                end = file.readall().rfind(b"\n") + 1
                 file.truncate(end)
                 file.seek(end)
                 try:
@@ -162,14 +161,3 @@ class JournalFile(JournalFileBackend):
 
 def _cannot_write(path: Path, error: OSError) -> StudyError:
     return StudyError(f"cannot write {path}: {error.strerror}", "free some space, or check the folder; then go on")
-
-
-def _end_of_lines(file: IO[bytes]) -> int:
-    """Where the last complete line of a file ends."""
-    start = file.seek(0, os.SEEK_END)
-    while start:
-        size = min(_CHUNK, start)
-        start = file.seek(start - size)
-        if (newline := file.read(size).rfind(b"\n")) >= 0:
-            return start + newline + 1
-    return 0
