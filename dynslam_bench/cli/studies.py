@@ -46,10 +46,8 @@ def space(study: Study, as_json: AsJson = False) -> None:
         for parameter in parameters:
             span = ", ".join(map(str, parameter.choices)) or f"{parameter.low:g} to {parameter.high:g}"
             span += " (log)" * (parameter.scale == "log")
-            conditions = [f"{name} = {' or '.join(map(str, values))}" for name, values in parameter.when]
-            only_if = " and ".join(conditions)
-            rows.append((parameter.name, span, parameter.default, parameter.unit, only_if, parameter.meaning))
-        write_table(("setting", "range", "default", "unit", "only if", "meaning"), rows)
+            rows.append((parameter.name, span, parameter.default, parameter.unit, parameter.meaning))
+        write_table(("setting", "range", "default", "unit", "meaning"), rows)
 
     present([asdict(parameter) for parameter in parameters], show)
 
