@@ -66,6 +66,26 @@ def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
         raise StudyError(text, "check the address and the permissions") from None
 
 
+def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:
+    """Load a stored study.
+
+    Args:
+        results: The results folder.
+        spec: The study.
+        **how: Further arguments of ``optuna.load_study``.
+
+    Raises:
+        StudyError: There is none; nothing is made then.
+    """
+    absent = StudyError(f"there is no study '{spec.name}' in {results}", "dynslam-bench tune run STUDY.toml")
+    if not spec.storage and not study_folder(results, spec).is_dir():
+        raise absent
+    try:
+        return optuna.load_study(study_name=spec.name, storage=open_storage(results, spec), **how)
+    except KeyError as error:
+        raise absent from error
+
+
 def open_database(url: str) -> BaseStorage:
     """Open a database, and make its tables if it is empty.
 

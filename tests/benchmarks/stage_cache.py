@@ -44,7 +44,7 @@ def study(sequence: str, segmenter: str, trials: int, cache: bool, results: Path
         run_id = trial.user_attrs["instances"][0][1]
         run = store.get(run_id), store.trajectory(run_id, "online"), trial.value
         found[trial.params["epipolar.threshold_px"]] = run
-        seconds.append(trial.user_attrs["wall_s"])
+        seconds.append(trial.duration.total_seconds())
     return total, seconds, found
 
 

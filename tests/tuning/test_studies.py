@@ -20,7 +20,7 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.core.toml import read_settings
 from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning import StudySpec, Tuner, finish, read_study, run_study, search_space, suggest, write_page
+from dynslam_bench.tuning import StudySpec, Tuner, distributions, finish, read_study, run_study, search_space, write_page
 from dynslam_bench.tuning.page import PLOTS_FILE
 from dynslam_bench.tuning.study_file import SpaceSpec
 from dynslam_bench.tuning.tuner import CRASHED_WORKER
@@ -216,5 +216,5 @@ def test_space_of_a_real_tracker_can_be_drawn() -> None:
     space = search_space(settings, SpaceSpec(include=("flow.*", "epipolar.*", "segmentation.*"), fixed={}))
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(20):
-        values = suggest(study.ask(), space)
+        values = study.ask(distributions(space)).params
         apply_overrides(settings(), values)  # every drawn configuration is valid
