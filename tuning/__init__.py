@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.final_runs import finish
     from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
     from dynslam_bench.tuning.page import write_page
+    from dynslam_bench.tuning.pilot import pilot_of
     from dynslam_bench.tuning.presets import read_preset_text
     from dynslam_bench.tuning.samplers import EmfoaSampler
+    from dynslam_bench.tuning.screening import screen_study
     from dynslam_bench.tuning.space import distributions, search_space
-    from dynslam_bench.tuning.study import Study, pilot_of, run_study, screen_study
+    from dynslam_bench.tuning.study import Study, run_study
     from dynslam_bench.tuning.study_file import SpaceSpec, StudySpec, read_study
     from dynslam_bench.tuning.summary import StudySummary
     from dynslam_bench.tuning.tuner import StudyEvent, Tuner
@@ -29,7 +31,9 @@ _HOMES = {
     "final_runs": ("finish",),
     "page": ("write_page",),
     "presets": ("read_preset_text",),
-    "study": ("Study", "pilot_of", "run_study", "screen_study"),
+    "pilot": ("pilot_of",),
+    "screening": ("screen_study",),
+    "study": ("Study", "run_study"),
     "space": ("distributions", "search_space"),
     "tuner": ("StudyEvent", "Tuner"),
     "study_file": ("SpaceSpec", "StudySpec", "read_study"),

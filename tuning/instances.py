@@ -121,7 +121,7 @@ def parse_instances(
     Raises:
         StudyError: It cannot be read; says how it is written.
     """
-    if os.path.isdir(os.path.expanduser(text)):  # whatever its name looks like
+    if os.path.isdir(os.path.expanduser(text)):  # noqa: PTH111, PTH112  # no error for what cannot be a path
         return tuple(ProblemInstance(text, offset=offset, seed=seed) for offset, seed in product(offsets, seeds))
     match = _TEXT.fullmatch(text)
     if match is None:

@@ -10,21 +10,23 @@ from __future__ import annotations
 import math
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, write_atomic
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.tuning.evaluate import InstanceFailedError
 from dynslam_bench.tuning.instances import ProblemInstance, scenes
-from dynslam_bench.tuning.objectives import Objective, Outcomes
+from dynslam_bench.tuning.objectives import ACCURACY, together
 from dynslam_bench.tuning.screening import stepped, toward
+from dynslam_bench.tuning.tuner import OnEvent, StudyEvent, Tuner
 
+PILOT_FILE = "pilot.json"
 EFFECTS = (0.05, 0.10, 0.20)
 """Gains, as shares, of which the pilot says what they would take."""
 HOPELESS = 0.5
@@ -135,100 +137,70 @@ def scenes_needed(effect: float, within: float, between: float, starts: float) -
     return 2 + bisect_left(counts, True, key=lambda count: detectable(within, between, count, starts) <= effect)
 
 
-def judge_pilot(
-    objective: Objective,
-    default: Outcomes,
-    changed: Sequence[Outcomes],
-    *,
-    run_s: float,
-    jobs: int = 1,
-    split: Sequence[ProblemInstance] | None = None,
-) -> Pilot:
-    """Make a pilot's numbers of its runs.
-
-    Args:
-        objective: Whose ratios are looked at.
-        default: The default settings' outcomes.
-        changed: Outcomes of changed settings, on instances that the default ran on.
-        run_s: Seconds of one run.
-        jobs: Runs at a time.
-        split: Instances that the study would judge on; those of the pilot if None.
+def begin(tuner: Tuner, *, jobs: int = 1, on_event: OnEvent | None = None) -> None:
+    """Run a new study's pilot, if it asks for one, and report what it shows.
 
     Raises:
-        StudyError: Too few scenes to tell a spread, or the changed settings changed nothing.
+        StudyError: Not even a gain of half would be told from nothing.
     """
-    pairs = [_paired(objective, outcomes, default) for outcomes in changed]
-    count = len(scenes(pairs[0])) if pairs else 0
+    if not tuner.spec.pilot or (tuner.folder / PILOT_FILE).is_file() or tuner.study.get_trials(deepcopy=False)[1:]:
+        return
+    pilot, texts = None, [f"no pilot: it takes {FEWEST} scenes to tune on"]
+    if len(scenes(tuner.design.tune)) >= FEWEST:
+        pilot = pilot_of(tuner, jobs=jobs)
+        texts = [pilot.sentence, *filter(None, [pilot.warning])]
+    for text in texts:
+        if on_event is not None:
+            on_event(StudyEvent("pilot", 0, 1, text))
+    speed_alone = tuner.spec.at_equal_accuracy  # settings that leave the poses alone show their speed
+    if pilot is not None and not speed_alone and pilot.detectable > HOPELESS:
+        raise StudyError(f"this study could show nothing: {pilot.sentence}; {pilot.way_out}", "or pilot = false to try")
+
+
+def pilot_of(tuner: Tuner, *, jobs: int = 1) -> Pilot:
+    """Run the default and a few changed settings, and judge what they say; `PILOT_FILE` in the study's folder holds it.
+
+    It looks at the study's own objectives, or at accuracy where a gain counts only at equal accuracy, and at the
+    instances that the study would judge on, or its own where those are of too few scenes.
+
+    Raises:
+        StudyError: The default settings fail, all changed ones do, or there are too few scenes to tell a spread.
+    """
+    chosen = some_of(tuner.design.reference)
+    objective = ACCURACY if tuner.spec.at_equal_accuracy else together(tuner.objectives)
+    count = len(scenes(chosen))
     if count < FEWEST:
         raise StudyError(
             f"a pilot over {count} scene{'s' * (count != 1)} says nothing, it takes {FEWEST}",
             'name more scenes, e.g. "synthetic/walking_xyz?scene=0-5&frames=80&offsets=0-2"',
         )
-    within, between = np.sqrt(np.square([spread(logs) for logs in pairs]).mean(axis=0)).tolist()
-    judged = scenes(split if split is not None else list(pairs[0]))
+    default = tuner.default_outcomes(chosen, jobs=jobs)
+    began, spreads, reason = time.perf_counter(), [], ""
+    for number in range(CONFIGURATIONS):
+        change = small_change(tuner.space, tuner.base, stream(tuner.spec.sampler_seed, "pilot", number))
+        try:
+            outcomes = tuner.evaluate({**tuner.spec.space.fixed, **change}, chosen, jobs=jobs)
+            spreads.append(spread(objective.log_ratios(outcomes, default)))
+        except InstanceFailedError as error:
+            reason = str(error.args[0])
+    if not spreads:
+        raise StudyError(f"no pilot: all settings tried near the default fail: {reason}", "narrow the space")
+    run_s = (time.perf_counter() - began) * jobs / (CONFIGURATIONS * len(chosen))
+    within, between = np.sqrt(np.square(spreads).mean(axis=0)).tolist()
+    judged = scenes(tuner.design.held_out)
+    judged = judged if len(judged) >= FEWEST else scenes(chosen)
     starts = sum(map(len, judged.values())) / len(judged)
     needs = []
     for effect in EFFECTS:
         count = scenes_needed(effect, within, between, starts)
         runs = math.ceil(count * starts)
         needs.append(Need(effect=effect, scenes=count, instances=runs, minutes=math.ceil(runs / jobs) * run_s / 60))
-    return Pilot(
+    pilot = Pilot(
         objective=objective.what, scenes=len(judged), starts=round(starts, 2), within=within,
         between=between, run_s=run_s, detectable=detectable(within, between, len(judged), starts), needs=needs,
     )  # fmt: skip
-
-
-def refuse_hopeless(pilot: Pilot) -> None:
-    """Refuse a study that could not show anything.
-
-    Raises:
-        StudyError: Not even a gain of half would be told from nothing.
-    """
-    if pilot.detectable > HOPELESS:
-        raise StudyError(f"this study could show nothing: {pilot.sentence}; {pilot.way_out}", "or pilot = false to try")
-
-
-def run_pilot(
-    space: Sequence[Parameter],
-    base: Mapping[str, Any],
-    run: Callable[[Mapping[str, Any], Sequence[ProblemInstance]], Outcomes],
-    instances: Sequence[ProblemInstance],
-    objective: Objective,
-    *,
-    seed: int = 0,
-    jobs: int = 1,
-    split: Sequence[ProblemInstance] | None = None,
-) -> Pilot:
-    """Run the default and a few changed settings, and judge what they say.
-
-    Args:
-        space: The study's settings.
-        base: Default value of every setting, dotted name to value.
-        run: Gives the outcomes of values of the space on instances, `jobs` at a time.
-        instances: What the study tunes on; `some_of` them are run.
-        objective: See `judge_pilot`, as `split` is.
-        seed: Of the changes.
-        jobs: Runs at a time.
-        split: Instances that the study would judge on.
-
-    Raises:
-        StudyError: See `judge_pilot`.
-    """
-    chosen = some_of(instances)
-    try:
-        default = run({}, chosen)
-    except InstanceFailedError as error:
-        raise StudyError(f"the default settings fail: {error.args[0]}", "a study needs a default that runs") from error
-    began, changed, reason = time.perf_counter(), [], ""
-    for number in range(CONFIGURATIONS):
-        try:
-            changed.append(run(small_change(space, base, stream(seed, "pilot", number)), chosen))
-        except InstanceFailedError as error:
-            reason = str(error.args[0])
-    if not changed:
-        raise StudyError(f"no pilot: all settings tried near the default fail: {reason}", "narrow the space")
-    run_s = (time.perf_counter() - began) * jobs / (CONFIGURATIONS * len(chosen))
-    return judge_pilot(objective, default, changed, run_s=run_s, jobs=jobs, split=split)
+    write_atomic(tuner.folder / PILOT_FILE, pilot.to_json())
+    return pilot
 
 
 def some_of(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
@@ -243,12 +215,3 @@ def small_change(space: Sequence[Parameter], base: Mapping[str, Any], rng: np.ra
     if any(changed[name] != base[name] for name in changed):
         return changed
     return {parameter.name: stepped(parameter, base[parameter.name], rng) for parameter in space}
-
-
-def _paired(objective: Objective, outcomes: Outcomes, default: Outcomes) -> dict[ProblemInstance, float]:
-    """Log ratio on each instance that both ran."""
-    return {
-        instance: math.log(objective.cost(outcome) / objective.cost(default[instance]))
-        for instance, outcome in outcomes.items()
-        if instance in default
-    }

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -17,14 +16,18 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, write_atomic
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.tuning.evaluate import InstanceFailedError
-from dynslam_bench.tuning.objectives import Objective, Outcomes
+from dynslam_bench.tuning.objectives import ACCURACY, Objective, Outcomes
 from dynslam_bench.tuning.samplers import from_unit, to_unit
 from dynslam_bench.tuning.space import distribution
+from dynslam_bench.tuning.tuner import Tuner
 
+SCREENING_FILE = "screening.json"
+SCREENED_INSTANCES = 4
+"""Instances that a screening takes if nothing else is asked for."""
 STEP = 1 / 3
 """How far a setting is moved, as a share of its range (of its logarithm where its scale is that)."""
 NEARNESS = 0.3
@@ -32,26 +35,13 @@ NEARNESS = 0.3
 Values = dict[str, Scalar]
 
 
-@dataclass(frozen=True)
-class Point:
-    """Where effects are measured from, and the steps from there.
-
-    Attributes:
-        base: Values of all screened settings.
-        steps: Value of each setting after its step.
-    """
-
-    base: Values
-    steps: Values
-
-
-def plan(space: Sequence[Parameter], base: Mapping[str, Any], points: int, seed: int) -> list[Point]:
-    """The points: the default first, then others near it; a step of each setting from each."""
-    chosen: list[Point] = []
+def plan(space: Sequence[Parameter], base: Mapping[str, Any], points: int, seed: int) -> list[tuple[Values, Values]]:
+    """Points to move from, the default first, then others near it: their values, and a step of each setting."""
+    chosen = []
     for number in range(points):
         rng = stream(seed, "screening", number)
         start = {p.name: base[p.name] if number == 0 else toward(p, base[p.name], rng) for p in space}
-        chosen.append(Point(start, {p.name: stepped(p, start[p.name], rng) for p in space}))
+        chosen.append((start, {p.name: stepped(p, start[p.name], rng) for p in space}))
     return chosen
 
 
@@ -127,64 +117,64 @@ class Screening(Record):
     runs: int
 
 
-def screen(
-    points: Sequence[Point],
-    run: Callable[[Mapping[str, Scalar]], Outcomes],
-    objectives: Sequence[Objective],
-    *,
-    jobs: int = 1,
+def screen_study(
+    tuner: Tuner, *, points: int = 2, instances: int = SCREENED_INSTANCES, jobs: int = 1,
     on_done: Callable[[int, int], None] | None = None,
-) -> Screening:
-    """Measure the effect of every setting.
+) -> Screening:  # fmt: skip
+    """Find the settings of a study's space that matter; `SCREENING_FILE` in its folder holds them.
 
     Args:
-        points: From `plan`.
-        run: Gives the outcomes of values on the instances, always the same ones.
-        objectives: In what effects are looked for.
+        tuner: The study.
+        points: From how many points settings are moved: the default and others near it.
+        instances: On how many of its instances, of different scenes where there are so many.
         jobs: Configurations at a time.
-        on_done: Told how many configurations of how many are done.
+        on_done: Called with the number of finished configurations and of all.
 
     Raises:
         StudyError: Fewer than two instances, or the default itself fails.
     """
-    try:
-        base = run(points[0].base)
-    except InstanceFailedError as error:
-        raise StudyError(
-            f"the default settings fail: {error.args[0]}", "screening needs a default that runs"
-        ) from error
-    if len(base) < FEWEST_INSTANCES:
-        raise StudyError(f"screening on {len(base)} instance cannot tell an effect from chance", "name two or more")
-    names = list(points[0].base)
-    todo: list[tuple[int, str | None]] = [(number, None) for number in range(1, len(points))]
-    todo += [(number, name) for number in range(len(points)) for name in names]
+    chosen = tuner.design.tune[:instances]
+    if len(chosen) < FEWEST_INSTANCES:
+        raise StudyError(f"screening on {len(chosen)} instance cannot tell an effect from chance", "name two or more")
+    starts = plan(tuner.space, tuner.base, points, tuner.spec.sampler_seed)
+    names = list(starts[0][0])
+    todo: dict[tuple[int, str], Values] = {}
+    for number, (start, steps) in enumerate(starts):
+        todo[number, ""] = start
+        todo |= {(number, name): {**start, name: steps[name]} for name in names}
     failed: dict[str, str] = {}
-    outcomes: dict[tuple[int, str | None], Outcomes] = {(0, None): base}
+    outcomes: dict[tuple[int, str], Outcomes] = {}
 
-    def evaluate(number: int, name: str | None) -> None:
-        point = points[number]
+    def run(number: int, name: str) -> None:
         try:
-            outcomes[number, name] = run(point.base if name is None else {**point.base, name: point.steps[name]})
+            outcomes[number, name] = tuner.evaluate({**tuner.spec.space.fixed, **todo[number, name]}, chosen)
         except InstanceFailedError as error:
             failed.setdefault(name or "a point near the default", error.args[0])
 
+    run(0, "")
+    if (0, "") not in outcomes:
+        text = failed["a point near the default"]
+        raise StudyError(f"the default settings fail: {text}", "screening needs a default that runs")
     with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-screen") as pool:
-        pending = [pool.submit(evaluate, number, name) for number, name in todo]
+        pending = [pool.submit(run, *key) for key in todo if key != (0, "")]
         for done, future in enumerate(as_completed(pending), start=2):
             future.result()
             if on_done is not None:
-                on_done(done, len(todo) + 1)
-    effects = [effect for name in names if (effect := _effect_of(name, outcomes, len(points), objectives))]
+                on_done(done, len(todo))
+    objectives = list(dict.fromkeys([*tuner.objectives, ACCURACY]))
+    effects = [effect for name in names if (effect := _effect_of(name, outcomes, points, objectives))]
     effects.sort(key=lambda effect: (-effect.low, -effect.size))
-    return Screening(
+    screening = Screening(
         effects=effects,
         kept=[effect.name for effect in effects if effect.low > 0][:KEPT],
         dead=[effect.name for effect in effects if effect.dead],
         failed=failed,
-        points=len(points),
-        instances=len(base),
-        runs=len(base) * (len(todo) + 1),
+        points=points,
+        instances=len(chosen),
+        runs=len(chosen) * len(todo),
     )
+    write_atomic(tuner.folder / SCREENING_FILE, screening.to_json())
+    return screening
 
 
 def size_of(effects: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -218,27 +208,20 @@ def size_of(effects: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def _effect_of(
-    name: str, outcomes: Mapping[tuple[int, str | None], Outcomes], points: int, objectives: Sequence[Objective]
+    name: str, outcomes: Mapping[tuple[int, str], Outcomes], points: int, objectives: Sequence[Objective]
 ) -> Effect | None:
     """The effect on the objective that shows it most; None where all its steps broke a run."""
-    pairs = [
-        (outcomes[number, None], outcomes[number, name])
-        for number in range(points)
-        if (number, None) in outcomes and (number, name) in outcomes
-    ]
-    if not pairs:
+    measured = [number for number in range(points) if (number, "") in outcomes and (number, name) in outcomes]
+    if not measured:
         return None
-    dead = all(
-        (base[instance].ate_m, base[instance].coverage) == (outcome.ate_m, outcome.coverage)
-        for base, moved in pairs
-        for instance, outcome in moved.items()
-    )
-    effects = []
+    pairs = [(outcomes[number, name], outcomes[number, ""]) for number in measured]
+    effects, dead = [], all(_errors(moved) == _errors(base) for moved, base in pairs)
     for objective in objectives:
-        logs = [
-            [math.log(objective.cost(outcome) / objective.cost(base[instance])) for instance, outcome in moved.items()]
-            for base, moved in pairs
-        ]
+        logs = [list(objective.log_ratios(moved, base).values()) for moved, base in pairs]
         size, low, high = size_of(np.array(logs))
         effects.append(Effect(name=name, objective=objective.what, size=size, low=low, high=high, dead=dead))
     return max(effects, key=lambda effect: (effect.low, effect.size))
+
+
+def _errors(outcomes: Outcomes) -> list[tuple[float, float]]:
+    return [(outcome.ate_m, outcome.coverage) for outcome in outcomes.values()]

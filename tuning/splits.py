@@ -287,7 +287,9 @@ def _shapes(sequence: Sequence) -> NDArray[np.float64]:
 
 def _alike(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
     """Whether two frames show the same colour, and depth in the numbers that their files hold."""
-    colours = [cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA) for frame in (here, there)]
+    colours = [
+        cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA) for frame in (here, there)
+    ]
     if np.abs(colours[0] - colours[1]).mean() > _GREY_LEVELS:
         return False
     raw = (here.depth * one.depth_factor, there.depth * other.depth_factor)
@@ -336,4 +338,3 @@ def seen_note(splits: PySequence[str]) -> str:
         else "so the errors there are optimistic, and the held-out instances, which it has not seen, may gain less"
     )
     return f"{SEEN} In the {named} the masks come from a network that was trained on those very scenes, {judged}."
-

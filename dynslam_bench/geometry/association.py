@@ -59,7 +59,7 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
 
 
 def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """Distance in seconds ``[N]`` of every (finite) stamp of `first` to the nearest of `second`; inf if `second` is empty."""
+    """Distance in seconds ``[N]`` of every (finite) stamp of `first` to the nearest of `second`; inf without any."""
     a = np.asarray(first, dtype=np.float64).reshape(-1)
     b = np.concatenate([[-np.inf], np.sort(np.asarray(second, dtype=np.float64).reshape(-1)), [np.inf]])
     after = np.searchsorted(b, a)
