@@ -39,9 +39,10 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
     """
     spec, design = tuner.spec, tuner.design
     note = on_note or (lambda _: None)
-    if not best_trials(tuner.study, 1):
+    finished = best_trials(tuner.study, spec.top + 1)
+    if not finished:
         raise StudyError(f"study '{spec.name}' has no finished trial", "run it first, or see why its trials failed")
-    best = [trial for trial in best_trials(tuner.study, spec.top + 1) if trial.number > 0][: spec.top]
+    best = [trial for trial in finished if trial.number > 0][: spec.top]
     candidates = []
     if best:
         numbers = " and ".join(str(trial.number) for trial in best)
@@ -58,14 +59,12 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         ]
     chosen = choose(candidates)
     picks = _picks(spec, candidates, chosen)
-    for number in dict.fromkeys(number for number in picks.values() if number is not None):
-        note(f"trial {number} on the held-out instances")
-        place = next(place for place, candidate in enumerate(candidates) if candidate.trial == number)
-        candidates[place] = _judge(tuner, candidates[place], jobs)
-    if chosen is not None:
-        number = chosen.trial
-        candidates.sort(key=lambda candidate: candidate.trial != number)
-        chosen = candidates[0]
+    for place, candidate in enumerate(candidates):
+        if candidate.trial in picks.values():
+            note(f"trial {candidate.trial} on the held-out instances")
+            candidates[place] = _judge(tuner, candidate, jobs)
+    number = None if chosen is None else chosen.trial
+    candidates.sort(key=lambda candidate: candidate.trial != number)
     notes = list(design.notes)
     summary = StudySummary(
         name=spec.name,
@@ -73,9 +72,9 @@ def finish(tuner: Tuner, on_note: Callable[[str], None] | None = None, *, jobs: 
         protocol=held_protocol(spec.protocol).describe(),
         trials=count_states(tuner.study),
         candidates=candidates,
-        chosen=None if chosen is None else chosen.trial,
-        improves=chosen is not None and chosen.is_confirmed and not notes,
-        conclusion=conclude(candidates, None if chosen is None else chosen.trial, notes),
+        chosen=number,
+        improves=number is not None and candidates[0].is_confirmed and not notes,
+        conclusion=conclude(candidates, number, notes),
         split_notes=notes,
         importances=importances(tuner.study),
         confirm=list(map(str, design.confirm)),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ def preset_text(
     tuned_on: Sequence[str] = (),
     judged_on: Sequence[str] = (),
 ) -> str:
-    """TOML text of tuned settings, dotted name to value, grouped into tables.
+    """TOML text of tuned settings, a dotted name and its value a line.
 
     What a study had fixed, for example the source of its masks, is only a comment, so that the preset runs wherever
     the tracker does.
@@ -97,29 +98,12 @@ def preset_text(
         values = ", ".join(f"{name} = {json.dumps(value)}" for name, value in sorted(fixed.items()))
         remarks.append(f"Fixed in that study, not part of these settings: {values}.")
     head = [f"settings of {tracker}", *(line for text in remarks for line in textwrap.wrap(text, 100))]
-    return "\n".join([*(f"# {line}" for line in head), "", *_tables(tuned)])
-
-
-def _tables(tuned: Mapping[str, Any]) -> Iterable[str]:
-    groups: dict[str, list[tuple[str, Any]]] = {}
-    for name, value in sorted(tuned.items()):
-        group, _, leaf = name.rpartition(".")
-        groups.setdefault(group, []).append((leaf, value))
-    for group in sorted(groups):
-        if group:
-            yield f"[{group}]"
-        yield from (f"{leaf} = {json.dumps(value)}" for leaf, value in groups[group])
-        yield ""
+    values = [f"{name} = {json.dumps(value)}" for name, value in sorted(tuned.items())]
+    return "\n".join([*(f"# {line}" for line in head), "", *values, ""])
 
 
 def _listed(instances: Sequence[str]) -> str:
     """Instances by their sequences, with their number."""
-    names = list(dict.fromkeys(_scene(text) for text in instances))
+    names = list(dict.fromkeys(re.sub(r"[?&](?!scene=)[^?&]*", "", text) for text in instances))
     shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
     return f"{len(instances)} instance{'s' * (len(instances) != 1)} of {shown}"
-
-
-def _scene(instance: str) -> str:
-    """A instance's text without its options but for the scene."""
-    name, _, query = instance.partition("?")
-    return "?".join([name, *(option for option in query.split("&") if option.startswith("scene="))])
