@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dynslam_bench.tuning.evaluate import Outcome
-    from dynslam_bench.tuning.final_runs import finish
+    from dynslam_bench.tuning.final_runs import finish, read_preset_text
     from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
     from dynslam_bench.tuning.page import write_page
-    from dynslam_bench.tuning.pilot import pilot_of
-    from dynslam_bench.tuning.presets import read_preset_text
+    from dynslam_bench.tuning.preliminary import pilot_of, screen_study
     from dynslam_bench.tuning.samplers import EmfoaSampler
-    from dynslam_bench.tuning.screening import screen_study
     from dynslam_bench.tuning.space import distributions, search_space
     from dynslam_bench.tuning.study import Study, run_study
     from dynslam_bench.tuning.study_file import SpaceSpec, StudySpec, read_study
@@ -28,11 +26,9 @@ _HOMES = {
     "instances": ("ProblemInstance", "parse_instances"),
     "samplers": ("EmfoaSampler",),
     "evaluate": ("Outcome",),
-    "final_runs": ("finish",),
+    "final_runs": ("finish", "read_preset_text"),
     "page": ("write_page",),
-    "presets": ("read_preset_text",),
-    "pilot": ("pilot_of",),
-    "screening": ("screen_study",),
+    "preliminary": ("pilot_of", "screen_study"),
     "study": ("Study", "run_study"),
     "space": ("distributions", "search_space"),
     "tuner": ("StudyEvent", "Tuner"),

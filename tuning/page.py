@@ -20,8 +20,8 @@ from dynslam_bench.reports.figures import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block, Section, render
 from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
+from dynslam_bench.tuning.final_runs import preset_text
 from dynslam_bench.tuning.instances import ProblemInstance, scenes
-from dynslam_bench.tuning.presets import preset_text
 from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
 from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, worth

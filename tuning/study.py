@@ -17,8 +17,7 @@ from dynslam_bench.tuning.final_runs import finish
 from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.objectives import Cost, Objective, find_objective, own_objective
 from dynslam_bench.tuning.page import write_page
-from dynslam_bench.tuning.pilot import Pilot, begin, pilot_of
-from dynslam_bench.tuning.screening import SCREENED_INSTANCES, Screening, screen_study
+from dynslam_bench.tuning.preliminary import SCREENED_INSTANCES, Pilot, Screening, begin, pilot_of, screen_study
 from dynslam_bench.tuning.space import starting_point
 from dynslam_bench.tuning.storage import load_study
 from dynslam_bench.tuning.study_file import StudySpec, make_spec, read_study

@@ -30,8 +30,7 @@ from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.evaluate import CancelledError, InstanceFailedError, Outcome, evaluate
 from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.objectives import Objective, Outcomes, coverage, find_objective, fps, violations
-from dynslam_bench.tuning.pruning import build_pruner, is_dominated, step_name, steps
-from dynslam_bench.tuning.samplers import build_sampler
+from dynslam_bench.tuning.samplers import build_pruner, build_sampler, is_dominated, step_name, steps
 from dynslam_bench.tuning.space import distributions, search_space
 from dynslam_bench.tuning.splits import design_of
 from dynslam_bench.tuning.storage import (

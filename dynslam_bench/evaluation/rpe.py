@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.evaluation.ape import named, statistics
-from dynslam_bench.evaluation.association import Index
-from dynslam_bench.evaluation.comparison import Comparison
+from dynslam_bench.evaluation.comparison import Comparison, Index
 from dynslam_bench.evaluation.protocol import RPESpec
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import nearest_gap

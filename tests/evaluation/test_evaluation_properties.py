@@ -21,7 +21,7 @@ from dynslam_bench.evaluation import (
 )
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.ape import ate_rmse_m
-from dynslam_bench.evaluation.association import nearest_match
+from dynslam_bench.evaluation.comparison import nearest_match
 from dynslam_bench.evaluation.rpe import segment_errors
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.rigs import bonn_as_droid_w, bonn_camera

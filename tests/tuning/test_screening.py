@@ -17,7 +17,7 @@ from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.settings import flatten, parameters
 from dynslam_bench.tuning import Outcome, ProblemInstance, screen_study
 from dynslam_bench.tuning.evaluate import InstanceFailedError
-from dynslam_bench.tuning.screening import KEPT, SCREENING_FILE, plan, size_of, stepped
+from dynslam_bench.tuning.preliminary import KEPT, SCREENING_FILE, plan, size_of, stepped
 
 SPACE = parameters(ToySettings)
 BASE = flatten(ToySettings())

@@ -20,7 +20,16 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.core.toml import read_settings
 from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning import StudySpec, Tuner, distributions, finish, read_study, run_study, search_space, write_page
+from dynslam_bench.tuning import (
+    StudySpec,
+    Tuner,
+    distributions,
+    finish,
+    read_study,
+    run_study,
+    search_space,
+    write_page,
+)
 from dynslam_bench.tuning.page import PLOTS_FILE
 from dynslam_bench.tuning.study_file import SpaceSpec
 from dynslam_bench.tuning.tuner import CRASHED_WORKER
