@@ -53,16 +53,6 @@ def test_tum_quaternion_order_is_xyzw(tmp_path):
     assert np.allclose(pose[:3, 3], [0.1, 0.2, 0.3])
 
 
-def test_tum_agrees_with_evo(tmp_path):
-    file_interface = pytest.importorskip("evo.tools.file_interface")
-    original = random_trajectory(seed=3)
-    write_tum(tmp_path / "a.txt", original)
-    evo = file_interface.read_tum_trajectory_file(str(tmp_path / "a.txt"))
-    ours = read_tum(tmp_path / "a.txt")
-    assert np.array_equal(evo.timestamps, ours.timestamps)
-    assert np.allclose(np.array(evo.poses_se3), ours.T_world_cam, atol=1e-9)
-
-
 def test_tum_skips_and_counts_like_the_official_tools(tmp_path):
     path = write(
         tmp_path,
