@@ -63,7 +63,7 @@ def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     a = np.asarray(first, dtype=np.float64).reshape(-1)
     b = np.concatenate([[-np.inf], np.sort(np.asarray(second, dtype=np.float64).reshape(-1)), [np.inf]])
     after = np.searchsorted(b, a)
-    return np.minimum(a - b[after - 1], b[after] - a)
+    return np.asarray(np.minimum(a - b[after - 1], b[after] - a))
 
 
 def _sorted_stamps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], Index]:
