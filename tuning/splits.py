@@ -252,8 +252,9 @@ def same_recording(one: Sequence, other: Sequence) -> bool:
 
 def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
     shapes = [_shapes(one), _shapes(other)]
-    distance, nearest = cKDTree(shapes[1]).query(shapes[0])
-    relative = distance / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
+    distance, index = cKDTree(shapes[1]).query(shapes[0])
+    nearest = np.asarray(index, np.intp)
+    relative = np.asarray(distance, np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
     yield from ((int(here), int(nearest[here])) for here in np.argsort(relative, kind="stable")[:_PAIRS])
     if _is_rendered(one) or _is_rendered(other):
         return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
