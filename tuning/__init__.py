@@ -2,7 +2,7 @@
 
 `Study` is all of it from Python: run, pilot, screen, finish, and a stored one as a pandas frame. Its steps by
 themselves: `read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on
-held-out instances, `write_page` shows it all. `search_space` and `suggest` serve studies of your own.
+held-out instances, `write_page` shows it all. `search_space` and `distributions` serve studies of your own.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dynslam_bench.tuning.evaluate import Outcome
-    from dynslam_bench.tuning.final_runs import finish
+    from dynslam_bench.tuning.final_runs import finish, read_preset_text
     from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
     from dynslam_bench.tuning.page import write_page
-    from dynslam_bench.tuning.presets import read_preset_text
+    from dynslam_bench.tuning.preliminary import pilot_of, screen_study
     from dynslam_bench.tuning.samplers import EmfoaSampler
-    from dynslam_bench.tuning.space import search_space, suggest
-    from dynslam_bench.tuning.study import Study, pilot_of, run_study, screen_study
+    from dynslam_bench.tuning.space import distributions, search_space
+    from dynslam_bench.tuning.study import Study, run_study
     from dynslam_bench.tuning.study_file import SpaceSpec, StudySpec, read_study
     from dynslam_bench.tuning.summary import StudySummary
     from dynslam_bench.tuning.tuner import StudyEvent, Tuner
@@ -26,12 +26,11 @@ _HOMES = {
     "instances": ("ProblemInstance", "parse_instances"),
     "samplers": ("EmfoaSampler",),
     "evaluate": ("Outcome",),
-    "final_runs": ("finish",),
+    "final_runs": ("finish", "read_preset_text"),
     "page": ("write_page",),
-    "presets": ("read_preset_text",),
-    "study": ("Study", "pilot_of", "run_study", "screen_study"),
-    "space": ("search_space", "suggest"),
-    "_": (),
+    "preliminary": ("pilot_of", "screen_study"),
+    "study": ("Study", "run_study"),
+    "space": ("distributions", "search_space"),
     "tuner": ("StudyEvent", "Tuner"),
     "study_file": ("SpaceSpec", "StudySpec", "read_study"),
     "summary": ("StudySummary",),
@@ -47,6 +46,7 @@ __all__ = [
     "StudySpec",
     "StudySummary",
     "Tuner",
+    "distributions",
     "finish",
     "parse_instances",
     "pilot_of",
@@ -55,7 +55,6 @@ __all__ = [
     "run_study",
     "screen_study",
     "search_space",
-    "suggest",
     "write_page",
 ]
 

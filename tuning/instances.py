@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
 from collections.abc import Sequence as PySequence
@@ -19,8 +20,14 @@ from dynslam_bench.sequences.view import SequenceView
 
 FEWEST_FRAMES = 2
 """A shorter instance has no motion."""
-_TEXT = re.compile(r"(?P<name>[^\[\]?]+?)(?:@(?P<scenes>[0-9,-]+))?(?:\[(?P<frames>[^\]]*)\])?(?:\?(?P<query>.*))?")
-_OPTIONS = ("scene", "frames", "offsets", "stride", "seeds", "degrade", "noise")
+_TEXT = re.compile(r"(?P<name>[^\[\]?]+)(?:\[(?P<frames>[^\]]*)\])?(?:\?(?P<query>.*))?")
+_NUMBER, _NUMBERS = "[1-9][0-9]{0,8}", "[0-9]{1,9}(-[0-9]{1,9})?(,[0-9]{1,9}(-[0-9]{1,9})?)*"
+_STRENGTHS = r"[a-z]+:[0-9]*\.?[0-9]+(,[a-z]+:[0-9]*\.?[0-9]+)*"
+_OPTIONS = {
+    "scene": _NUMBERS, "frames": _NUMBER, "offsets": _NUMBERS, "stride": _NUMBER, "seeds": _NUMBERS,
+    "degrade": _STRENGTHS, "noise": "[0-9]{1,9}",
+}  # fmt: skip
+"""What may stand behind the question mark, and how its value is written."""
 _FORM = 'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4"'
 
 
@@ -114,42 +121,35 @@ def parse_instances(
     Raises:
         StudyError: It cannot be read; says how it is written.
     """
-    if Path(text).expanduser().is_dir():  # whatever its name looks like
+    if os.path.isdir(os.path.expanduser(text)):  # noqa: PTH111, PTH112  # no error for what cannot be a path
         return tuple(ProblemInstance(text, offset=offset, seed=seed) for offset, seed in product(offsets, seeds))
     match = _TEXT.fullmatch(text)
     if match is None:
         raise StudyError(f"'{text}' names no instances", _FORM)
-    options = _options(match["query"], text)
-    frames = None if match["frames"] is None else _frames(match["frames"], text)
-    if match["name"].startswith("synthetic/"):
-        names = _rendered_names(match["name"], match["scenes"], options, text)
+    name, query = match["name"], match["query"] or ""
+    rendered = name.startswith("synthetic/")
+    if rendered:
+        name, separator, scenes = name.partition("@")
+        query = f"scene={scenes}&{query}".rstrip("&") if separator else query
+    options = _options(query, text)
+    frames = _frames(match["frames"], text)
+    if rendered:
+        rest = [f"{key}={options[key]}" for key in ("frames", "noise") if key in options]
+        numbers = [f"scene={scene}" for scene in _numbers(options["scene"], text)] if "scene" in options else [""]
+        queries = ["&".join(filter(None, [number, *rest])) for number in numbers]
+        names = [f"{name}?{query}" if query else name for query in queries]
     else:
-        for option in {"scene", "noise"} & options.keys():
-            raise StudyError(f"'{text}': rendered sequences alone have a {option}", _FORM)
-        if "frames" in options:
-            if frames is not None:
-                raise StudyError(f"'{text}' names its frames twice", "write [A:B] or ?frames=N")
-            frames = (0, _number(options["frames"], "frames", text))
-        names = [match["name"] if match["scenes"] is None else f"{match['name']}@{match['scenes']}"]
-    stride = _number(options["stride"], "stride", text) if "stride" in options else 1
+        for option in ({"scene", "noise"} | ({"frames"} if frames else set())) & options.keys():
+            raise StudyError(f"'{text}' may not have a {option}", _FORM)
+        frames = (0, int(options["frames"])) if "frames" in options else frames
+        names = [name]
     starts = _numbers(options["offsets"], text) if "offsets" in options else offsets
     seeds = _numbers(options["seeds"], text) if "seeds" in options else seeds
-    strengths = _strengths(options.get("degrade", ""), text)
+    stride, strengths = int(options.get("stride", 1)), _strengths(options.get("degrade", ""), text)
     return tuple(
         ProblemInstance(name, frames, offset, stride, strengths, seed)
         for name, offset, seed in product(names, starts, seeds)
     )
-
-
-def _rendered_names(name: str, scenes: str | None, options: dict[str, str], text: str) -> list[str]:
-    """Ids of a rendered sequence's scenes."""
-    if scenes is not None and "scene" in options:
-        raise StudyError(f"'{text}' names its scenes twice", "write ?scene=0-19")
-    scenes = options.get("scene", scenes)
-    rest = [f"{key}={options[key]}" for key in ("frames", "noise") if key in options]
-    numbers = [""] if scenes is None else [f"scene={scene}" for scene in _numbers(scenes, text)]
-    queries = ["&".join(filter(None, [number, *rest])) for number in numbers]
-    return [f"{name}?{query}" if query else name for query in queries]
 
 
 def scene_of(name: str) -> str:
@@ -175,19 +175,21 @@ def scenes(instances: Iterable[ProblemInstance]) -> dict[str, list[ProblemInstan
     return groups
 
 
-def _options(query: str | None, text: str) -> dict[str, str]:
+def _options(query: str, text: str) -> dict[str, str]:
     options: dict[str, str] = {}
-    for option in [] if query is None else query.split("&"):
+    for option in query.split("&") if query else ():
         key, _, value = option.partition("=")
         if key not in _OPTIONS or not value:
             raise StudyError(f"'{text}' has an unknown option '{option}'", did_you_mean(key, list(_OPTIONS)))
         if key in options:
             raise StudyError(f"'{text}' names {key} twice", "leave one out")
+        if not re.fullmatch(_OPTIONS[key], value):
+            raise StudyError(f"'{option}' of '{text}' cannot be read", _FORM)
         options[key] = value
     return options
 
 
-def _frames(text: str, whole: str) -> tuple[int, int | None] | None:
+def _frames(text: str | None, whole: str) -> tuple[int, int | None] | None:
     try:
         frames = parse_frames(text)
     except SequenceError as error:
@@ -195,22 +197,15 @@ def _frames(text: str, whole: str) -> tuple[int, int | None] | None:
     return None if frames == (0, None) else frames
 
 
-def _number(text: str, what: str, whole: str) -> int:
-    if not re.fullmatch("[0-9]{1,9}", text) or int(text) < 1:
-        raise StudyError(f"{what} '{text}' of '{whole}' is no whole number from 1 on", _FORM)
-    return int(text)
-
-
 def _numbers(text: str, whole: str) -> list[int]:
     """``0-4,7`` as ``[0, 1, 2, 3, 4, 7]``."""
     numbers: list[int] = []
     for piece in text.split(","):
-        match = re.fullmatch("([0-9]{1,9})(?:-([0-9]{1,9}))?", piece)
-        if match is None or int(match[2] or match[1]) < int(match[1]):
-            raise StudyError(f"'{piece}' of '{whole}' is neither a number nor a range of numbers", "write 0-4,7")
-        numbers += range(int(match[1]), int(match[2] or match[1]) + 1)
-    if len(set(numbers)) < len(numbers):
-        raise StudyError(f"'{text}' of '{whole}' names a number twice", "leave one out")
+        first, _, last = piece.partition("-")
+        chosen = range(int(first), int(last or first) + 1)
+        if not chosen or not set(numbers).isdisjoint(chosen):
+            raise StudyError(f"'{piece}' of '{whole}' is no range of numbers, or repeats one", "write 0-4,7")
+        numbers += chosen
     return numbers
 
 
@@ -223,9 +218,6 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
         kind, _, strength = piece.partition(":")
         if kind not in kinds:
             raise StudyError(f"'{whole}': unknown degradation '{kind}'", did_you_mean(kind, kinds))
-        try:
-            strengths[kind] = float(strength)
-        except ValueError:
-            raise StudyError(f"'{whole}': strength '{strength}' of {kind} is no number", "degrade=blur:0.5") from None
+        strengths[kind] = float(strength)
     Degradation(**strengths)  # type: ignore[arg-type]  # refuses a strength out of range
     return tuple(sorted(strengths.items()))

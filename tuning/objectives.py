@@ -44,9 +44,21 @@ class Objective:
     worst: bool = False
     degraded: bool = False
 
+    def log_ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[ProblemInstance, float]:
+        """Natural logarithm of the ratio on each instance, whether it counts or not."""
+        return {
+            instance: math.log(self.cost(outcome) / self.cost(default[instance]))
+            for instance, outcome in outcomes.items()
+        }
+
     def by_start(self, outcomes: Outcomes, default: Outcomes) -> list[float]:
         """Natural logarithm of the ratio on each instance that counts and that both ran."""
-        return by_start(self._costs(outcomes), self._costs(default))
+        reference = self._costs(default)
+        return [
+            math.log(max(cost, FLOOR_M) / max(reference[instance], FLOOR_M))
+            for instance, cost in self._costs(outcomes).items()
+            if instance in reference
+        ]
 
     def ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[str, float]:
         """Natural logarithm of the ratio to the default by scene; empty without any instance that counts."""
@@ -208,15 +220,6 @@ def _log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
     for instance, error in errors.items():
         logs.setdefault(place_of(instance), []).append(math.log(max(error, FLOOR_M)))
     return logs
-
-
-def by_start(errors: Errors, default: Errors) -> list[float]:
-    """Log ATE ratio on each instance that both ran: all that one or two scenes tell."""
-    return [
-        math.log(max(error, FLOOR_M) / max(default[instance], FLOOR_M))
-        for instance, error in errors.items()
-        if instance in default
-    ]
 
 
 def centre(values: Iterable[float]) -> float:

@@ -20,10 +20,10 @@ from dynslam_bench.reports.figures import GRID, axis, guide, layout_of
 from dynslam_bench.reports.html.page import Block, Section, render
 from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
+from dynslam_bench.tuning.final_runs import preset_text
 from dynslam_bench.tuning.instances import ProblemInstance, scenes
-from dynslam_bench.tuning.presets import preset_text
 from dynslam_bench.tuning.samplers import is_feasible
-from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note, splits_seen
+from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
 from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, worth
 from dynslam_bench.tuning.trials import FEWEST_TRIALS, errors_of, importances
 from dynslam_bench.tuning.tuner import Tuner
@@ -42,13 +42,6 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV, Optuna's plots in `PLOTS_FILE`.
     """
     spec = tuner.spec
-    summary = summary.model_copy(
-        update={
-            "split_notes": list(tuner.design.notes),
-            "importances": importances(tuner.study),
-            "seen": splits_seen(tuner.defaults, tuner.design),
-        }
-    )
     candidates, trials = _candidates(summary), _trials(tuner, summary)
     best = summary.candidates[0].params if summary.candidates else {}
     settings = settings_table(tuner.space, tuner.base, best, summary.improves)
@@ -64,7 +57,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         )
         result.append(Block("figure", figure="ratios", caption=caption))
     plots = Markup('<a href="{}">Optuna\'s plots</a>: history, slices, importances, intermediate values, Pareto front')
-    conclusion = [summary.verdict, *filter(None, [seen_note(summary.seen)])]
+    conclusion = [summary.conclusion, *filter(None, [seen_note(summary.seen)])]
     sections = [
         Section("result", "What the study found", "Result", conclusion, result),
         Section(
@@ -72,7 +65,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
             _preset(tuner, summary, settings),
         ),
         Section(
-            "course", "How it went", "Course", [*warnings_of(tuner), *_importance_notes(summary)],
+            "course", "How it went", "Course", [*warnings_of(tuner), _importance_note(summary)],
             [Block("list", entries=[plots.format(PLOTS_FILE)])],
         ),
         Section("trials", "All trials", "Trials", [], [Block("table", table=trials)]),
@@ -134,7 +127,7 @@ def _preset(tuner: Tuner, summary: StudySummary, settings: Table) -> list[Block]
     if summary.chosen is None:
         return [shown]
     chosen = summary.candidates[0]
-    text = preset_text({**spec.space.fixed, **chosen.params}, spec.tracker, summary.verdict)
+    text = preset_text({**spec.space.fixed, **chosen.params}, spec.tracker, summary.conclusion)
     if not summary.improves:
         return [shown, Block("code", title="Not recommended: they are not confirmed; shown as a record", text=text)]
     command = f"dynslam-bench run {spec.tracker} SEQUENCE --settings best.toml"
@@ -151,15 +144,15 @@ def _picks(summary: StudySummary) -> list[str]:
     ]
 
 
-def _importance_notes(summary: StudySummary) -> list[str]:
+def _importance_note(summary: StudySummary) -> str:
     if not summary.importances:
         complete = summary.trials.get("complete", 0)
-        return [f"No importances: they need {FEWEST_TRIALS} complete trials that differ, there are {complete}."]
+        return f"No importances: they need {FEWEST_TRIALS} complete trials that differ, there are {complete}."
     shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in summary.importances.items())
-    return [
+    return (
         f"Importances (PED-ANOVA): {shares}. The shares add up to 100 % even where no setting matters; `tune screen` "
         "tells effects from chance."
-    ]
+    )
 
 
 def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
@@ -174,19 +167,18 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
         ]
         if not points:
             continue
-        bars = {
-            "type": "data",
-            "symmetric": False,
-            "color": colour,
-            "array": [0.0 if ratio.high is None else ratio.high - ratio.ratio for _, ratio in points],
-            "arrayminus": [0.0 if ratio.low is None else ratio.ratio - ratio.low for _, ratio in points],
-        }
         traces.append(
             {
                 "type": "scatter",
                 "mode": "markers",
                 "name": split.replace("_", "-"),
-                "error_x": bars,
+                "error_x": {
+                    "type": "data",
+                    "symmetric": False,
+                    "color": colour,
+                    "array": [0.0 if ratio.high is None else ratio.high - ratio.ratio for _, ratio in points],
+                    "arrayminus": [0.0 if ratio.low is None else ratio.ratio - ratio.low for _, ratio in points],
+                },
                 "x": [ratio.ratio for _, ratio in points],
                 "y": [label for label, _ in points],
                 "marker": {"size": 11, "color": colour, "symbol": symbol},
@@ -227,13 +219,10 @@ def warnings_of(tuner: Tuner) -> list[str]:
     if len(complete) < 20:
         notes.append(f"Only {len(complete)} trials were finished: the best value is partly luck.")
     infeasible = sum(not is_feasible(trial) for trial in complete)
-    if infeasible and infeasible == len(complete):
-        notes.append(
-            f"None of the {infeasible} trials fulfils the constraints on its instances: the least bad were judged on "
-            "unseen instances, and have to fulfil them there."
-        )
-    elif infeasible:
-        notes.append(f"{infeasible} trials violate a constraint and are not candidates.")
+    if infeasible:
+        least_bad = "the least bad were judged on unseen instances, and have to fulfil the constraints there"
+        what = least_bad if infeasible == len(complete) else "they are not candidates"
+        notes.append(f"{infeasible} of {len(complete)} trials violate a constraint: {what}.")
     if "speed" in tuner.spec.objectives:
         notes.append(
             "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On "

@@ -1,4 +1,10 @@
-"""Samplers by name, each trial with a stream of its own."""
+"""Samplers and pruners by name.
+
+Each trial draws from a stream of its own, and all trials meet the same growing sets of instances, on which Optuna's
+pruners end the worse ones early: asynchronous successive halving (Li et al. 2020) or Wilcoxon's signed-rank test
+against the best trial. Optuna prunes no trials of several objectives; there a trial ends once other trials dominate it
+at the same step.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +18,15 @@ from typing import Any
 import numpy as np
 import optuna
 from numpy.typing import NDArray
-from optuna.distributions import BaseDistribution, CategoricalDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
 from optuna.search_space import IntersectionSearchSpace
-from optuna.study import Study
-from optuna.study._study_direction import StudyDirection
+from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.flow.moth_flame import EMFOA, flames_left, flight, moth_positions, opposites
-from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.study_file import PrunerName, StudySpec
 
 _STARTUP_TRIALS = 8
 
@@ -207,27 +212,33 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
         """One flight of one moth."""
-        if study._is_multi_objective():
+        if len(study.directions) > 1:
             raise ValueError("EmfoaSampler takes one objective")
         if not search_space:
             return {}
-        finished = [trial for trial in _finished(study) if search_space.keys() <= trial.params.keys()]
-        if len(finished) < self._population:
-            return self._first_population(finished, search_space)
         names = sorted(search_space)
-        moths = np.array([[to_unit(trial.params[name], search_space[name]) for name in names] for trial in finished])
+        finished = []
+        for other in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)):
+            if not np.isnan(_value(other)) and search_space.keys() <= other.params.keys():
+                finished.append(other)
+        units = [[to_unit(other.params[name], search_space[name]) for name in names] for other in finished]
+        moths = np.array(units).reshape(-1, len(names))
+        if len(moths) < self._population:
+            drawn = zip(names, self._first_population(moths), strict=True)
+            return {name: from_unit(value, search_space[name]) for name, value in drawn}
         sign = 1.0 if study.direction == StudyDirection.MINIMIZE else -1.0
-        order = np.argsort([sign * _value(trial) for trial in finished], kind="stable")
+        order = np.argsort([sign * _value(other) for other in finished], kind="stable")
         flames = moths[order[: self._population]]
-        index = trial.number % self._population
+        index, at = trial.number % self._population, min(trial.number, self._n_trials)
         own = [row for row, other in enumerate(finished) if other.number % self._population == index]
         moth = moths[own[-1] if own else -1]
-        landed = self._fly(moth, flames, index, min(trial.number, self._n_trials))
-        best = [finished[row] for row in order[: self._population]]
-        flame = best[min(index, len(best) - 1)]
+        around = flames[min(index, flames_left(self._population, at, self._n_trials) - 1)]
+        now = flight(at / self._n_trials, EMFOA)
+        landed = moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
+        flame = finished[order[index]]
         return {
             name: self._land(value, search_space[name], flame.params[name])
-            for name, value in zip(names, landed, strict=True)
+            for name, value in zip(names, np.asarray(landed), strict=True)
         }
 
     def sample_independent(
@@ -236,21 +247,13 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
         """Uniformly, for parameters outside the shared space."""
         return self._independent.sample_independent(study, trial, param_name, param_distribution)
 
-    def _first_population(self, finished: list[FrozenTrial], space: dict[str, BaseDistribution]) -> dict[str, Any]:
-        """A member of the first population: uniform, or the elite opposite of an earlier member."""
-        names = sorted(space)
-        unit = self._rng.random(len(names))
-        if len(finished) >= self._population // 2:
-            members = np.array([[to_unit(trial.params[name], space[name]) for name in names] for trial in finished])
+    def _first_population(self, members: Array) -> Array:
+        """A member of the first population in the unit cube: uniform, or the elite opposite of an earlier member."""
+        unit = self._rng.random(members.shape[1])
+        if len(members) >= self._population // 2:
             low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
-            unit = opposites(members[len(finished) % len(members)], low, high, low, high, self._rng.random)
-        return {name: from_unit(value, space[name]) for name, value in zip(names, unit, strict=True)}
-
-    def _fly(self, moth: Array, flames: Array, index: int, trial: int) -> Array:
-        """Where the moth of that index lands in a trial of the budget; `flames` best first."""
-        left = flames_left(self._population, trial, self._n_trials)
-        around, now = flames[min(index, left - 1)], flight(trial / self._n_trials, EMFOA)
-        return np.asarray(moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random))
+            unit = opposites(members[0], low, high, low, high, self._rng.random)
+        return np.asarray(unit)
 
     def _land(self, value: float, distribution: BaseDistribution, flame: Any) -> Any:
         if isinstance(distribution, CategoricalDistribution):
@@ -258,12 +261,6 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
                 return flame
             return distribution.choices[int(self._rng.integers(len(distribution.choices)))]
         return from_unit(float(np.clip(value, 0.0, 1.0)), distribution)
-
-
-def _finished(study: Study) -> list[FrozenTrial]:
-    states = (TrialState.COMPLETE, TrialState.PRUNED)
-    trials = study._get_trials(deepcopy=False, states=states, use_cache=True)
-    return [trial for trial in trials if not np.isnan(_value(trial))]
 
 
 def _value(trial: FrozenTrial) -> float:
@@ -275,12 +272,9 @@ def _value(trial: FrozenTrial) -> float:
 
 def _scaled_bounds(distribution: Any) -> tuple[float, float]:
     """Ends of a numerical range, half a step wider for stepped ones, so that both ends are drawn as often."""
-    low, high = float(distribution.low), float(distribution.high)
-    if distribution.log:
-        half = 0.5 if isinstance(distribution.low, int) else 0.0
-        return float(np.log(low - half)), float(np.log(high + half))
-    half = 0.0 if distribution.step is None else distribution.step / 2
-    return low - half, high + half
+    half = (distribution.step or 0) / 2
+    low, high = distribution.low - half, distribution.high + half
+    return (float(np.log(low)), float(np.log(high))) if distribution.log else (low, high)
 
 
 def to_unit(value: Any, distribution: BaseDistribution) -> float:
@@ -300,11 +294,54 @@ def from_unit(unit: float, distribution: BaseDistribution) -> Any:
     value = low + unit * (high - low)
     if distribution.log:  # type: ignore[attr-defined]
         value = float(np.exp(value))
-    if isinstance(distribution, optuna.distributions.IntDistribution):
-        step = distribution.step
-        value = distribution.low + step * round((value - distribution.low) / step)
-        return int(np.clip(value, distribution.low, distribution.high))
-    assert isinstance(distribution, optuna.distributions.FloatDistribution)
-    if distribution.step is not None:
+    if distribution.step is not None:  # type: ignore[attr-defined]
         value = distribution.low + distribution.step * round((value - distribution.low) / distribution.step)
-    return float(np.clip(value, distribution.low, distribution.high))
+    value = np.clip(value, distribution.low, distribution.high)
+    return int(value) if isinstance(distribution, IntDistribution) else float(value)
+
+
+FIRST_STEP = 3
+"""Instances that every trial runs on before it is compared."""
+DOMINATED_SHARE = 0.1
+"""With several objectives a trial ends once this share of the trials, at least two, beats it in all of them."""
+WILCOXON_LEVEL = 0.1
+
+
+def build_pruner(name: PrunerName) -> optuna.pruners.BasePruner:
+    """Optuna's pruner of that name."""
+    if name == "halving":
+        return optuna.pruners.SuccessiveHalvingPruner(min_resource=FIRST_STEP, reduction_factor=2)
+    if name == "wilcoxon":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            return optuna.pruners.WilcoxonPruner(p_threshold=WILCOXON_LEVEL, n_startup_steps=FIRST_STEP)
+    return optuna.pruners.NopPruner()
+
+
+def steps(name: PrunerName, count: int) -> list[int]:
+    """After how many of `count` instances a trial may be pruned; the last one is the whole set.
+
+    ``halving`` doubles the set (the rungs of successive halving), ``wilcoxon`` tests after every instance.
+    """
+    if name == "none" or count <= FIRST_STEP:
+        return [count]
+    if name == "wilcoxon":
+        return list(range(FIRST_STEP, count + 1))
+    rungs = [FIRST_STEP]
+    while rungs[-1] * 2 < count:
+        rungs.append(rungs[-1] * 2)
+    return [*rungs, count]
+
+
+def is_dominated(trials: Sequence[FrozenTrial], number: int, step: int) -> bool:
+    """Whether enough of the trials that came as far beat a trial in every objective at the same step."""
+    name = step_name(step)
+    reported = {trial.number: trial.user_attrs[name] for trial in trials if name in trial.user_attrs}
+    rivals, own = np.array(list(reported.values())), reported[number]
+    better = ((rivals <= own).all(axis=1) & (rivals != own).any(axis=1)).sum()
+    return bool(better >= max(2, DOMINATED_SHARE * len(rivals)))
+
+
+def step_name(step: int) -> str:
+    """User attribute that holds a trial's values after so many instances; Optuna has none for several objectives."""
+    return f"values_after_{step}_instances"

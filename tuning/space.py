@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Any, cast
+from typing import Any
 
 import optuna
 
@@ -61,9 +61,9 @@ def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[
     return chosen
 
 
-def suggest(trial: optuna.trial.BaseTrial, space: Sequence[Parameter]) -> dict[str, Scalar]:
-    """Draw a configuration from a space of `search_space`."""
-    return {parameter.name: _draw(trial, parameter) for parameter in space}
+def distributions(space: Sequence[Parameter]) -> dict[str, optuna.distributions.BaseDistribution]:
+    """A space of `search_space` as ``optuna.Study.ask`` takes it."""
+    return {parameter.name: distribution(parameter) for parameter in space}
 
 
 def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
@@ -75,21 +75,6 @@ def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
     if parameter.kind == "int":
         return optuna.distributions.IntDistribution(int(parameter.low), int(parameter.high), log=log)
     return optuna.distributions.FloatDistribution(parameter.low, parameter.high, log=log)
-
-
-def default_configuration(space: list[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
-    """The default settings as a configuration: what trial 0 runs."""
-    return {parameter.name: base[parameter.name] for parameter in space}
-
-
-def _draw(trial: optuna.trial.BaseTrial, parameter: Parameter) -> Scalar:
-    if parameter.kind in ("bool", "categorical"):
-        return cast("Scalar", trial.suggest_categorical(parameter.name, parameter.choices))
-    assert parameter.low is not None and parameter.high is not None
-    log = parameter.scale == "log"
-    if parameter.kind == "int":
-        return trial.suggest_int(parameter.name, int(parameter.low), int(parameter.high), log=log)
-    return trial.suggest_float(parameter.name, parameter.low, parameter.high, log=log)
 
 
 def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:
@@ -123,10 +108,8 @@ def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: 
                 f'tune it, or say "{name}" = ... under [space.fixed]',
             )
         if name in tuned and not _fits(tuned[name], value):
-            raise StudyError(
-                f"the preset to start from sets {name} = {value!r}, outside the range that the study tunes"
-            )
-    return default_configuration(list(space), {**base, **preset})
+            raise StudyError(f"the preset to start from sets {name} = {value!r}, out of the range that the study tunes")
+    return {name: preset.get(name, base[name]) for name in tuned}
 
 
 def _fits(parameter: Parameter, value: Any) -> bool:

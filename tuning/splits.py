@@ -6,19 +6,20 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import combinations, islice, product
-from typing import Any, Literal, cast
+from itertools import combinations, islice, product, zip_longest
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.folders import find_data_root
+from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.reports.model.row import SEEN
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
@@ -26,7 +27,6 @@ from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
 from dynslam_bench.sequences.view import Part, part_of
 from dynslam_bench.tuning.instances import ProblemInstance, scenes
 from dynslam_bench.tuning.objectives import place_of
-from dynslam_bench.tuning.pruning import running_order
 from dynslam_bench.tuning.study_file import StudySpec
 
 FEWEST_STARTS = 3
@@ -70,7 +70,13 @@ def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
         DynslamError: See `splits.check_splits`.
     """
     accept = accept or spec.allow_overlap
-    tune, confirm = _tune_and_confirm(spec.instances(*spec.tune), spec.instances(*spec.confirm))
+    tune, confirm = spec.instances(*spec.tune), spec.instances(*spec.confirm)
+    groups = list(scenes(tune).values())
+    if not confirm and len(groups) < ENOUGH_SCENES:
+        confirm = fresh_starts(tune)
+    elif not confirm:
+        confirm = [instance for group in groups[2::3] for instance in group]
+        tune = [instance for instance in tune if instance not in confirm]
     held_out = spec.instances(*spec.held_out)
     splits: dict[Split, list[ProblemInstance]] = {"tune": tune, "confirm": confirm, "held_out": held_out}
     notes = check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
@@ -84,22 +90,29 @@ def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
     return Design(tuple(tune), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes))
 
 
+def running_order(instances: PySequence[ProblemInstance], seed: int) -> list[ProblemInstance]:
+    """The instances in the order of all trials: one of each scene in turn, so that small sets hold different scenes."""
+    groups = list(scenes(instances).values())
+    stream(seed, "order").shuffle(groups)
+    return [instance for turn in zip_longest(*groups) for instance in turn if instance is not None]
+
+
 def with_more_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
     """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
     more = []
     for own in _places(instances).values():
-        missing = FEWEST_STARTS - len({instance.offset for instance in own})
-        more += [replace(own[0], offset=offset) for offset in _unused(own, missing)]
+        offsets = {instance.offset for instance in own}
+        more += [replace(own[0], offset=offset) for offset in _unused(offsets, FEWEST_STARTS - len(offsets))]
     return [*instances, *more]
 
 
 def fresh_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
     """As many instances at each place from starts, and with seeds, that none of the instances has."""
-    return [
-        replace(place, offset=offset, seed=FRESH_SEED + index)
-        for place, own in _places(instances).items()
-        for index, offset in enumerate(_unused(own, len(own)))
-    ]
+    fresh = []
+    for place, own in _places(instances).items():
+        offsets = _unused({instance.offset for instance in own}, len(own))
+        fresh += [replace(place, offset=offset, seed=FRESH_SEED + index) for index, offset in enumerate(offsets)]
+    return fresh
 
 
 def _places(instances: Iterable[ProblemInstance]) -> dict[ProblemInstance, list[ProblemInstance]]:
@@ -109,22 +122,9 @@ def _places(instances: Iterable[ProblemInstance]) -> dict[ProblemInstance, list[
     return places
 
 
-def _unused(instances: PySequence[ProblemInstance], count: int) -> list[int]:
-    """The first `count` offsets that no instance has."""
-    used = {instance.offset for instance in instances}
+def _unused(used: set[int], count: int) -> list[int]:
+    """The first `count` offsets that are not used."""
     return list(islice((offset for offset in itertools.count() if offset not in used), max(count, 0)))
-
-
-def _tune_and_confirm(
-    tune: list[ProblemInstance], confirm: list[ProblemInstance]
-) -> tuple[list[ProblemInstance], list[ProblemInstance]]:
-    groups = list(scenes(tune).values())
-    if confirm:
-        return tune, confirm
-    if len(groups) < ENOUGH_SCENES:
-        return tune, fresh_starts(tune)
-    confirm = [instance for group in groups[2::3] for instance in group]
-    return [instance for instance in tune if instance not in confirm], confirm
 
 
 def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
@@ -182,7 +182,7 @@ def check_splits(
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
         for one, other in product(tuned, judged)
-        if scenes_of[one] == scenes_of[other] or _same_recording(opened[one], opened[other])
+        if scenes_of[one] == scenes_of[other] or same_recording(opened[one], opened[other])
     ]
     for names, used, own in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
         faults += [_misplaced(name, used, own) for name in names if getattr(opened[name], "split", "") == own]
@@ -198,34 +198,26 @@ def _check_repeats(instances: PySequence[ProblemInstance], opened: Mapping[str, 
     for instance in instances:
         if instance in parts:
             raise StudyError(f"instance '{instance}' is named twice", "leave one out")
-        parts[instance] = part_of(cast("Any", instance.cut(opened[instance.sequence])), instance.offset)
+        parts[instance] = part_of(instance.cut(opened[instance.sequence]), instance.offset)
     for (one, here), (other, there) in combinations(parts.items(), 2):
         if here.scene != there.scene:
             continue
-        if _content(one, here) == _content(other, there):
+        if (here.block, here.noise, _drawn(one)) == (there.block, there.noise, _drawn(other)):
             raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
         shared = min(here.stop, there.stop) - max(here.start, there.start)
         if (here.start, here.stop) != (there.start, there.stop) and shared > 0:
             raise StudyError(f"'{one}' and '{other}' share {shared} frames", "write instances of a sequence apart")
 
 
-def _content(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
-    """What a tracker sees of an instance."""
-    own = (instance.offset, instance.degradation, instance.seed)
-    return (part.content, part.noise, part.start, part.stop, part.stride, *own)
+def _drawn(instance: ProblemInstance) -> tuple[object, ...]:
+    return instance.offset, instance.degradation, instance.seed
 
 
 def _misplaced(name: str, used: str, own: str) -> str:
-    who = "the catalogue"
-    if name.startswith("synthetic/"):
-        own_range = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
-        who = f"its scene ({own_range.start}-{own_range.stop - 1})"
+    scenes_of_split = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
+    of_scene = f"its scene ({scenes_of_split.start}-{scenes_of_split.stop - 1})"
+    who = of_scene if name.startswith("synthetic/") else "the catalogue"
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
-
-
-def _same_recording(one: Any, other: Any) -> bool:
-    """`same_recording`; rendered scenes are told apart by their parameters."""
-    return not (is_rendered(one) and is_rendered(other)) and same_recording(one, other)
 
 
 # Whether two recordings show the same: by what was filmed and how the camera moved, never by names or stamps.
@@ -244,36 +236,36 @@ _ENOUGH = 3
 
 
 def same_recording(one: Sequence, other: Sequence) -> bool:
-    """Whether frames of one recording are frames of the other.
+    """Whether frames of one recording are frames of the other; of two rendered scenes never: their digests tell.
 
     Frames are paired where the ground truths have the same shape around them (in whatever frame of reference, at
     whatever stamps), where stamps are equal, and in order from the first and from the last frame; of a few pairs the
     decoded images are compared, reduced to `_THUMB` pixels. Other names, shifted stamps, other image files, frames left
     out and a smaller size leave a copy a copy.
     """
-    thumbs = tuple(cache(lambda index, of=of: _thumbnail(of, index)) for of in (one, other))
+    if _is_rendered(one) and _is_rendered(other):
+        return False
     pairs = dict.fromkeys(_likely_pairs(one, other))
-    alike = ((here, there) for here, there in pairs if _alike(thumbs[0](here), thumbs[1](there)))
+    alike = (True for here, there in pairs if _alike(one[here], other[there], one.camera, other.camera))
     return len(list(islice(alike, _ENOUGH))) == min(_ENOUGH, len(one), len(other))
 
 
 def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
     shapes = [_shapes(one), _shapes(other)]
-    if len(shapes[0]) and len(shapes[1]):
-        distance, index = cKDTree(shapes[1]).query(shapes[0])
-        nearest = np.asarray(index, np.intp)
-        relative = np.asarray(distance, np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
-        yield from ((int(here), int(nearest[here])) for here in np.argsort(relative, kind="stable")[:_PAIRS])
-    if is_rendered(one) or is_rendered(other):
+    distance, index = cKDTree(shapes[1]).query(shapes[0])
+    nearest = np.asarray(index, np.intp)
+    relative = np.asarray(distance, np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
+    yield from ((int(here), int(nearest[here])) for here in np.argsort(relative, kind="stable")[:_PAIRS])
+    if _is_rendered(one) or _is_rendered(other):
         return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
     stamps = (np.round(one.timestamps, 6), np.round(other.timestamps, 6))
     _, here, there = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
     spread = np.unique(np.linspace(0, len(here) - 1, min(_PAIRS, len(here))).astype(np.intp))
-    yield from ((int(here[k]), int(there[k])) for k in spread)
+    yield from zip(here[spread].tolist(), there[spread].tolist(), strict=True)
     yield from ((0, 0), (len(one) - 1, len(other) - 1))
 
 
-def is_rendered(sequence: Sequence) -> bool:
+def _is_rendered(sequence: Sequence) -> bool:
     """Whether the frames of a sequence are computed and its content is known by its parameters."""
     return hasattr(sequence, "scene_digest")
 
@@ -281,37 +273,30 @@ def is_rendered(sequence: Sequence) -> bool:
 def _shapes(sequence: Sequence) -> NDArray[np.float64]:
     """Distances in metres ``[N, 4]`` of the camera at every frame from itself `_AROUND_S` earlier and later.
 
-    They depend neither on the frame of reference nor on a shift of the stamps. Empty without ground truth.
+    They depend neither on the frame of reference nor on a shift of the stamps.
     """
     truth = sequence.ground_truth
-    if truth is None or len(truth) < 2:
-        return np.empty((0, len(_AROUND_S)))
+    assert truth is not None  # else its instances are refused
 
     def positions(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
         axes = [np.interp(stamps, truth.timestamps, truth.positions[:, axis]) for axis in range(3)]
         return np.stack(axes, axis=-1)
 
-    stamps = sequence.timestamps
-    around = positions(stamps[:, None] + _AROUND_S)
-    return np.asarray(np.linalg.norm(around - positions(stamps)[:, None], axis=2), np.float64)
+    stamps = sequence.timestamps[:, None]
+    return np.asarray(np.linalg.norm(positions(stamps + _AROUND_S) - positions(stamps), axis=2), np.float64)
 
 
-def _thumbnail(sequence: Sequence, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colour ``[24, 32, 3]`` and depth ``[24, 32]`` of a frame, depth in the numbers that its file holds."""
-    frame = sequence[index]
-    raw = (frame.depth * sequence.camera.depth_factor).astype(np.float32)  # as stored, whatever the camera says
-    colour = cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA)
-    depth = cv2.resize(raw, _THUMB, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(colour, np.float32), np.asarray(depth, np.float32)
-
-
-def _alike(
-    one: tuple[NDArray[np.float32], NDArray[np.float32]], other: tuple[NDArray[np.float32], NDArray[np.float32]]
-) -> bool:
-    if np.abs(one[0] - other[0]).mean() > _GREY_LEVELS:
+def _alike(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
+    """Whether two frames show the same colour, and depth in the numbers that their files hold."""
+    colours = [
+        cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA) for frame in (here, there)
+    ]
+    if np.abs(colours[0] - colours[1]).mean() > _GREY_LEVELS:
         return False
-    allowed = _DEPTH_SHARE * float(np.median(one[1])) + 0.5
-    return bool(np.median(np.abs(one[1] - other[1])) <= allowed)
+    raw = (here.depth * one.depth_factor, there.depth * other.depth_factor)
+    depths = [cv2.resize(depth.astype(np.float32), _THUMB, interpolation=cv2.INTER_NEAREST) for depth in raw]
+    allowed = _DEPTH_SHARE * float(np.median(depths[0])) + 0.5
+    return bool(np.median(np.abs(depths[0] - depths[1])) <= allowed)
 
 
 # Which instances of a study show scenes that the network behind the masks was trained on: a best case there.
@@ -334,8 +319,12 @@ def source_of_masks(settings: Settings, sequences: PySequence[str]) -> str:
 
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
-    splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
-    return [name for name, instances in splits.items() if _masks_seen(settings, instances)]
+    seen = []
+    for split in ("tune", "confirm", "held_out"):
+        names = {instance.sequence for instance in getattr(design, split)}
+        if any(seen_in_training(source_of_masks(settings, [name]), name) for name in names):
+            seen.append(split)
+    return seen
 
 
 def seen_note(splits: PySequence[str]) -> str:
@@ -350,8 +339,3 @@ def seen_note(splits: PySequence[str]) -> str:
         else "so the errors there are optimistic, and the held-out instances, which it has not seen, may gain less"
     )
     return f"{SEEN} In the {named} the masks come from a network that was trained on those very scenes, {judged}."
-
-
-def _masks_seen(settings: Settings, instances: Iterable[ProblemInstance]) -> bool:
-    names = (instance.sequence for instance in instances)
-    return any(seen_in_training(source_of_masks(settings, [name]), name) for name in names)

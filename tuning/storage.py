@@ -10,7 +10,7 @@ import socket
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import optuna
@@ -30,7 +30,6 @@ Optuna unpickles what Redis holds."""
 _ATTEMPTS = 10
 _BEING_MADE = ("already exists", "duplicate", "unique constraint", "is locked")
 """What drivers say where another worker makes the tables at the same time."""
-_CHUNK = 1 << 16
 
 
 def study_folder(results: Path, spec: StudySpec) -> Path:
@@ -65,6 +64,26 @@ def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
         line = (str(error).strip() or type(error).__name__).splitlines()[0]
         text = without_password(f"cannot open the storage {spec.storage or folder}: {line}", spec.storage)
         raise StudyError(text, "check the address and the permissions") from None
+
+
+def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:
+    """Load a stored study.
+
+    Args:
+        results: The results folder.
+        spec: The study.
+        **how: Further arguments of ``optuna.load_study``.
+
+    Raises:
+        StudyError: There is none; nothing is made then.
+    """
+    absent = StudyError(f"there is no study '{spec.name}' in {results}", "dynslam-bench tune run STUDY.toml")
+    if not spec.storage and not study_folder(results, spec).is_dir():
+        raise absent
+    try:
+        return optuna.load_study(study_name=spec.name, storage=open_storage(results, spec), **how)
+    except KeyError as error:
+        raise absent from error
 
 
 def open_database(url: str) -> BaseStorage:
@@ -146,7 +165,7 @@ class JournalFile(JournalFileBackend):
         try:
             with self.path.open("r+b", buffering=0) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
-                end = _end_of_lines(file)
+                end = file.readall().rfind(b"\n") + 1
                 file.truncate(end)
                 file.seek(end)
                 try:
@@ -162,14 +181,3 @@ class JournalFile(JournalFileBackend):
 
 def _cannot_write(path: Path, error: OSError) -> StudyError:
     return StudyError(f"cannot write {path}: {error.strerror}", "free some space, or check the folder; then go on")
-
-
-def _end_of_lines(file: IO[bytes]) -> int:
-    """Where the last complete line of a file ends."""
-    start = file.seek(0, os.SEEK_END)
-    while start:
-        size = min(_CHUNK, start)
-        start = file.seek(start - size)
-        if (newline := file.read(size).rfind(b"\n")) >= 0:
-            return start + newline + 1
-    return 0

@@ -9,19 +9,17 @@ from typing import TYPE_CHECKING, Any
 import optuna
 from optuna.trial import FrozenTrial
 
-from dynslam_bench.core.errors import SequenceError, SettingsError, StudyError
+from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.reading import read_json
-from dynslam_bench.core.records import write_atomic
 from dynslam_bench.core.settings import Scalar
-from dynslam_bench.core.toml import read_toml
+from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning.final_runs import finish
-from dynslam_bench.tuning.instances import ProblemInstance, scenes
-from dynslam_bench.tuning.objectives import ACCURACY, Cost, Objective, Outcomes, find_objective, own_objective, together
+from dynslam_bench.tuning.instances import ProblemInstance
+from dynslam_bench.tuning.objectives import Cost, Objective, find_objective, own_objective
 from dynslam_bench.tuning.page import write_page
-from dynslam_bench.tuning.pilot import FEWEST, Pilot, refuse_hopeless, run_pilot
-from dynslam_bench.tuning.screening import Screening, plan, screen
+from dynslam_bench.tuning.preliminary import SCREENED_INSTANCES, Pilot, Screening, begin, pilot_of, screen_study
 from dynslam_bench.tuning.space import starting_point
-from dynslam_bench.tuning.storage import open_storage, study_folder
+from dynslam_bench.tuning.storage import load_study
 from dynslam_bench.tuning.study_file import StudySpec, make_spec, read_study
 from dynslam_bench.tuning.summary import StudySummary
 from dynslam_bench.tuning.trials import trials_frame
@@ -85,9 +83,8 @@ class Study:
         self._tuner = tuner = Tuner(self.spec, results, objectives=objectives, sampler=sampler)
         self.study = tuner.study
         self._callbacks = tuple(callbacks)
-        self._summary: StudySummary | None = None
         for preset in start:
-            settings = preset if isinstance(preset, Mapping) else read_preset(Path(preset))
+            settings = preset if isinstance(preset, Mapping) else read_settings(Path(preset))
             tuner.study.enqueue_trial(starting_point(settings, tuner.space, tuner.base), skip_if_exists=True)
 
     @classmethod
@@ -102,15 +99,8 @@ class Study:
             StudyError: There is no such study.
         """
         spec, root = _spec_of(study, Path(results))
-        if not spec.storage and not study_folder(root, spec).is_dir():
-            raise StudyError(f"there is no study '{spec.name}' in {root}", "dynslam-bench tune run STUDY.toml")
         opened = cls.__new__(cls)
-        try:
-            opened.study = optuna.load_study(study_name=spec.name, storage=open_storage(root, spec))
-        except KeyError as error:
-            raise StudyError(
-                f"the storage holds no study '{spec.name}'", "dynslam-bench tune run STUDY.toml"
-            ) from error
+        opened.study = load_study(root, spec)
         opened.spec, opened._tuner = spec, None
         return opened
 
@@ -137,7 +127,7 @@ class Study:
         """What the study's instances could show; see `pilot_of`."""
         return pilot_of(self._running(), jobs=jobs)
 
-    def screen(self, *, points: int = 2, instances: int = 4, jobs: int = 1) -> Screening:
+    def screen(self, *, points: int = 2, instances: int = SCREENED_INSTANCES, jobs: int = 1) -> Screening:
         """Which settings matter; see `screen_study`."""
         return screen_study(self._running(), points=points, instances=instances, jobs=jobs)
 
@@ -164,26 +154,6 @@ class Study:
                 callback(self.study, trial)
 
 
-def read_preset(path: Path) -> dict[str, Scalar]:
-    """A preset's settings by dotted name.
-
-    Raises:
-        SettingsError: It cannot be read, or is no TOML.
-    """
-    try:
-        return dict(_flat(read_toml(path.expanduser())))
-    except SequenceError as error:
-        raise SettingsError(str(error)) from None
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
 def _objectives(given: str | Cost | Sequence[str | Cost] | None) -> list[Objective] | None:
     if given is None:
         return None
@@ -208,13 +178,6 @@ def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, P
     if path.is_dir():
         raise StudyError(f"{path} holds no study: it has no {_SPEC_FILE}", "name results/studies/NAME")
     return read_study(path), results
-
-
-# Running studies: a pilot first, then the trials; and the screening that may come before both.
-
-PILOT_FILE, SCREENING_FILE = "pilot.json", "screening.json"
-SCREENED_INSTANCES = 4
-"""Instances that a screening takes if nothing else is asked for."""
 
 
 def run_study(
@@ -245,74 +208,3 @@ def run_study(
     begin(tuner, jobs=jobs, on_event=on_event)
     tuner.run(jobs=jobs, on_event=on_event)
     return tuner
-
-
-def begin(tuner: Tuner, *, jobs: int = 1, on_event: OnEvent | None = None) -> None:
-    """Run a new study's pilot, if it asks for one, and report what it shows.
-
-    Raises:
-        StudyError: The study could find nothing.
-    """
-    if not tuner.spec.pilot or (tuner.folder / PILOT_FILE).is_file() or tuner.study.get_trials(deepcopy=False)[1:]:
-        return
-    if len(scenes(tuner.design.tune)) < FEWEST:
-        texts = [f"no pilot: it takes {FEWEST} scenes to tune on"]
-        pilot = None
-    else:
-        pilot = pilot_of(tuner, jobs=jobs)
-        texts = [pilot.sentence, *filter(None, [pilot.warning])]
-    for text in texts:
-        if on_event is not None:
-            on_event(StudyEvent("pilot", 0, 1, text))
-    if pilot is not None and not tuner.spec.at_equal_accuracy:  # settings that leave the poses alone show their speed
-        refuse_hopeless(pilot)
-
-
-def pilot_of(tuner: Tuner, *, jobs: int = 1) -> Pilot:
-    """Run a study's pilot; `pilot.json` in its folder holds it.
-
-    It looks at the study's own objectives, or at accuracy where a gain counts only at equal accuracy.
-
-    Raises:
-        StudyError: The default settings fail, or there are too few scenes.
-    """
-
-    def run(values: Mapping[str, Any], instances: Sequence[ProblemInstance]) -> Outcomes:
-        return tuner.evaluate({**tuner.spec.space.fixed, **values}, instances, jobs=jobs)
-
-    objective = ACCURACY if tuner.spec.at_equal_accuracy else together(tuner.objectives)
-    split = tuner.design.held_out if len(scenes(tuner.design.held_out)) >= FEWEST else None
-    pilot = run_pilot(
-        tuner.space, tuner.base, run, tuner.design.reference, objective,
-        seed=tuner.spec.sampler_seed, jobs=jobs, split=split,
-    )  # fmt: skip
-    write_atomic(tuner.folder / PILOT_FILE, pilot.to_json())
-    return pilot
-
-
-def screen_study(
-    tuner: Tuner, *, points: int = 2, instances: int = SCREENED_INSTANCES, jobs: int = 1,
-    on_done: Callable[[int, int], None] | None = None,
-) -> Screening:  # fmt: skip
-    """Find the settings of a study's space that matter; `screening.json` in its folder holds them.
-
-    Args:
-        tuner: The study.
-        points: From how many points settings are moved: the default and others near it.
-        instances: On how many of its instances, of different scenes where there are so many.
-        jobs: Runs at a time.
-        on_done: Called with the number of finished configurations and of all.
-
-    Raises:
-        StudyError: See `screening.screen`.
-    """
-    chosen = tuner.design.tune[:instances]
-    objectives = list(dict.fromkeys([*tuner.objectives, ACCURACY]))
-
-    def run(values: Mapping[str, Scalar]) -> Outcomes:
-        return tuner.evaluate({**tuner.spec.space.fixed, **values}, chosen)
-
-    steps = plan(tuner.space, tuner.base, points, tuner.spec.sampler_seed)
-    screening = screen(steps, run, objectives, jobs=jobs, on_done=on_done)
-    write_atomic(tuner.folder / SCREENING_FILE, screening.to_json())
-    return screening

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.records import Record
@@ -20,11 +20,7 @@ EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
 Offset = Annotated[int, Field(ge=0)]
 
 
-class _Part(Record):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class SpaceSpec(_Part):
+class SpaceSpec(Record, frozen=True):
     """Which settings are tuned.
 
     Attributes:
@@ -38,7 +34,7 @@ class SpaceSpec(_Part):
     fixed: dict[str, Any] = Field(default_factory=dict)
 
 
-class StudySpec(_Part):
+class StudySpec(Record, frozen=True):
     """A tuning study.
 
     Attributes:
@@ -108,27 +104,12 @@ class StudySpec(_Part):
     threads: int = Field(default=1, ge=1)
     data_root: str | None = None
 
-    @model_validator(mode="after")
-    def _splits_are_apart(self) -> StudySpec:
-        for name in ("tune", "confirm", "held_out", "recorded", "seeds", "offsets", "objectives"):
-            values = [str(value) for value in getattr(self, name) or ()]
-            repeated = next((value for value in values if values.count(value) > 1), None)
-            if repeated is not None:
-                raise ValueError(f"{name} names '{repeated}' twice")
-        held_out = {instance.scene: text for text in reversed(self.held_out) for instance in self.instances(text)}
-        shared = {
-            instance.scene: text
-            for text in (*self.tune, *self.confirm)
-            for instance in self.instances(text)
-            if instance.scene in held_out
-        }
-        if shared and not self.allow_overlap:
-            scene, text = next(iter(shared.items()))
-            other = "" if text == held_out[scene] else f", held out as '{held_out[scene]}'"
-            raise ValueError(
-                f"the tune and held_out splits share {len(shared)} sequences, the first is '{text}'{other}"
-            )
-        return self
+    @field_validator("objectives")
+    @classmethod
+    def _objectives_differ(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError("an objective is named twice")
+        return names
 
     def instances(self, *texts: str) -> list[ProblemInstance]:
         """The instances that texts of this study name.
@@ -172,8 +153,6 @@ def make_spec(values: Any, where: str) -> StudySpec:
     """
     try:
         return StudySpec.model_validate(values)
-    except OSError as error:  # a sequence is named by what cannot be a path
-        raise StudyError(f"{where}: {error.strerror}: {error.filename}") from error
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))

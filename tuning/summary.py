@@ -50,17 +50,6 @@ class Ratio(Record):
         return self.low is not None and self.low > 1 and self.sequences >= FEWEST_SCENES
 
     @property
-    def verdict(self) -> str:
-        """What may be concluded."""
-        if self.sequences < FEWEST_SCENES:
-            return f"on {self.sequences} scene{'s' * (self.sequences > 1)} only, from which nothing follows for others"
-        if self.shows_gain:
-            return f"better than the default by {100 * (1 - self.ratio):.1f} %"
-        if self.shows_loss:
-            return f"worse than the default by {100 * (self.ratio - 1):.1f} %"
-        return "no difference to the default that these runs could show"
-
-    @property
     def interval(self) -> str:
         """The interval in brackets; empty without one."""
         return "" if self.low is None or self.high is None else f"[{self.low:.3f}, {self.high:.3f}]"
@@ -194,11 +183,6 @@ class StudySummary(Record):
     split_notes: list[str] = Field(default_factory=list)
     seen: list[str] = Field(default_factory=list)
 
-    @property
-    def verdict(self) -> str:
-        """One sentence: better or not on the held-out split, by how much, how sure, and whether to keep the default."""
-        return conclude(self.candidates, self.chosen, self.split_notes)
-
 
 def choose(candidates: Sequence[Candidate]) -> Candidate | None:
     """The candidate with the smallest upper bound of its ratio; None, the default, where no bound lies below 1."""
@@ -215,10 +199,10 @@ def conclude(candidates: Sequence[Candidate], chosen: int | None, split_notes: S
 
 def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
     """Why the default was chosen."""
-    judged = [candidate for candidate in candidates if candidate.confirm is not None]
-    feasible = [candidate for candidate in judged if candidate.feasible]
     if not candidates:
         return "Keep the default: no trial with other settings came to its end."
+    judged = [candidate for candidate in candidates if candidate.confirm is not None]
+    feasible = [candidate for candidate in judged if candidate.feasible]
     if not judged:
         return f"Keep the default: trial {candidates[0].trial} failed when run again: {candidates[0].failed}."
     if not feasible:
@@ -228,7 +212,7 @@ def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
         ate = best.on_confirm["accuracy"]
         return (
             f"Keep the default: no trial is shown to be as accurate on {ate.n} runs that none had seen (trial "
-            f"{best.trial}: {best.confirm}, but {ate}, upper bound {_bound_text(ate)}, which has to lie below "
+            f"{best.trial}: {best.confirm}, but {ate}, upper bound {_bound(ate):.3f}, which has to lie below "
             f"{1 + (best.ate_margin or 0.0):.2f})."
         )
     best = min(feasible, key=lambda candidate: candidate.bound)
@@ -236,12 +220,8 @@ def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
     many = f"none of the {len(judged)} best trials is" if len(judged) > 1 else "the best trial is not"
     return (
         f"Keep the default: {many} confirmed on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
-        f"{best.confirm}, upper bound {_bound_text(best.confirm)})."
+        f"{best.confirm}, upper bound {_bound(best.confirm):.3f})."
     )
-
-
-def _bound_text(ratio: Ratio) -> str:
-    return "none" if ratio.bound is None else f"{ratio.bound:.3f}"
 
 
 def _judged(chosen: Candidate, overlapping: bool) -> str:
@@ -325,15 +305,13 @@ def pick(name: PickName, candidates: Sequence[Candidate], margin: float) -> Cand
     """
     asked = 1 + margin if name != "accurate" else math.inf
     accurate = [candidate for candidate in candidates if _bound(candidate.on_confirm["accuracy"]) < asked]
-    best = min(accurate, key=lambda candidate: _decides(name, candidate), default=None)
-    return best if best is not None and _decides(name, best) < 1 else None
+    objective = {"fast": "speed", "accurate": "accuracy"}.get(name)
 
+    def bound(candidate: Candidate) -> float:
+        return _bound(candidate.confirm if objective is None else candidate.on_confirm[objective])
 
-def _decides(name: PickName, candidate: Candidate) -> float:
-    """The upper bound that a pick is chosen by."""
-    if name == "balanced":
-        return _bound(candidate.confirm)
-    return _bound(candidate.on_confirm["speed" if name == "fast" else "accuracy"])
+    best = min(accurate, key=bound, default=None)
+    return best if best is not None and bound(best) < 1 else None
 
 
 def _bound(ratio: Ratio | None) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import optuna
@@ -29,12 +30,9 @@ def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     if len(study.directions) > 1:
         front = {trial.number for trial in study.best_trials}
         candidates = [trial for trial in candidates if trial.number in front] or candidates
-    orders = [
-        sorted(candidates, key=lambda trial: (trial.values[index], trial.number))
-        for index in range(len(study.directions))
-    ]
     distinct: list[FrozenTrial] = []
-    for trial in (trial for turn in zip(*orders, strict=True) for trial in turn):
+    orders = [sorted(candidates, key=lambda trial: trial.values[at]) for at in range(len(study.directions))]
+    for trial in chain.from_iterable(zip(*orders, strict=True)):
         if all(trial.params != other.params for other in distinct):
             distinct.append(trial)
     return distinct[:count]
@@ -76,36 +74,23 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
     kinds |= {"runs": "Int64", "feasible": "boolean", "reason": "string"}
     frame = pd.DataFrame([_row(spec, trial) for trial in trials], columns=list(kinds)).astype(kinds)
     for name in sorted({name for trial in trials for name in trial.params}):
-        drawn = [trial.params.get(name) for trial in trials]
-        frame[f"params.{name}"] = pd.Series(drawn, dtype=_dtype(drawn))
+        frame[f"params.{name}"] = pd.array([trial.params.get(name) for trial in trials])
     return frame
 
 
 def _row(spec: StudySpec, trial: FrozenTrial) -> dict[str, Any]:
     values = dict(zip(spec.objectives, trial.values or [], strict=False))
-    attributes = trial.user_attrs
     accuracy = values.get("accuracy")
     return {
+        **{f"value_{objective}": value for objective, value in values.items()},
+        **{name: trial.user_attrs.get(name) for name in ("coverage", "fps", "reason")},
         "trial": trial.number,
         "state": trial.state.name.lower(),
-        **{f"value_{objective}": value for objective, value in values.items()},
         "ratio": None if accuracy is None else math.exp(accuracy),
         "duration_s": None if trial.duration is None else trial.duration.total_seconds(),
-        "coverage": attributes.get("coverage"),
-        "fps": attributes.get("fps"),
-        "runs": len(attributes.get("instances", ())),
+        "runs": len(trial.user_attrs.get("instances", ())),
         "feasible": is_feasible(trial) if trial.state == TrialState.COMPLETE else None,
-        "reason": attributes.get("reason"),
     }
-
-
-def _dtype(values: list[Any]) -> str:
-    kinds = {type(value) for value in values if value is not None}
-    if kinds == {bool}:
-        return "boolean"
-    if kinds == {int}:
-        return "Int64"
-    return "Float64" if kinds <= {int, float} else "string"
 
 
 # Importances.

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,14 +30,19 @@ from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.evaluate import CancelledError, InstanceFailedError, Outcome, evaluate
 from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.objectives import Objective, Outcomes, coverage, find_objective, fps, violations
-from dynslam_bench.tuning.pruning import build_pruner, is_dominated, step_name, steps
-from dynslam_bench.tuning.samplers import build_sampler
-from dynslam_bench.tuning.space import default_configuration, search_space, suggest
+from dynslam_bench.tuning.samplers import build_pruner, build_sampler, is_dominated, step_name, steps
+from dynslam_bench.tuning.space import distributions, search_space
 from dynslam_bench.tuning.splits import design_of
-from dynslam_bench.tuning.storage import open_storage, study_folder, without_password, worker_is_dead, worker_name
+from dynslam_bench.tuning.storage import (
+    load_study,
+    open_storage,
+    study_folder,
+    without_password,
+    worker_is_dead,
+    worker_name,
+)
 from dynslam_bench.tuning.study_file import StudySpec
 
-DONE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
 CRASHED_WORKER = "worker ended in the middle of the trial"
 
 
@@ -106,7 +112,7 @@ class Tuner:
         self.objectives = [find_objective(name) for name in spec.objectives] if objectives is None else list(objectives)
         sampler = build_sampler(spec) if sampler is None else sampler
         self.design = design_of(spec, accept=reading)
-        self.steps = self._steps()
+        self.steps = self._comparable_steps()
         self.store = RunStore(self.results)
         self.store.prepare()
         self.folder = study_folder(self.results, spec)
@@ -154,19 +160,29 @@ class Tuner:
 
     def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[ProblemInstance, Outcome]:
         """The default settings' outcomes on the tune split, to which every trial is compared."""
-        missing = [instance for instance in self.design.reference if instance not in self._reference]
         if on_event is not None:
-            on_event(StudyEvent("reference", 0, len(missing), "the default settings"))
+            missing = len(self.design.reference) - len(self._reference)
+            on_event(StudyEvent("reference", 0, missing, "the default settings"))
+        return self.default_outcomes(self.design.reference, jobs=jobs)
+
+    def default_outcomes(
+        self, instances: Sequence[ProblemInstance], *, jobs: int = 1
+    ) -> dict[ProblemInstance, Outcome]:
+        """The default settings' outcomes on instances.
+
+        Raises:
+            StudyError: The default settings fail; says where and why.
+        """
+        missing = [instance for instance in instances if instance not in self._reference]
         with self._ending_all():
             try:
-                self._reference.update(self.evaluate(self.spec.space.fixed, missing, jobs=jobs))
+                self._reference |= self.evaluate(self.spec.space.fixed, missing, jobs=jobs)
             except InstanceFailedError as error:
-                raise StudyError(
-                    f"the default settings fail: {error.args[0]}", "a study needs a default that runs"
-                ) from error
+                text = f"the default settings fail: {error.args[0]}"
+                raise StudyError(text, "a study needs a default that runs") from error
             except CancelledError as error:
                 raise StudyError("interrupted") from error
-        return self._reference
+        return {instance: self._reference[instance] for instance in instances}
 
     def evaluate(
         self,
@@ -193,32 +209,26 @@ class Tuner:
         Returns:
             For each configuration its outcomes, or the error of its first failed run; it runs on no instance after it.
         """
-        outcomes: list[dict[ProblemInstance, Outcome]] = [{} for _ in configurations]
-        failed: dict[int, InstanceFailedError] = {}
+        results: list[dict[ProblemInstance, Outcome] | InstanceFailedError] = [{} for _ in configurations]
 
-        def one(number: int, instance: ProblemInstance) -> None:
-            if number not in failed:
+        def one(instance: ProblemInstance, number: int) -> None:
+            result = results[number]
+            if isinstance(result, dict):
                 try:
-                    outcomes[number].update(self.evaluate(configurations[number], [instance], cache=False))
+                    result |= self.evaluate(configurations[number], [instance], cache=False)
                 except InstanceFailedError as error:
-                    failed.setdefault(number, error)
+                    results[number] = error
 
         with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-beside") as pool, self._ending_all():
-            for future in [
-                pool.submit(one, number, instance) for instance in instances for number in range(len(outcomes))
-            ]:
+            for future in [pool.submit(one, *task) for task in product(instances, range(len(results)))]:
                 future.result()
-        return [failed.get(number, outcome) for number, outcome in enumerate(outcomes)]
+        return results
 
     def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
         """The overrides that a trial ran with."""
         return {**self.spec.space.fixed, **trial.params}
 
-    def values(self, outcomes: Outcomes) -> list[float]:
-        """The objectives' values: natural logarithms of ratios to the default settings, less is better."""
-        return [objective.value(outcomes, self._reference) for objective in self.objectives]
-
-    def _steps(self) -> list[int]:
+    def _comparable_steps(self) -> list[int]:
         """The steps at which every objective has an instance that counts."""
         *early, last = steps(self.spec.pruner, len(self.design.tune))
         counted = [[objective.counts(instance) for instance in self.design.tune] for objective in self.objectives]
@@ -226,49 +236,52 @@ class Tuner:
 
     def _one(self, on_event: OnEvent | None) -> None:
         with self._lock:
-            trial = self.study.ask()
-            values = suggest(trial, self.space)
+            trial = self.study.ask(distributions(self.space))
         trial.set_user_attr("worker", worker_name())
         if on_event is not None:
             on_event(StudyEvent("started", trial.number, self.spec.trials, f"trial {trial.number}"))
-        state, result, text = self._evaluate(trial, values)
+        values, state = None, TrialState.COMPLETE
+        try:
+            values, text = self._evaluate(trial)
+        except (optuna.TrialPruned, CancelledError, InstanceFailedError) as error:
+            state = TrialState.PRUNED if isinstance(error, optuna.TrialPruned) else TrialState.FAIL
+            text = CRASHED_WORKER if isinstance(error, CancelledError) else str(error)
+            trial.set_user_attr("reason", text)
         with self._lock:
-            self.study.tell(trial, result, state=state)
+            self.study.tell(trial, values, state=state)
         if on_event is not None:
             on_event(StudyEvent("finished", trial.number, self.spec.trials, f"trial {trial.number}: {text}"))
 
-    def _evaluate(self, trial: optuna.Trial, values: dict[str, Any]) -> tuple[TrialState, list[float] | None, str]:
-        settings = {**self.spec.space.fixed, **values}
+    def _evaluate(self, trial: optuna.Trial) -> tuple[list[float], str]:
+        """Run a trial on growing sets of instances.
+
+        Returns:
+            The objectives' values (natural logarithms of ratios to the default settings, less is better), in words too.
+
+        Raises:
+            TrialPruned: It is worse than others on the instances so far.
+            InstanceFailedError: A run failed.
+            CancelledError: The study was interrupted.
+        """
         outcomes: dict[ProblemInstance, Outcome] = {}
-        started = time.perf_counter()
-        try:
-            for step in self.steps:
-                first = len(outcomes)
-                outcomes |= self.evaluate(settings, self.design.tune[first:step])
-                result = self.values(outcomes)
-                self._record(trial, outcomes)
-                if self._pruned(trial, outcomes, result, first) and trial.number > 0:
-                    text = f"pruned after {step} of {self.steps[-1]} instances"
-                    trial.set_user_attr("reason", text)
-                    return TrialState.PRUNED, None, text
-        except CancelledError:
-            trial.set_user_attr("reason", CRASHED_WORKER)
-            return TrialState.FAIL, None, "interrupted"
-        except InstanceFailedError as error:
-            trial.set_user_attr("reason", str(error))
-            return TrialState.FAIL, None, f"failed: {error}"
-        finally:
-            trial.set_user_attr("wall_s", round(time.perf_counter() - started, 3))
+        values: list[float] = []
+        for step in self.steps:
+            first = len(outcomes)
+            outcomes |= self.evaluate({**self.spec.space.fixed, **trial.params}, self.design.tune[first:step])
+            values = [objective.value(outcomes, self._reference) for objective in self.objectives]
+            trial.set_user_attr("coverage", coverage(outcomes))
+            trial.set_user_attr("fps", fps(outcomes))
+            rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
+            trial.set_user_attr("instances", rows)
+            if self._pruned(trial, outcomes, values, first) and trial.number > 0:
+                raise optuna.TrialPruned(f"pruned after {step} of {self.steps[-1]} instances")
         violated = violations(self.spec, outcomes, self._reference)
         for name, value in violated.items():
             trial.set_constraint(name, value)
-        parts = [
-            f"{objective.what} x {math.exp(value):.3f}"
-            for objective, value in zip(self.objectives, result, strict=True)
-        ]
+        ratios = zip(self.objectives, values, strict=True)
+        text = ", ".join(f"{objective.what} x {math.exp(value):.3f}" for objective, value in ratios)
         broken = [name for name, value in violated.items() if value > 0]
-        text = ", ".join(parts) + (f", violates {' and '.join(broken)}" if broken else "")
-        return TrialState.COMPLETE, result, text
+        return values, text + (f", violates {' and '.join(broken)}" if broken else "")
 
     def _pruned(self, trial: optuna.Trial, outcomes: Outcomes, values: list[float], first: int) -> bool:
         """Report a trial's values and ask the pruner; `first` instances were reported before.
@@ -289,51 +302,37 @@ class Tuner:
         trial.set_user_attr(step_name(step), values)
         return is_dominated(self.study.get_trials(deepcopy=False), trial.number, step)
 
-    def _record(self, trial: optuna.Trial, outcomes: Outcomes) -> None:
-        trial.set_user_attr("coverage", coverage(outcomes))
-        trial.set_user_attr("fps", fps(outcomes))
-        rows = [[str(instance), run.run_id, run.ate_m, run.coverage, run.frame_s] for instance, run in outcomes.items()]
-        trial.set_user_attr("instances", rows)
-
     def _more(self) -> bool:
-        """Whether another trial is wanted; running ones count, those of dead workers do not."""
+        """Whether another trial is wanted; running ones count, those of dead workers are marked as failed."""
         with self._lock:
-            self._fail_trials_of_dead_workers()
+            lost = set()
             trials = self.study.get_trials(deepcopy=False)
-            counted = [t for t in trials if t.state in DONE and t.user_attrs.get("reason") != CRASHED_WORKER]
-            running = [t for t in trials if t.state == TrialState.RUNNING]
-            return len(counted) + len(running) < self.spec.trials
-
-    def _fail_trials_of_dead_workers(self) -> None:
-        """Mark as failed the trials that a killed worker of this host left running."""
-        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            worker = trial.user_attrs.get("worker", "")
-            if worker and worker_is_dead(worker):
-                with suppress(RuntimeError):  # another worker has done so meanwhile
-                    self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
-                    self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+            for trial in trials:
+                if trial.state == TrialState.RUNNING and worker_is_dead(trial.user_attrs.get("worker", "")):
+                    lost.add(trial.number)
+                    with suppress(RuntimeError):  # another worker has done so meanwhile
+                        self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
+                        self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+                if trial.state == TrialState.WAITING or trial.user_attrs.get("reason") == CRASHED_WORKER:
+                    lost.add(trial.number)
+            return len(trials) - len(lost) < self.spec.trials
 
     def _open(self, sampler: optuna.samplers.BaseSampler) -> optuna.Study:
         """The stored study, or a new one whose first trial is the default, whatever is enqueued later."""
-        name, absent = self.spec.name, f"there is no study '{self.spec.name}' in {self.results}"
-        if self.reading and not self.spec.storage and not self.folder.is_dir():
-            raise StudyError(absent, "dynslam-bench tune run STUDY.toml")
-        storage = open_storage(self.results, self.spec)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        how: dict[str, Any] = {"storage": storage, "study_name": name, "sampler": sampler}
-        how["pruner"] = build_pruner(self.spec.pruner)
-        try:
-            if self.reading:
-                study = optuna.load_study(**how)
-            else:
+        how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.spec.pruner)}
+        if self.reading:
+            study = load_study(self.results, self.spec, **how)
+        else:
+            how |= {"storage": open_storage(self.results, self.spec), "study_name": self.spec.name}
+            try:
                 study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
                 self._begin(study)
-        except optuna.exceptions.DuplicatedStudyError:
-            study = optuna.load_study(**how)
-        except KeyError as error:
-            raise StudyError(absent, "dynslam-bench tune run STUDY.toml") from error
-        except Exception as error:  # storages raise their drivers' errors
-            raise StudyError(without_password(f"cannot open study '{name}': {error}", self.spec.storage)) from None
+            except optuna.exceptions.DuplicatedStudyError:
+                study = optuna.load_study(**how)
+            except Exception as error:  # storages raise their drivers' errors
+                text = f"cannot open study '{self.spec.name}': {error}"
+                raise StudyError(without_password(text, self.spec.storage)) from None
         self._check_identity(study)
         if not self.spec.storage:
             write_atomic(self.folder / "study.json", json.dumps(self.spec.for_others(), indent=2) + "\n")
@@ -346,7 +345,7 @@ class Tuner:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             study.set_metric_names(list(self.spec.objectives))
-        study.enqueue_trial(default_configuration(self.space, self.base))
+        study.enqueue_trial({parameter.name: self.base[parameter.name] for parameter in self.space})
         study.set_user_attr("identity", self._identity())
 
     def _check_identity(self, study: optuna.Study) -> None:
@@ -359,47 +358,29 @@ class Tuner:
                 f"the storage holds a study '{self.spec.name}' that is none of this toolkit", "give yours another name"
             )
         identity = self._identity()
-        if different := difference(stored, identity):
+        changed = [key for key in identity if stored.get(key) != identity[key]]
+        if changed:
+            there, here = (json.dumps(values.get(changed[0]))[:80] for values in (stored, identity))
+            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
             raise StudyError(
-                f"study '{self.spec.name}' is stored with other {different}",
+                f"study '{self.spec.name}' is stored with other {changed[0]}{more}: {there} there, {here} here",
                 f"give the study another name, or delete {self.folder}",
             )
 
     def _identity(self) -> dict[str, Any]:
-        """What must be the same when a study is resumed; without data and program, which reading does not need."""
-        spec = self.spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "pilot"})
-        if self.reading:
-            return spec
-        return {**spec, **self._made_of(), "parameters": digest([repr(parameter) for parameter in self.space])}
+        """What must be the same when a study is resumed, by name; to read one, its own fields alone.
 
-    def _made_of(self) -> dict[str, Any]:
-        """The content of the study's sequences, and the program that runs on them: code, weights, libraries, device."""
+        Beside the fields these are the content of its sequences, and the program that runs on them: code, weights,
+        libraries, device.
+        """
         spec = self.spec
-        first: dict[str, ProblemInstance] = {}
-        for instance in spec.instances(*spec.tune, *spec.confirm, *spec.held_out):
-            first.setdefault(instance.sequence, instance)
+        identity = spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "pilot"})
+        if self.reading:
+            return identity
         how: dict[str, Any] = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(spec.space.fixed)}
-        data: dict[str, str] = {}
-        program: dict[str, str] = {}
-        for sequence, instance in first.items():
-            identity = resolve(instance.run_spec(spec.tracker, **how)).identity
-            data[sequence] = digest([identity["content"], identity["camera"]])
-            program |= program_of(identity) | {"device": identity["device"]}
-        return {"data": data, "program": program}
-
-
-def difference(stored: dict[str, Any], now: dict[str, Any]) -> str:
-    """The first thing of an identity that is stored otherwise, in words; empty where there is none."""
-    changed = [key for key in now if stored.get(key) != now[key]]
-    if not changed:
-        return ""
-    key = changed[0]
-    there, here = stored.get(key), now[key]
-    if key in ("data", "program"):
-        names = [name for name in here if (there or {}).get(name) != here[name]]
-        if key == "data":
-            return f"data: the content of {', '.join(names[:3])} is not what it was"
-        key, there, here = names[0], (there or {}).get(names[0]), here[names[0]]
-        return f"{key}: {there} there, {here} here"
-    more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-    return f"{key}{more}: {json.dumps(there)[:80]} there, {json.dumps(here)[:80]} here"
+        instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
+        for sequence, instance in {instance.sequence: instance for instance in reversed(instances)}.items():
+            run = resolve(instance.run_spec(spec.tracker, **how)).identity
+            identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
+            identity |= program_of(run) | {"device": run["device"]}
+        return identity | {"parameters": digest([repr(parameter) for parameter in self.space])}

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec, TrackingState, TrackResult
@@ -178,27 +177,19 @@ def _pose_faults(pose: object) -> Iterator[Fault]:
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4):
         kind = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
         yield Fault(f"{kind} as pose, expected a 4x4 matrix")
-    elif pose.dtype.kind not in "fiu":
-        yield Fault(f"a pose of the type {pose.dtype}, expected real numbers", "return float64")
+    elif pose.dtype.kind not in "fiu" or pose.dtype == np.float16:  # positions in float16 are rounded to millimetres
+        yield Fault(f"a pose of the type {pose.dtype}, expected real numbers of enough digits", "return float64")
     elif not np.isfinite(pose).all():
         bad = int(np.count_nonzero(~np.isfinite(pose)))
         yield Fault(f"a pose with {bad} values that are not finite", "a solver diverged; say 'lost' instead")
     elif (far := float(np.abs(pose).max())) > FARTHEST_M:
         yield Fault(f"a pose {far:.3g} m away", "a solver diverged; say 'lost' instead")
-    elif pose.dtype == np.float16:
-        step_mm = 1000 * float(np.spacing(np.abs(pose[:3, 3]).max()))
-        rounded = f"{_rotation_words(pose)}, positions to {step_mm:.2g} mm"
-        yield Fault(f"a pose in float16, which is too coarse: {rounded}", "return float64, or float32")
     elif not se3.is_pose(pose.astype(np.float64)):
+        rotation = pose[:3, :3].astype(np.float64)
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        words = f"|R R^T - I| = {off:.2g}, det R = {float(np.linalg.det(rotation)):.4g}"
         cause = "the rotation drifted from orthonormal, or world-to-camera scale is mixed in"
-        yield Fault(f"a pose that is no rigid transformation: {_rotation_words(pose)}", cause)
-
-
-def _rotation_words(pose: NDArray[np.generic]) -> str:
-    """How far a rotation is from orthonormal."""
-    rotation = pose[:3, :3].astype(np.float64)
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    return f"|R R^T - I| = {off:.2g}, det R = {float(np.linalg.det(rotation)):.4g}"
+        yield Fault(f"a pose that is no rigid transformation: {words}", cause)
 
 
 def _is_number(value: object) -> bool:

@@ -41,10 +41,23 @@ class Similarity:
         """Standard error of the rotation, see `rotation_uncertainty_deg`; None where too few positions determine it."""
         return None if self.fitted is None else rotation_uncertainty_deg(*self.fitted, self.rotation)
 
-    @property
-    def rotation_reliable(self) -> bool:
-        """Whether absolute rotational errors under this alignment are errors of the estimate."""
-        return self.uncertainty_deg is None or self.uncertainty_deg <= RELIABLE_DEG
+    def doubts(self, truth: Array) -> list[str]:
+        """Why absolute rotational errors under this alignment may not be errors of the estimate, a line each.
+
+        Args:
+            truth: True poses that the estimate was aligned with ``[N, 4, 4]``.
+        """
+        if self.degenerate:
+            return ["the estimated positions do not determine a rotation; it was taken from the orientations"]
+        if self.uncertainty_deg is None or self.uncertainty_deg <= RELIABLE_DEG:
+            return []
+        positions = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
+        along, *across = np.linalg.svd(positions, compute_uv=False) / np.sqrt(len(positions))
+        return [
+            f"the path (spread {along:.3f} m along, {across[0]:.3f} and {across[1]:.3f} m across) hardly determines "
+            f"the alignment's rotation with such errors: +-{self.uncertainty_deg:.0f} degrees; the absolute rotational "
+            "error (ape_rot) is unreliable, the translational and the relative ones are not affected"
+        ]
 
     def apply(self, poses: Array) -> Array:
         """Poses ``[N, 4, 4]`` moved; rotations stay rotations."""
@@ -121,7 +134,7 @@ RELIABLE_DEG = 10.0
 """With a larger uncertainty of the alignment's rotation, absolute rotational errors say nothing of the tracker."""
 _GENERATOR = np.array([1, 1, -1, 1, 1, 1, -1, -1, -1, 1, -1])
 _DESIGN = np.array([np.append(np.roll(_GENERATOR, shift), -1) for shift in range(len(_GENERATOR))])
-_HALVES = np.vstack([_DESIGN, -_DESIGN]) > 0
+_HALVES = (np.vstack([_DESIGN, -_DESIGN]) > 0).astype(np.float64)
 
 
 def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> float | None:
@@ -139,27 +152,21 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
     if len(source) < 3:
         return None
     if len(source) < 2 * BLOCKS:
-        return _left_out(source, target, rotation)
+        kept = ~np.eye(len(source), dtype=bool)
+        pairs = [(source[rows], target[rows]) for rows in kept]
+        covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
+        squares = _turned_deg(covariances, rotation) ** 2
+        return float(np.sqrt((len(source) - 1) / len(source) * squares.sum()))
     size, more = divmod(len(source), BLOCKS)  # the first blocks are longer by one where it does not come out even
     starts = np.arange(BLOCKS) * size + np.minimum(np.arange(BLOCKS), more)
     source, target = source - source.mean(axis=0), target - target.mean(axis=0)
-    weights = _HALVES.astype(np.float64)
-    count = weights @ np.diff(starts, append=len(source))
-    sums = weights @ np.add.reduceat(source, starts)
-    target_sums = weights @ np.add.reduceat(target, starts)
+    count = _HALVES @ np.diff(starts, append=len(source))
+    sums = _HALVES @ np.add.reduceat(source, starts)
+    target_sums = _HALVES @ np.add.reduceat(target, starts)
     together = np.add.reduceat(target[:, :, None] * source[:, None, :], starts)
-    products = (weights @ together.reshape(BLOCKS, 9)).reshape(-1, 3, 3)
+    products = (_HALVES @ together.reshape(BLOCKS, 9)).reshape(-1, 3, 3)
     covariances = products - target_sums[:, :, None] * sums[:, None, :] / count[:, None, None]
     return float(np.sqrt((_turned_deg(covariances, rotation) ** 2).mean()))
-
-
-def _left_out(source: Array, target: Array, rotation: Array) -> float:
-    """The jackknife's standard error in degrees: every position is left out once."""
-    kept = ~np.eye(len(source), dtype=bool)
-    pairs = [(source[rows], target[rows]) for rows in kept]
-    covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
-    squares = _turned_deg(covariances, rotation) ** 2
-    return float(np.sqrt((len(source) - 1) / len(source) * squares.sum()))
 
 
 def _turned_deg(covariances: Array, rotation: Array) -> Array:

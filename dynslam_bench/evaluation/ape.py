@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynslam_bench.core.errors import EvaluationError
-from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.association import match
-from dynslam_bench.evaluation.prepare import compared, hold
+from dynslam_bench.evaluation.comparison import Comparison, compare
+from dynslam_bench.evaluation.prepare import hold
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import associate
@@ -33,6 +31,12 @@ def absolute_errors(estimate: Array, ground_truth: Array) -> tuple[Array, Array]
     translation = np.linalg.norm(estimate[:, :3, 3] - ground_truth[:, :3, 3], axis=1)
     rotation = np.rad2deg(se3.rotation_angle(se3.inverse(ground_truth) @ estimate))
     return translation, rotation
+
+
+def absolute_metrics(comparison: Comparison) -> dict[str, float]:
+    """``ate_<statistic>_m`` and ``ape_rot_<statistic>_deg``."""
+    translation, rotation = absolute_errors(comparison.aligned, comparison.truth)
+    return {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
 
 
 # The seven statistics of an error series.
@@ -85,12 +89,8 @@ def ate_rmse_m(
     """
     if held_at is not None:
         estimate = hold(estimate, held_at)
-    estimate, ground_truth = compared(estimate, ground_truth, protocol, held_at)
-    association = match(estimate, ground_truth, protocol)
-    if len(association) < 2:
-        raise EvaluationError("only one pose has ground truth")
-    matched, true = estimate.T_world_cam[association.estimate], ground_truth.T_world_cam[association.ground_truth]
-    left = align(matched, true, protocol.alignment).apply(matched)[:, :3, 3] - true[:, :3, 3]
+    comparison = compare(estimate, ground_truth, protocol, held_at)
+    left = comparison.aligned[:, :3, 3] - comparison.truth[:, :3, 3]
     return math.sqrt(float((left * left).sum()) / len(left))
 
 
@@ -118,17 +118,17 @@ def static_camera(ground_truth: Trajectory, stamps: ArrayLike | None = None, max
         positions = positions[index]
     if not len(positions):
         raise EvaluationError(f"none of {len(ground_truth)} true poses belongs to an input frame")
-    return dict(_errors(positions.tobytes()))
-
-
-@lru_cache(maxsize=8)
-def _errors(where: bytes) -> dict[str, float]:
-    """`static_camera` of positions, once for all runs on one sequence."""
-    positions = np.frombuffer(where).reshape(-1, 3)
     constant = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
     first = np.linalg.norm(positions - positions[0], axis=1)
-    return {
-        f"{name}_{key}_{'m2' if key == 'sse' else 'm'}": value
-        for name, error in (("constant", constant), ("first", first))
-        for key, value in statistics(error).items()
-    }
+    return {**named("constant", constant, "m"), **named("first", first, "m")}
+
+
+def static_camera_metrics(comparison: Comparison) -> dict[str, float]:
+    """``static_camera_ate_rmse_m``: what a camera that does not move scores under the same alignment."""
+    truth, protocol = comparison.ground_truth, comparison.protocol
+    if comparison.input_timestamps is None or protocol.thins:
+        errors = static_camera(truth.select(np.unique(comparison.truth_index)))
+    else:
+        errors = static_camera(truth, comparison.input_timestamps, protocol.max_dt)
+    fit = "first" if protocol.alignment in ("none", "origin") else "constant"
+    return {"static_camera_ate_rmse_m": errors[f"{fit}_rmse_m"]}

@@ -45,64 +45,54 @@ def compare_protocols(estimate: Trajectory, ground_truth: Trajectory, *, of_file
     """
     evaluate(estimate, ground_truth, "tum-rgbd/v1")
     rows = []
-    for metric, protocols in (("ATE", _absolute()), ("RPE", _relative())):
-        for label, protocol in protocols:
+    for metric, habits in (("ATE", ABSOLUTE), ("RPE", RELATIVE)):
+        for label, protocol in habits:
             truth = truth_of_file(ground_truth, protocol) if of_file else ground_truth
             rows.append(_row(metric, label, estimate, truth, protocol))
     return rows
 
 
-def _absolute() -> list[tuple[str, Protocol]]:
-    base = PROTOCOLS["tum-rgbd/v1"].model_copy(update={"rpe": ()})
-    alignments: list[tuple[str, Alignment]] = [
-        ("not aligned", "none"),
-        ("origin-aligned", "origin"),
-        ("yaw-aligned", "yaw"),
-        ("SE(3)-aligned (TUM's ATE)", "se3"),
-        ("Sim(3)-aligned", "sim3"),
-    ]
-    rows = [
-        (label, base.model_copy(update={"id": f"tum-rgbd/{mode}", "alignment": mode})) for label, mode in alignments
-    ]
-    evo = PROTOCOLS["evo-default"].model_copy(update={"id": "evo -a", "alignment": "se3", "rpe": ()})
-    return [
-        *rows,
-        ("evo_ape -a", evo),
-        ("VSLAM-LAB", PROTOCOLS["vslam-lab"]),
-        ("WildGS-SLAM, DROID-W", PROTOCOLS["droid-w/v1"]),
-        ("MonST3R (90 frames)", PROTOCOLS["tum-dynamics-90/v1"].model_copy(update={"rpe": ()})),
-        ("at Bonn's camera, SE(3)", PROTOCOLS["bonn-camera/v1"].model_copy(update={"rpe": ()})),
-        ("DROID-W on Bonn", PROTOCOLS["droid-w/v1-bonn"]),
-    ]
+_TUM, _EVO = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS["evo-default"]
 
 
-def _relative() -> list[tuple[str, Protocol]]:
-    tum, evo = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS["evo-default"]
+def _variant(base: Protocol, name: str, *rpe: RPESpec, alignment: Alignment | None = None) -> Protocol:
+    return base.model_copy(update={"id": name, "rpe": rpe, "alignment": alignment or base.alignment})
 
-    def variant(base: Protocol, name: str, spec: RPESpec) -> Protocol:
-        return base.model_copy(update={"id": name, "rpe": (spec,)})
 
-    return [
-        ("TUM, 1 frame, fixed delta", variant(tum, "tum-rgbd/1f", RPESpec(delta=1, unit="f"))),
-        ("TUM, 1 s, fixed delta", variant(tum, "tum-rgbd/1s", RPESpec(delta=1, unit="s"))),
-        ("TUM, 1 s, as a rate (m/s)", PROTOCOLS["tum-rgbd/v1-rate"]),
-        ("MonST3R (90 frames), 1 frame", PROTOCOLS["tum-dynamics-90/v1"]),
-        ("TUM's default, random pairs", PROTOCOLS["tum-rgbd/v1-random-pairs"]),
-        ("evo_rpe, 1 frame", evo),
-        ("evo_rpe, 30 frames", variant(evo, "evo 30f", RPESpec(delta=30, unit="f", pairs="consecutive"))),
-        ("evo_rpe, 30 frames, all pairs", variant(evo, "evo 30f all", RPESpec(delta=30, unit="f", pairs="all"))),
-    ]
+ABSOLUTE = (
+    ("not aligned", _variant(_TUM, "tum-rgbd/none", alignment="none")),
+    ("origin-aligned", _variant(_TUM, "tum-rgbd/origin", alignment="origin")),
+    ("yaw-aligned", _variant(_TUM, "tum-rgbd/yaw", alignment="yaw")),
+    ("SE(3)-aligned (TUM's ATE)", _variant(_TUM, "tum-rgbd/se3", alignment="se3")),
+    ("Sim(3)-aligned", _variant(_TUM, "tum-rgbd/sim3", alignment="sim3")),
+    ("evo_ape -a", _variant(_EVO, "evo -a", alignment="se3")),
+    ("VSLAM-LAB", PROTOCOLS["vslam-lab"]),
+    ("WildGS-SLAM, DROID-W", PROTOCOLS["droid-w/v1"]),
+    ("MonST3R (90 frames)", _variant(PROTOCOLS["tum-dynamics-90/v1"], "tum-dynamics-90/v1")),
+    ("at Bonn's camera, SE(3)", _variant(PROTOCOLS["bonn-camera/v1"], "bonn-camera/v1")),
+    ("DROID-W on Bonn", PROTOCOLS["droid-w/v1-bonn"]),
+)
+RELATIVE = (
+    ("TUM, 1 frame, fixed delta", _variant(_TUM, "tum-rgbd/1f", RPESpec(delta=1, unit="f"))),
+    ("TUM, 1 s, fixed delta", _variant(_TUM, "tum-rgbd/1s", RPESpec(delta=1, unit="s"))),
+    ("TUM, 1 s, as a rate (m/s)", PROTOCOLS["tum-rgbd/v1-rate"]),
+    ("MonST3R (90 frames), 1 frame", PROTOCOLS["tum-dynamics-90/v1"]),
+    ("TUM's default, random pairs", PROTOCOLS["tum-rgbd/v1-random-pairs"]),
+    ("evo_rpe, 1 frame", _EVO),
+    ("evo_rpe, 30 frames", _variant(_EVO, "evo 30f", RPESpec(delta=30, unit="f", pairs="consecutive"))),
+    ("evo_rpe, 30 frames, all pairs", _variant(_EVO, "evo 30f all", RPESpec(delta=30, unit="f", pairs="all"))),
+)
 
 
 def _row(metric: str, label: str, estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> ComparisonRow:
+    text, spec = protocol.describe(), protocol.rpe[0] if metric == "RPE" else None
     try:
         result = evaluate(estimate, ground_truth, protocol)
     except EvaluationError as error:
-        return ComparisonRow(metric, label, None, 0, protocol.describe(), str(error))
-    if metric == "ATE":
+        return ComparisonRow(metric, label, None, 0, text, str(error))
+    if spec is None:
         note = f"means something for {protocol.only_for}* only" if protocol.only_for else ""
-        return ComparisonRow(metric, label, result.metrics["ate_rmse_m"], result.n_pairs, protocol.describe(), note)
-    key = protocol.rpe[0].key
-    rmse = result.metrics.get(protocol.rpe[0].metric("trans"))
-    note = "" if rmse is not None else f"the trajectory has no pair {protocol.rpe[0].describe()} apart"
-    return ComparisonRow(metric, label, rmse, result.n_pairs_rpe[key], protocol.describe(), note)
+        return ComparisonRow(metric, label, result.metrics["ate_rmse_m"], result.n_pairs, text, note)
+    rmse = result.metrics.get(spec.metric("trans"))
+    note = "" if rmse is not None else f"the trajectory has no pair {spec.describe()} apart"
+    return ComparisonRow(metric, label, rmse, result.n_pairs_rpe[spec.key], text, note)

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import field_validator
 
-from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.evaluation.alignment import RELIABLE_DEG, Similarity, align
-from dynslam_bench.evaluation.ape import absolute_errors, named, static_camera
-from dynslam_bench.evaluation.association import AssociationRecord, match
-from dynslam_bench.evaluation.prepare import apply_policy, compared, tracked_frames, truth_of_file
+from dynslam_bench.evaluation.ape import absolute_errors, absolute_metrics, static_camera_metrics
+from dynslam_bench.evaluation.comparison import AssociationRecord, Comparison, compare
+from dynslam_bench.evaluation.prepare import apply_policy, truth_of_file
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import TumFile, load_trajectory
 
 SCHEMA_VERSION = 1
+METRICS: tuple[Callable[[Comparison], dict[str, float]], ...] = (
+    absolute_metrics,
+    relative_metrics,
+    segment_metrics,
+    static_camera_metrics,
+)
+"""Everything that is measured. To add a metric, add a function here that gives plain floats by name with their unit."""
 
 
 class AlignmentRecord(Record):
@@ -31,11 +37,6 @@ class AlignmentRecord(Record):
     scale: float
     degenerate: bool
     uncertainty_deg: float | None = None
-
-    @property
-    def rotation_reliable(self) -> bool:
-        """Whether the metrics ``ape_rot_*`` are errors of the estimate rather than of the alignment."""
-        return self.uncertainty_deg is None or self.uncertainty_deg <= RELIABLE_DEG
 
 
 class Evaluation(Record):
@@ -118,54 +119,23 @@ def evaluate(
     """
     protocol = get_protocol(protocol)
     diagnostics: list[str] = []
-    n_input = n_tracked = None
-    if input_timestamps is not None:
-        n_input = len(np.asarray(input_timestamps).reshape(-1))
-        n_tracked = int(tracked_frames(estimate, input_timestamps).sum())
-    estimate = apply_policy(estimate, protocol, input_timestamps, n_input, n_tracked, diagnostics)
-    estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
-    association = match(estimate, ground_truth, protocol)
-    dropped = association.describe(protocol.max_dt)
-    if len(association) < 2:
-        raise EvaluationError(
-            f"only {len(association)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s, "
-            "at least 2 are needed",
-            dropped,
-        )
-    if dropped:
-        diagnostics.append(dropped)
-    matched, truth = estimate.T_world_cam[association.estimate], ground_truth.T_world_cam[association.ground_truth]
-    similarity = align(matched, truth, protocol.alignment)
-    if similarity.degenerate:
-        diagnostics.append("the estimated positions do not determine a rotation; it was taken from the orientations")
-    if not similarity.rotation_reliable:
-        diagnostics.append(_unreliable(similarity, truth))
-    aligned = similarity.apply(matched)
-    translation, rotation = absolute_errors(aligned, truth)
-    metrics = {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
-    relative, counts = relative_metrics(estimate, ground_truth, association, aligned, similarity, protocol)
-    for key, count in counts.items():
-        if not count:
-            diagnostics.append(f"no pair of poses for the relative error over {key}; it is left out")
-    metrics.update(relative)
-    if protocol.segments_m:
-        metrics.update(segment_metrics(aligned, truth, protocol, diagnostics))
-    if input_timestamps is None or protocol.thins:
-        static = static_camera(ground_truth.select(np.unique(association.ground_truth)))
-    else:
-        static = static_camera(ground_truth, input_timestamps, protocol.max_dt)
-    fit = "first" if protocol.alignment in ("none", "origin") else "constant"
-    metrics["static_camera_ate_rmse_m"] = static[f"{fit}_rmse_m"]
+    estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
+    comparison = compare(estimate, ground_truth, protocol, input_timestamps, diagnostics)
+    diagnostics += comparison.similarity.doubts(comparison.truth)
+    metrics: dict[str, float] = {}
+    for metric in METRICS:
+        metrics |= metric(comparison)
+    similarity = comparison.similarity
     return Evaluation(
         protocol_id=protocol.id,
         protocol_digest=protocol.digest(),
         protocol=protocol.describe(),
         metrics=metrics,
-        n_pairs=len(association),
-        n_pairs_rpe=counts,
-        n_input=n_input,
-        n_tracked=n_tracked,
-        coverage=None if n_tracked is None or not n_input else n_tracked / n_input,
+        n_pairs=len(comparison.truth),
+        n_pairs_rpe=comparison.n_pairs_rpe,
+        n_input=None if tracked is None else len(tracked),
+        n_tracked=None if tracked is None else int(tracked.sum()),
+        coverage=None if tracked is None else float(tracked.mean()),
         alignment=AlignmentRecord(
             mode=protocol.alignment,
             rotation=similarity.rotation.tolist(),
@@ -174,7 +144,7 @@ def evaluate(
             degenerate=similarity.degenerate,
             uncertainty_deg=similarity.uncertainty_deg,
         ),
-        association=association.record,
+        association=comparison.association,
         diagnostics=diagnostics,
     )
 
@@ -230,27 +200,11 @@ def pose_errors(
     Raises:
         EvaluationError: Nothing can be associated.
     """
-    protocol = get_protocol(protocol)
-    estimate, ground_truth = compared(estimate, ground_truth, protocol)
-    association = match(estimate, ground_truth, protocol)
-    matched = estimate.T_world_cam[association.estimate]
-    truth = ground_truth.T_world_cam[association.ground_truth]
-    aligned = align(matched, truth, protocol.alignment).apply(matched)
-    translation, rotation = absolute_errors(aligned, truth)
-    stamps, first = np.unique(estimate.timestamps[association.estimate], return_index=True)
+    comparison = compare(estimate, ground_truth, get_protocol(protocol))
+    translation, rotation = absolute_errors(comparison.aligned, comparison.truth)
+    stamps, first = np.unique(comparison.stamps, return_index=True)
     return (
-        Trajectory(stamps, aligned[first]),
-        Trajectory(stamps, truth[first]),
+        Trajectory(stamps, comparison.aligned[first]),
+        Trajectory(stamps, comparison.truth[first]),
         {"trans_m": translation[first], "rot_deg": rotation[first]},
-    )
-
-
-def _unreliable(similarity: Similarity, truth: np.ndarray) -> str:
-    """Why the absolute rotational error is not the tracker's."""
-    positions = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
-    along, *across = np.linalg.svd(positions, compute_uv=False) / np.sqrt(len(positions))
-    return (
-        f"the path (spread {along:.3f} m along, {across[0]:.3f} and {across[1]:.3f} m across) hardly determines the "
-        f"alignment's rotation with such errors: +-{similarity.uncertainty_deg:.0f} degrees; the absolute rotational "
-        "error (ape_rot) is unreliable, the translational and the relative ones are not affected"
     )

@@ -12,7 +12,7 @@ alignment.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import comb
 from typing import Literal
@@ -77,15 +77,12 @@ def hints(
         return tuple(faults)
     stamps, poses = estimate.timestamps[inside], estimate.T_world_cam[inside]
     shift, left = _time_shift(stamps, poses, truth)
-    motions = Motions(stamps, poses, truth)
-    if (wrong := motions.wrong_convention(shift)) is not None:
-        hint, poses = wrong
-        faults.append(hint)
+    wrong, poses = _wrong_convention(stamps, poses, truth, shift)
+    if wrong:
         shift, left = _time_shift(stamps, poses, truth)
-    if shift:
-        late = _shift_hint(stamps, poses, truth, shift, left)
-        faults += [late] if late else []
-        shift = shift if late else 0.0
+    late = _shift_hint(stamps, poses, truth, shift, left) if shift else []
+    faults += wrong + late
+    shift = shift if late else 0.0
     covered = truth.covers(stamps + shift)
     stamps, poses = stamps[covered] + shift, poses[covered]
     if not sim3 and left < MOSTLY:
@@ -101,7 +98,6 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
     stamps = estimate.timestamps
     parts = np.split(stamps, np.flatnonzero(np.diff(stamps) > OTHER_RECORDING_S) + 1)
     outside = [part for part in parts if part[-1] < truth.timestamps[0] or part[0] > truth.timestamps[-1]]
-    back = 0.0 if notes is None else notes.back_s
     evidence: list[str] = []
     numbers: dict[str, float] = {}
     if 0 < len(outside) < len(parts):
@@ -110,10 +106,10 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
             f"{rows} of {len(stamps)} poses, in {len(outside)} stretches of time, lie outside of the truth's"
         )
         numbers |= {"poses_outside": float(rows), "stretches_outside": float(len(outside))}
-    if notes is not None and back > OTHER_RECORDING_S:
+    if notes is not None and notes.back_s > OTHER_RECORDING_S:
         repeated = f", {notes.duplicates} of {notes.lines} lines repeat a stamp" if notes.duplicates else ""
-        evidence.append(f"the stamps of the file go back by {back:.0f} s{repeated}")
-        numbers |= {"back_s": back, "repeated_stamps": float(notes.duplicates)}
+        evidence.append(f"the stamps of the file go back by {notes.back_s:.0f} s{repeated}")
+        numbers |= {"back_s": notes.back_s, "repeated_stamps": float(notes.duplicates)}
     if not evidence:
         return []
     text = f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one"
@@ -188,20 +184,20 @@ def _unexplained(own: Array, true: Array) -> Array:
     return np.asarray(np.where(enough, share.clip(0), 1.0))
 
 
-def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: float) -> Hint | None:
+def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: float) -> list[Hint]:
     """The hint, if the absolute error falls, too: by half where displacements stay unexplained."""
     both = truth.covers(stamps) & truth.covers(stamps + shift)
     if both.sum() < MIN_POSES:
-        return None
+        return []
     before, after = (fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift))
     if not after < (0.9 if left < 0.05 else 0.5) * before:
-        return None
+        return []
     text = (
         f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each the "
         f"error falls from {before:.4f} to {after:.4f} m (at its best scale); give the stamps of the images, on the "
         "truth's clock"
     )
-    return Hint("time-shift", text, {"shift_s": shift, "error_m": before, "error_undone_m": after})
+    return [Hint("time-shift", text, {"shift_s": shift, "error_m": before, "error_undone_m": after})]
 
 
 # -- scale and noise ---
@@ -386,91 +382,77 @@ may be not; an undone fault has to be better than the trajectory as it stands by
 VARIES, TIE = 0.7, 0.1
 """Least correlation of motions that are explained, and the errors between which the path does not tell."""
 
-_AXES = {
-    "y up, z back (OpenGL)": np.diag([1.0, -1.0, -1.0]),
-    "x forward, y left, z up (ROS)": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-}
-"""Axes that are not the camera's (x right, y down, z forward): rotations ``R_named_camera``."""
+
+def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -> tuple[list[Hint], Array]:
+    """The convention that explains motions which the poses as they stand do not, and the poses brought in order.
+
+    Args:
+        stamps: Seconds ``[N]``.
+        poses: The estimate's ``[N, 4, 4]``.
+        truth: The true poses.
+        shift: A time shift that would explain them as well, seconds; the better explanation counts.
+    """
+    pairs = _pairs(stamps)
+    true_poses = truth.at(stamps)
+    true = _relative(true_poses, pairs)
+    as_read, _ = _compare(_relative(poses, pairs), true)
+    if as_read < UNEXPLAINED or not np.isfinite(as_read):
+        return [], poses
+    limit = min(EXPLAINED, as_read / CLEARLY)
+    if shift:  # the error of the poses as they stand beside the true motions at another time
+        covered = truth.covers(stamps + shift)
+        seen = pairs[covered[pairs].all(axis=1)]
+        limit = min(limit, _compare(_relative(poses, seen), _relative(truth.at(stamps + shift), seen))[0])
+    candidates: list[tuple[float, Convention, Array]] = []
+    for convention in CONVENTIONS:
+        undone = convention.undo(poses)
+        error, varies = _compare(_relative(undone, pairs), true)
+        if error < limit and varies > VARIES:
+            candidates.append((error, convention, undone))
+    candidates = candidates or _in_axes_of_a_body(poses, pairs, true, true_poses)
+    if not candidates:
+        return [], poses
+    misfit = [error + fit(undone, true_poses).misfit for error, _, undone in candidates]
+    best = [candidate for candidate, score in zip(candidates, misfit, strict=True) if score < min(misfit) + TIE]
+    error, convention, undone = best[0]
+    text = (
+        f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
+        f"by {100 * error:.0f} % {convention.cure}"
+    ) + "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:])
+    return [Hint(convention.id, text, {"motion_error": as_read, "motion_error_undone": error})], undone
 
 
-class Motions:
-    """An estimate's motions from pose to pose beside the true ones."""
+def _in_axes_of_a_body(
+    poses: Array, pairs: NDArray[np.intp], true: Array, true_poses: Array
+) -> list[tuple[float, Convention, Array]]:
+    """The convention where the truth is that of a body with axes of its own, such as a set of markers; none or one."""
+    motions = _relative(poses, pairs)
+    as_turned, _ = _compare(motions, true, R_est_cam=_axes(motions, true))
+    for convention in CONVENTIONS[:2]:
+        undone = convention.undo(poses)
+        motions = _relative(undone, pairs)
+        error, varies = _compare(motions, true, R_est_cam=_axes(motions, true))
+        worse = 2 * fit(undone, true_poses).misfit > fit(poses, true_poses).misfit
+        if error < min(EXPLAINED, as_turned / CLEARLY) and varies > VARIES:
+            if convention.id != "inverted-poses" or not worse:
+                return [(error, convention, undone)]
+    return []
 
-    def __init__(self, stamps: Array, poses: Array, truth: Track) -> None:
-        self.stamps, self.poses, self.truth = stamps, poses, truth
-        span = stamps[-1] - stamps[0]
-        ends = np.searchsorted(stamps, stamps + min(PAIR_S, span / 3))
-        starts = np.flatnonzero(ends < len(stamps))
-        length = stamps[ends[starts]] - stamps[starts]
-        keep = length < 2 * min(PAIR_S, span / 3)  # no motions over holes
-        step = 1 + int(keep.sum()) // 300
-        self.pairs = starts[keep][::step], ends[starts[keep][::step]]
-        self.true = _relative(truth.at(stamps), self.pairs)
 
-    def compare(self, poses: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
-        """`_compare` with the true motions at the stamps."""
-        return _compare(_relative(poses, self.pairs), self.true, R_est_cam)
+def _pairs(stamps: Array) -> NDArray[np.intp]:
+    """Poses ``[P, 2]`` between which motions are compared; none over holes."""
+    longest = min(PAIR_S, (stamps[-1] - stamps[0]) / 3)
+    ends = np.searchsorted(stamps, stamps + longest)
+    starts = np.flatnonzero(ends < len(stamps))
+    pairs = np.stack([starts, ends[starts]], axis=1)
+    pairs = pairs[stamps[pairs[:, 1]] - stamps[pairs[:, 0]] < 2 * longest]
+    return pairs[:: 1 + len(pairs) // 300]
 
-    def wrong_convention(self, shift: float) -> tuple[Hint, Array] | None:
-        """The convention that explains motions which the poses as they stand do not, and the poses brought in order.
 
-        Args:
-            shift: A time shift that would explain them as well, seconds; the better explanation counts.
-        """
-        as_read, _ = self.compare(self.poses)
-        if as_read < UNEXPLAINED or not np.isfinite(as_read):
-            return None
-        limit = min(EXPLAINED, as_read / CLEARLY, self._shifted(shift) if shift else np.inf)
-        candidates: list[tuple[float, HintId, Array, str]] = []
-        for name, axes, undo in _CONVENTIONS:
-            poses = undo(self.poses)
-            error, varies = self.compare(poses)
-            if error < limit and varies > VARIES:
-                candidates.append((error, name, poses, axes))
-        if not candidates:
-            return self._other_axes(as_read)
-        true = self.truth.at(self.stamps)
-        misfit = [one[0] + fit(one[2], true).misfit for one in candidates]
-        best = [one for one, score in zip(candidates, misfit, strict=True) if score < min(misfit) + TIE]
-        error, name, poses, axes = best[0]
-        others = [_CURES[one[1]][0].format(axes=one[3]) for one in best[1:]]
-        return self._hint(name, as_read, error, axes, others), poses
-
-    def _shifted(self, shift: float) -> float:
-        """The error of the poses as they stand beside the true motions at another time."""
-        covered = self.truth.covers(self.stamps + shift)
-        keep = covered[self.pairs[0]] & covered[self.pairs[1]]
-        pairs = self.pairs[0][keep], self.pairs[1][keep]
-        true = _relative(self.truth.at(self.stamps + shift), pairs)
-        return _compare(_relative(self.poses, pairs), true)[0]
-
-    def _other_axes(self, as_read: float) -> tuple[Hint, Array] | None:
-        """The same where the truth is that of a body with axes of its own, such as a set of markers."""
-        as_turned, _ = self.compare(self.poses, R_est_cam=self._axes(self.poses))
-        true = self.truth.at(self.stamps)
-        before = fit(self.poses, true).misfit
-        for name, axes, undo in _CONVENTIONS[:2]:
-            poses = undo(self.poses)
-            error, varies = self.compare(poses, R_est_cam=self._axes(poses))
-            if error < min(EXPLAINED, as_turned / CLEARLY) and varies > VARIES:
-                if name == "inverted-poses" and 2 * fit(poses, true).misfit > before:
-                    continue
-                return self._hint(name, as_read, error, axes), poses
-        return None
-
-    def _axes(self, poses: Array) -> Array:
-        """Rotation from the truth's axes to the estimate's that explains most of the rotations."""
-        estimated, true = (_axis(motions) for motions in (_relative(poses, self.pairs), self.true))
-        u, _, vt = np.linalg.svd(estimated.T @ true)
-        return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
-
-    def _hint(self, name: HintId, as_read: float, undone: float, axes: str = "", others: Sequence[str] = ()) -> Hint:
-        what, cure = _CURES[name]
-        text = (
-            f"{what.format(axes=axes)}: the motions are off by {100 * as_read:.0f} % of the true ones, "
-            f"by {100 * undone:.0f} % {cure}"
-        ) + "".join(f" (or {other}: the path does not tell)" for other in others)
-        return Hint(name, text, {"motion_error": as_read, "motion_error_undone": undone})
+def _axes(motions: Array, true: Array) -> Array:
+    """Rotation from the truth's axes to the estimate's that explains most of the rotations."""
+    u, _, vt = np.linalg.svd(_axis(motions).T @ _axis(true))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
 
 def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
@@ -524,44 +506,62 @@ def _turned_back(poses: Array) -> Array:
     return turned
 
 
-def _other_camera(rotation: Array) -> Callable[[Array], Array]:
-    def turned(poses: Array) -> Array:
+@dataclass(frozen=True)
+class Convention:
+    """What poses may be in place of camera-to-world matrices.
+
+    Attributes:
+        id: Of the hint.
+        what: What they seem to be.
+        cure: What was done to them, and what to give instead.
+        undo: Brings poses ``[N, 4, 4]`` in order.
+    """
+
+    id: HintId
+    what: str
+    cure: str
+    undo: Callable[[Array], Array]
+
+
+def _with_axes(name: str, R_named_camera: Array) -> Convention:
+    """Orientations of axes that are not the camera's (x right, y down, z forward)."""
+
+    def undo(poses: Array) -> Array:
         poses = poses.copy()
-        poses[:, :3, :3] = poses[:, :3, :3] @ rotation
+        poses[:, :3, :3] = poses[:, :3, :3] @ R_named_camera
         return poses
 
-    return turned
+    cure = "after turning them; give those of a camera with x right, y down, z forward"
+    return Convention("camera-axes", f"the orientations seem to have the axes {name}", cure, undo)
 
 
-_CONVENTIONS: tuple[tuple[HintId, str, Callable[[Array], Array]], ...] = (
-    ("inverted-poses", "", se3.inverse),
-    ("quaternion-order", "", _reordered),
-    ("inverted-rotations", "", _turned_back),
-    *(("camera-axes", axes, _other_camera(rotation)) for axes, rotation in _AXES.items()),
-)
-"""What poses may be in place of ``T_world_cam``, the likeliest first, and what brings them in order."""
-_CURES: dict[HintId, tuple[str, str]] = {
-    "inverted-poses": (
+CONVENTIONS = (
+    Convention(
+        "inverted-poses",
         "the poses seem to be world to camera",
         "after inverting each pose; give T_world_cam, camera to world: invert your matrices",
+        se3.inverse,
     ),
-    "quaternion-order": (
+    Convention(
+        "quaternion-order",
         "the quaternions seem to be in the order qw qx qy qz",
         "after re-ordering; write them as qx qy qz qw",
+        _reordered,
     ),
-    "inverted-rotations": (
+    Convention(
+        "inverted-rotations",
         "the rotations seem to be world to camera, the positions are not",
         "after transposing each rotation; give those of T_world_cam, camera to world",
+        _turned_back,
     ),
-    "camera-axes": (
-        "the orientations seem to have the axes {axes}",
-        "after turning them; give those of a camera with x right, y down, z forward",
-    ),
-}
+    _with_axes("y up, z back (OpenGL)", np.diag([1.0, -1.0, -1.0])),
+    _with_axes("x forward, y left, z up (ROS)", np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])),
+)
+"""The likeliest first."""
 
 
-def _relative(poses: Array, pairs: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Array:
-    return np.asarray(se3.inverse(poses[pairs[0]]) @ poses[pairs[1]])
+def _relative(poses: Array, pairs: NDArray[np.intp]) -> Array:
+    return np.asarray(se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]])
 
 
 def _correlation(first: Array, second: Array) -> float:

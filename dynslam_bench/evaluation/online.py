@@ -63,8 +63,7 @@ class OnlineError:
         self._previous_truth: Array | None = None
         self._previous_pose: Array | None = None
         self._last_truth: Array | None = None
-        self._way_m = 0.0
-        self._lost_way_m = 0.0
+        self._way_m = self._lost_way_m = 0.0
 
     def truth_at(self, timestamp: float) -> Array | None:
         """The true pose ``[4, 4]`` nearest in time, or None in a hole."""
@@ -91,20 +90,17 @@ class OnlineError:
         """
         pose = np.array(T_world_cam, dtype=np.float64) if ok and T_world_cam is not None else None
         truth = self.truth_at(timestamp)
-        sample = None if truth is None else self._sample(truth, pose)
-        if pose is not None and self._align is not None:
-            self._held = self._align @ pose
-        self._previous_truth = truth
-        if pose is not None:
-            self._previous_pose = pose
-            self._lost_way_m = 0.0
-        return sample
-
-    def _sample(self, truth: Array, pose: Array | None) -> OnlineSample:
-        if pose is not None and self._align is None:
+        if pose is not None and truth is not None and self._align is None:
             self._align = truth @ se3.inverse(pose)
         if pose is not None and self._align is not None:
             self._held = self._align @ pose
+        sample = None if truth is None else self._sample(truth, pose)
+        self._previous_truth = truth
+        if pose is not None:
+            self._previous_pose, self._lost_way_m = pose, 0.0
+        return sample
+
+    def _sample(self, truth: Array, pose: Array | None) -> OnlineSample:
         if self._held is None:
             self._held = truth.copy()
         if self._last_truth is not None:

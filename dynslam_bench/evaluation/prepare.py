@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache, reduce
+from functools import reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,8 +30,8 @@ def compared(
     estimate: Trajectory,
     ground_truth: Trajectory,
     protocol: Protocol,
-    input_timestamps: ArrayLike | None = None,
-    diagnostics: list[str] | None = None,
+    input_timestamps: ArrayLike | None,
+    diagnostics: list[str],
 ) -> tuple[Trajectory, Trajectory]:
     """The trajectories that a protocol compares: the truth corrected, the estimate on the frames that count.
 
@@ -45,10 +45,9 @@ def compared(
     Raises:
         EvaluationError: None of the frames that count was tracked.
     """
-    if protocol.truth == "bonn-camera":
-        ground_truth = Trajectory(ground_truth.timestamps, bonn_camera(ground_truth.T_world_cam))
-    elif protocol.truth == "bonn-droid-w":
-        ground_truth = Trajectory(ground_truth.timestamps, bonn_as_droid_w(ground_truth.T_world_cam))
+    if protocol.truth != "as-is":
+        correct = bonn_camera if protocol.truth == "bonn-camera" else bonn_as_droid_w
+        ground_truth = Trajectory(ground_truth.timestamps, correct(ground_truth.T_world_cam))
     if not protocol.thins:
         return estimate, ground_truth
     stamps = estimate.timestamps if input_timestamps is None else np.asarray(input_timestamps, np.float64).reshape(-1)
@@ -60,10 +59,9 @@ def compared(
             f"none of {len(estimate)} poses is of the {len(chosen)} frames that {protocol.id} compares "
             f"(every {protocol.every} of {len(matched)} matched ones, at most {protocol.most_frames})"
         )
-    if diagnostics is not None:
-        diagnostics.append(
-            f"{len(index)} poses on {len(chosen)} frames are compared: every {protocol.every} of {len(matched)} matched"
-        )
+    diagnostics.append(
+        f"{len(index)} poses on {len(chosen)} frames are compared: every {protocol.every} of {len(matched)} matched"
+    )
     return estimate.select(np.sort(index)), ground_truth
 
 
@@ -71,33 +69,33 @@ def apply_policy(
     estimate: Trajectory,
     protocol: Protocol,
     input_timestamps: ArrayLike | None,
-    n_input: int | None,
-    n_tracked: int | None,
     diagnostics: list[str],
-) -> Trajectory:
+) -> tuple[Trajectory, NDArray[np.bool_] | None]:
     """The estimate with its lost frames held, left out, or refused, as the protocol has it.
+
+    Returns:
+        The estimate, and which input frames were tracked ``[N]``; None where the input frames are not known.
 
     Raises:
         EvaluationError: The policy needs the input frames, or allows no lost frame.
     """
-    if input_timestamps is None or n_input is None or n_tracked is None:
+    if input_timestamps is None:
         if protocol.lost_frames != "exclude":
             raise EvaluationError(
                 f"protocol {protocol.id} ({protocol.lost_frames}) needs the stamps of the input frames",
                 "pass input_timestamps, or use a protocol that excludes lost frames",
             )
-        return estimate
-    lost = n_input - n_tracked
-    if not lost:
-        return estimate
-    percent = f"coverage {100 * n_tracked / n_input:.1f} %"
+        return estimate, None
+    tracked = tracked_frames(estimate, input_timestamps)
+    n_input, n_tracked = len(tracked), int(tracked.sum())
+    if n_tracked == n_input:
+        return estimate, tracked
+    lost = f"{n_input - n_tracked} of {n_input} frames were lost (coverage {100 * n_tracked / n_input:.1f} %)"
     if protocol.lost_frames == "fail":
-        raise EvaluationError(f"{lost} of {n_input} frames were lost ({percent}), {protocol.id} allows none")
-    if protocol.lost_frames == "hold":
-        diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and held at the last tracked pose")
-        return hold(estimate, input_timestamps)
-    diagnostics.append(f"{lost} of {n_input} frames were lost ({percent}) and take no part")
-    return estimate
+        raise EvaluationError(f"{lost}, {protocol.id} allows none")
+    held = protocol.lost_frames == "hold"
+    diagnostics.append(f"{lost} and {'held at the last tracked pose' if held else 'take no part'}")
+    return (hold(estimate, input_timestamps) if held else estimate), tracked
 
 
 # Which frames take part: coverage, frames common to several trajectories, and held poses of lost frames.
@@ -107,7 +105,7 @@ STAMP_TOLERANCE = 1e-3
 
 
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:
-    """Which input frames ``[N]`` have a pose in the estimate; read-only.
+    """Which input frames ``[N]`` have a pose in the estimate.
 
     A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some systems write the depth
     image's stamp, and files round.
@@ -115,13 +113,7 @@ def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray
     Raises:
         EvaluationError: The estimate has poses at stamps that are no input frame's.
     """
-    return _tracked(estimate.timestamps.tobytes(), np.asarray(input_timestamps, dtype=np.float64).tobytes())
-
-
-@lru_cache(maxsize=64)
-def _tracked(estimate: bytes, inputs: bytes) -> NDArray[np.bool_]:
-    """`tracked_frames`, once for equal stamps: most runs on one sequence have them."""
-    poses, stamps = np.frombuffer(estimate), np.frombuffer(inputs)
+    poses, stamps = estimate.timestamps, np.asarray(input_timestamps, dtype=np.float64).reshape(-1)
     interval = float(np.median(np.diff(np.sort(stamps)))) if len(stamps) > 1 else 0.0
     index, _ = associate(stamps, poses, max(interval / 2, STAMP_TOLERANCE), strict=False)
     if len(index) < len(poses):
@@ -131,7 +123,6 @@ def _tracked(estimate: bytes, inputs: bytes) -> NDArray[np.bool_]:
         )
     tracked = np.zeros(len(stamps), dtype=bool)
     tracked[index] = True
-    tracked.flags.writeable = False
     return tracked
 
 

@@ -249,13 +249,10 @@ PROTOCOLS: dict[str, Protocol] = {
 def _digest(protocol: Protocol) -> str:
     """Taken once: lists of a hundred thousand runs ask for it as often."""
     fields = protocol.model_dump(mode="json")
-    for name in ("truth", "every", "most_frames", "only_for"):
-        if fields[name] == type(protocol).model_fields[name].default:
-            del fields[name]
-    for spec in fields["rpe"]:
-        if not spec["rate"]:
-            del spec["rate"]
-    return digest(fields)
+    defaults = {name: Protocol.model_fields[name].default for name in ("truth", "every", "most_frames", "only_for")}
+    used = {name: value for name, value in fields.items() if name not in defaults or value != defaults[name]}
+    used["rpe"] = [spec.model_dump(mode="json", exclude=set() if spec.rate else {"rate"}) for spec in protocol.rpe]
+    return digest(used)
 
 
 def get_protocol(name: str | Protocol) -> Protocol:

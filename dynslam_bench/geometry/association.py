@@ -30,11 +30,8 @@ def associate(first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: boo
     Raises:
         TrajectoryError: A stamp is not finite, or `max_dt` is negative or not a number.
     """
-    return _associate(_bytes(first), _bytes(second), float(max_dt), strict)
-
-
-def _bytes(stamps: ArrayLike) -> bytes:
-    return np.asarray(stamps, dtype=np.float64).reshape(-1).tobytes()
+    stamps = (np.asarray(stamps, dtype=np.float64).tobytes() for stamps in (first, second))
+    return _associate(*stamps, float(max_dt), strict)
 
 
 @lru_cache(maxsize=512)
@@ -45,39 +42,31 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
     if not max_dt >= 0:
         raise TrajectoryError(f"the largest time difference is {max_dt!r}, not a number of seconds >= 0")
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
-    if (np.diff(candidate_a) > 0).all() and (np.diff(candidate_b) > 0).all():  # no stamp has two candidates
-        return _shared(order_a[candidate_a], order_b[candidate_b])
-    free_a = np.ones(len(a), dtype=bool).tolist()
-    free_b = np.ones(len(b), dtype=bool).tolist()
-    matched: list[tuple[int, int]] = []
-    by_distance = np.lexsort((candidate_b, candidate_a, dt))
-    for i, j in zip(candidate_a[by_distance].tolist(), candidate_b[by_distance].tolist(), strict=True):
-        if free_a[i] and free_b[j]:
-            free_a[i] = free_b[j] = False
-            matched.append((i, j))
-    pairs = np.array(sorted(matched), dtype=np.intp).reshape(-1, 2)
-    return _shared(order_a[pairs[:, 0]], order_b[pairs[:, 1]])
-
-
-def _shared(first: Index, second: Index) -> tuple[Index, Index]:
-    first.flags.writeable = second.flags.writeable = False
-    return first, second
+    pairs = np.stack([candidate_a, candidate_b], axis=1)
+    if not (np.diff(pairs, axis=0) > 0).all():  # some stamp has several candidates
+        used_a: set[int] = set()
+        used_b: set[int] = set()
+        matched: list[tuple[int, int]] = []
+        for i, j in pairs[np.lexsort((candidate_b, candidate_a, dt))].tolist():
+            if i not in used_a and j not in used_b:
+                used_a.add(i)
+                used_b.add(j)
+                matched.append((i, j))
+        pairs = np.array(sorted(matched), dtype=np.intp).reshape(-1, 2)
+    index_a, index_b = order_a[pairs[:, 0]], order_b[pairs[:, 1]]
+    index_a.flags.writeable = index_b.flags.writeable = False
+    return index_a, index_b
 
 
 def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """Distance in seconds ``[N]`` of every stamp of `first` to the nearest of `second`; inf if `second` is empty."""
+    """Distance in seconds ``[N]`` of every (finite) stamp of `first` to the nearest of `second`; inf without any."""
     a = np.asarray(first, dtype=np.float64).reshape(-1)
-    b = np.sort(np.asarray(second, dtype=np.float64).reshape(-1))
-    if not len(b):
-        return np.full(len(a), np.inf)
-    at = np.searchsorted(b, a)
-    below = np.abs(a - b[np.clip(at - 1, 0, len(b) - 1)])
-    above = np.abs(b[np.clip(at, 0, len(b) - 1)] - a)
-    return np.minimum(below, above)
+    b = np.concatenate([[-np.inf], np.sort(np.asarray(second, dtype=np.float64).reshape(-1)), [np.inf]])
+    after = np.searchsorted(b, a)
+    return np.asarray(np.minimum(a - b[after - 1], b[after] - a))
 
 
-def _sorted_stamps(stamps: ArrayLike) -> tuple[NDArray[np.float64], Index]:
-    values = np.asarray(stamps, dtype=np.float64).reshape(-1)
+def _sorted_stamps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], Index]:
     if not np.isfinite(values).all():
         at = int(np.argmin(np.isfinite(values)))
         raise TrajectoryError(f"stamp {at} of {len(values)} is {values[at]}, not a finite number of seconds")

@@ -28,7 +28,7 @@ BONN_R_BODY_CAM: Matrix = (
 
 
 def nearest_rotation(matrix: Array | Matrix) -> Array:
-    """The rotation ``[3, 3]`` nearest to a matrix that is nearly one, up to scale."""
+    """The rotations ``[..., 3, 3]`` nearest to matrices that are nearly rotations, up to scale."""
     left, _, right = np.linalg.svd(np.array(matrix))
     return np.asarray(left @ right)
 
@@ -65,6 +65,5 @@ def bonn_as_droid_w(poses: Array) -> Array:
     markers[:, :3, :3] = poses[:, :3, :3] @ nearest_rotation(BONN_R_BODY_CAM).T
     corrected = BONN_T_ROS.T @ markers @ BONN_T_ROS @ BONN_T_M
     relative = np.linalg.inv(corrected[0]) @ corrected
-    left, _, right = np.linalg.svd(relative[:, :3, :3])
-    relative[:, :3, :3] = left @ right
+    relative[:, :3, :3] = nearest_rotation(relative[:, :3, :3])
     return np.asarray(relative)

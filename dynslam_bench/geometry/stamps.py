@@ -8,7 +8,6 @@ nearest to its text.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable
 from decimal import ROUND_HALF_EVEN, Context, Decimal, InvalidOperation
 
@@ -23,7 +22,6 @@ LEAST_GAP_NS = 1000
 
 No camera and no motion capture is so fast, float64 seconds hardly tell them apart, and files of six decimals do not.
 """
-_PLAIN = re.compile(r"\d{1,10}(?:\.\d{0,9})?")
 _EXACT = Context(prec=400, rounding=ROUND_HALF_EVEN)
 _LARGEST_NS = 2**63 - 1
 
@@ -34,20 +32,15 @@ def parse_ns(text: str) -> int:
     Raises:
         ValueError: It is no finite number, or beyond the range of 64 bits (292 years from 0).
     """
-    if _PLAIN.fullmatch(text):
-        whole, _, fraction = text.partition(".")
-        ns = int(whole) * NS_PER_S + int(fraction.ljust(9, "0"))
-    else:
-        try:
-            seconds = Decimal(text)
-        except InvalidOperation:
-            raise ValueError(f"{text[:40]!r} is not a number of seconds") from None
-        if not seconds.is_finite() or seconds.adjusted() > 11:
-            raise ValueError(f"{text[:40]!r} is not a number of seconds that 64 bits of nanoseconds hold")
-        ns = int(seconds.scaleb(9, _EXACT).to_integral_value(context=_EXACT)) if seconds.adjusted() >= -11 else 0
-    if abs(ns) > _LARGEST_NS:
-        raise ValueError(f"{text[:40]!r} is not a number of seconds that 64 bits of nanoseconds hold")
-    return ns
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        seconds = Decimal("nan")
+    if seconds.is_finite() and seconds.adjusted() <= 11:
+        ns = int(seconds.scaleb(9, _EXACT).to_integral_value(context=_EXACT))
+        if abs(ns) <= _LARGEST_NS:
+            return ns
+    raise ValueError(f"{text[:40]!r} is not a number of seconds that 64 bits of nanoseconds hold")
 
 
 def format_ns(ns: int) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
-from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
 
 
@@ -90,7 +89,3 @@ class Trajectory:
     def transformed(self, T_new_world: NDArray[np.float64]) -> Trajectory:
         """The same trajectory in another world frame: ``T_new_world @ T_world_cam``."""
         return self.with_poses(T_new_world @ self.T_world_cam)
-
-    def relative_to_first(self) -> Trajectory:
-        """The trajectory in the frame of its own first pose."""
-        return self.transformed(se3.inverse(self.T_world_cam[0]))

@@ -7,10 +7,8 @@ lines with one stamp the last holds. Whatever is not taken as it stands is count
 
 from __future__ import annotations
 
-import io
 from array import array
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.reading import RECORD_BYTES, read_lines
+from dynslam_bench.core.reading import read_lines
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -93,7 +91,7 @@ def load_tum(path: str | Path) -> TumFile:
         TrajectoryError: As `read_tum`.
     """
     path = Path(path)
-    values, texts = _read_table(path, 8, _COLUMNS)
+    values, numbers, texts = _read_table(path, 8, _COLUMNS)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
     valid = finite & (norm >= _ZERO_NORM)
@@ -113,7 +111,8 @@ def load_tum(path: str | Path) -> TumFile:
         )
     ns = np.array([parse_ns(texts[row]) for row in np.flatnonzero(valid)], dtype=np.int64)
     order = np.argsort(ns, kind="stable")
-    refuse_close(ns[order], str(path), TrajectoryError, lambda stamp: _line_of(path, stamp))
+    line_of = dict(zip(ns.tolist(), np.array(numbers)[valid].tolist(), strict=True))
+    refuse_close(ns[order], str(path), TrajectoryError, line_of.get)
     last_of_stamp = np.append(np.diff(ns[order]) > 0, True)
     chosen, exact = kept[order][last_of_stamp], ns[order][last_of_stamp]
     notes = FileNotes(
@@ -160,19 +159,6 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
     return _read_table(path, columns, meaning)[0]
 
 
-def read_stamped_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A table as `read_table` reads it, and its first column, seconds, in nanoseconds ``[N]``.
-
-    Raises:
-        TrajectoryError: As `read_table`; or a stamp is not finite or beyond the range of 64 bits.
-    """
-    values, texts = _read_table(path, columns, meaning)
-    try:
-        return values, np.array([parse_ns(text) for text in texts], dtype=np.int64)
-    except ValueError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
-
-
 def read_stamps(path: Path) -> NDArray[np.int64]:
     """The first numbers of all lines, seconds, in nanoseconds ``[N]``; comments and blank lines are left out.
 
@@ -197,31 +183,16 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
         if number > MOST_LINES:
             raise TrajectoryError(f"{path} has more than {MOST_LINES} lines, too many for a trajectory")
-        parts = _parts(line)
+        parts = line.partition("#")[0].replace(",", " ").split()
         if parts:
             yield number, parts
 
 
-def _parts(line: str) -> list[str]:
-    return line.partition("#")[0].replace(",", " ").split()
-
-
-def _line_of(path: Path, ns: int) -> int | None:
-    """The last line that begins with a stamp."""
-    last = None
+def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], list[int], list[str]]:
+    """The numbers of a table, the numbers of its lines, and the texts of its first column."""
+    values, numbers, texts = array("d"), [], []
     for number, parts in _lines(path):
-        with suppress(ValueError):
-            last = number if parse_ns(parts[0]) == ns else last
-    return last
-
-
-def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], list[str]]:
-    """The numbers of a table, and the texts of its first column."""
-    whole = _plain_table(path, columns)
-    if whole is not None:
-        return whole
-    values, texts = array("d"), []
-    for number, parts in _lines(path):
+        numbers.append(number)
         texts.append(parts[0])
         if len(parts) != columns:
             raise TrajectoryError(
@@ -234,20 +205,7 @@ def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.floa
             raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
     if not values:
         raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
-    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns), texts
-
-
-def _plain_table(path: Path, columns: int) -> tuple[NDArray[np.float64], list[str]] | None:
-    """The numbers of a file of a usual size and without any fault, read at once; None for every other one."""
-    with suppress(OSError, ValueError):  # whatever it is, reading line by line says it
-        if 0 < path.stat().st_size <= RECORD_BYTES:
-            text = path.read_text(encoding="utf-8-sig").replace(",", " ")
-            texts = [parts[0] for line in text.splitlines() if (parts := line.partition("#")[0].split(None, 1))]
-            if texts:  # numpy warns of a table of nothing
-                table = np.loadtxt(io.StringIO(text), ndmin=2)
-                if table.shape == (len(texts), columns):
-                    return table, texts
-    return None
+    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns), numbers, texts
 
 
 def is_number(text: str) -> bool:
@@ -272,13 +230,12 @@ def _hint(parts: list[str]) -> str:
 _MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 
 
-def read_kitti(path: str | Path, times: str | Path | None = None, *, fps: float = 10.0) -> Trajectory:
+def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
     """Read a KITTI pose file.
 
     Args:
         path: The poses.
-        times: A file whose lines begin with the stamps in seconds, one a pose; None for ``i / fps``.
-        fps: Frame rate in Hz where there is no `times` (KITTI's is 10).
+        times: A file whose lines begin with the stamps in seconds, one a pose.
 
     Returns:
         Camera-to-world poses; rotations are made orthonormal exactly (files hold about seven digits).
@@ -295,14 +252,10 @@ def read_kitti(path: str | Path, times: str | Path | None = None, *, fps: float 
             raise TrajectoryError(f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING)
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     poses[:, :3, :3] = u @ vt
-    if times is not None:
-        ns = read_stamps(Path(times))
-        if len(ns) != len(poses):
-            raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
-        return Trajectory(to_seconds(ns), poses, ns)
-    if not (np.isfinite(fps) and fps > 0):
-        raise TrajectoryError(f"the frame rate is {fps!r}, not a positive number of Hz")
-    return Trajectory(np.arange(len(poses)) / fps, poses)
+    ns = read_stamps(Path(times))
+    if len(ns) != len(poses):
+        raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
+    return Trajectory(to_seconds(ns), poses, ns)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | None = None) -> None:

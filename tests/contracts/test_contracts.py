@@ -1,6 +1,5 @@
 """The room of contracts: complete, light, and the same objects as in the rooms that use them."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -65,8 +64,7 @@ def given(**changes: object) -> TrackResult:
         (given(T_world_cam=np.eye(4).astype(object)), "a pose of the type object"),
         (given(T_world_cam=np.eye(4).astype(str)), "a pose of the type <U32"),
         (given(T_world_cam=np.eye(4, dtype=bool)), "a pose of the type bool"),
-        (given(T_world_cam=np.eye(4, dtype=np.float16)), "a pose in float16"),
-        (given(T_world_cam=np.full((4, 4), np.inf, np.float16)), "a pose with 16 values that are not finite"),
+        (given(T_world_cam=np.eye(4, dtype=np.float16)), "a pose of the type float16"),
         (given(dynamic_mask=np.zeros((4, 4), bool)), "a dynamic mask of shape (4, 4)"),
     ],
 )
@@ -85,10 +83,7 @@ def test_a_pose_of_any_real_type_is_taken_as_float64(dtype: object) -> None:
     assert whole is not None and whole.dtype == np.float64
 
 
-def test_a_pose_in_float16_is_invalid_with_its_deviation() -> None:
-    (fault,) = faults(given(T_world_cam=TURNED.astype(np.float16)), FRAME)
-    off = float(re.findall(r"I. = ([\d.e-]+)", fault.found)[0])
-    assert 1e-4 < off < 2e-3 and "float64" in fault.cause
+def test_a_fault_names_the_frame() -> None:
     with pytest.raises(TrackerContractError, match="frame 3"):
         check_result(given(T_world_cam=TURNED.astype(np.float16)), FRAME, "mine")
 

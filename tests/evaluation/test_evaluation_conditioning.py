@@ -46,7 +46,7 @@ def test_a_straight_path_gives_the_warning(sigma_m: float) -> None:
     wrong = [each for each in found if each.metrics["ape_rot_rmse_deg"] > 15]
     assert len(wrong) >= 6, "the case is there"
     for each in wrong:
-        assert not each.alignment.rotation_reliable and each.alignment.uncertainty_deg > RELIABLE_DEG
+        assert each.alignment.uncertainty_deg > RELIABLE_DEG
         assert any("ape_rot) is unreliable" in line for line in each.diagnostics)
         assert each.metrics["ate_rmse_m"] < 3 * sigma_m, "while the positions fit"
 
@@ -72,7 +72,7 @@ def test_ordinary_paths_do_not(name: str, sigma_m: float) -> None:
     truth = path_of(name)
     for seed in range(6):
         found = judged(truth, disturbed(truth, sigma_m, seed))
-        assert found.alignment.rotation_reliable, found.alignment.uncertainty_deg
+        assert found.alignment.uncertainty_deg <= RELIABLE_DEG
         assert not any("unreliable" in line for line in found.diagnostics)
         assert found.metrics["ape_rot_rmse_deg"] < 10
 

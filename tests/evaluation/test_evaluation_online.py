@@ -4,18 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evaluation_walks import walk
 
 from dynslam_bench.evaluation import OnlineError, Protocol, RPESpec, evaluate, hold
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
-
-
-def walk(n=60, seed=0):
-    rng = np.random.default_rng(seed)
-    poses = [se3.exp(rng.normal(size=6))]
-    for _ in range(n - 1):
-        poses.append(poses[-1] @ se3.exp(rng.normal(0, 0.02, 6)))
-    return Trajectory(100 + np.arange(n) / 30, np.array(poses))
 
 
 def estimate_of(truth, seed=1):
@@ -24,7 +17,7 @@ def estimate_of(truth, seed=1):
     return se3.exp(rng.normal(size=6)) @ noisy
 
 
-TRUTH = walk()
+TRUTH = walk(n=60)
 POSES = estimate_of(TRUTH)
 
 
@@ -112,7 +105,7 @@ def test_the_true_way_goes_straight_across_holes():
 
 
 def test_without_ground_truth_there_is_no_error():
-    truth = walk(5)
+    truth = walk(n=5)
     empty = truth.select(slice(0, 0))
     for ground_truth in (None, empty):
         assert run(OnlineError(ground_truth), truth, truth.T_world_cam, [True] * 5) == [None] * 5

@@ -137,9 +137,6 @@ def test_kitti_files_are_taken_with_their_stamps(tmp_path):
     assert found.metrics["ate_rmse_m"] == pytest.approx(evaluate(estimate, truth).metrics["ate_rmse_m"], abs=1e-6)
     with pytest.raises(TrajectoryError, match=r"12 values.*--timestamps FILE"):
         evaluate_files(tmp_path / "estimate.txt", tmp_path / "truth.txt")
-    (tmp_path / "short.txt").write_text("1.0\n2.0\n")
-    with pytest.raises(TrajectoryError, match=r"60 poses but .*short\.txt has 2 stamps"):
-        evaluate_files(tmp_path / "estimate.txt", tmp_path / "truth.txt", timestamps=tmp_path / "short.txt")
     (tmp_path / "short.txt").write_text("x\n")
     with pytest.raises(TrajectoryError, match=r"short\.txt line 1: 'x' is not a stamp"):
         evaluate_files(tmp_path / "estimate.txt", tmp_path / "truth.txt", timestamps=tmp_path / "short.txt")

@@ -21,7 +21,7 @@ from dynslam_bench.evaluation import (
 )
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.ape import ate_rmse_m
-from dynslam_bench.evaluation.association import nearest_match
+from dynslam_bench.evaluation.comparison import nearest_match
 from dynslam_bench.evaluation.rpe import segment_errors
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.rigs import bonn_as_droid_w, bonn_camera
@@ -53,10 +53,6 @@ def test_a_perfect_estimate_scores_zero(name):
 def test_the_world_frame_of_the_estimate_does_not_matter(name):
     truth, seed = walk(), 5
     close(evaluate(ESTIMATE, truth, name).metrics, evaluate(turned(ESTIMATE, seed), truth, name).metrics)
-
-
-def test_the_world_frame_of_both_does_not_matter():
-    close(evaluate(ESTIMATE, TRUTH).metrics, evaluate(turned(ESTIMATE, 2), turned(TRUTH, 3)).metrics)
 
 
 def test_relative_errors_need_no_alignment_and_absolute_ones_do():
@@ -101,14 +97,6 @@ def test_alignment_is_a_minimum(mode):
         if mode == "yaw":
             twist[3:5] = 0
         assert cost(se3.exp(twist) @ best.apply(estimate.T_world_cam)) >= reached
-
-
-def test_rmse_squared_is_mean_squared_plus_variance():
-    metrics = evaluate(noisy(walk()), walk()).metrics
-    for prefix, unit in (("ate", "m"), ("ape_rot", "deg"), ("rpe_1s_trans", "m")):
-        rmse, mean, std = (metrics[f"{prefix}_{name}_{unit}"] for name in ("rmse", "mean", "std"))
-        assert rmse**2 == pytest.approx(mean**2 + std**2)
-        assert rmse >= mean
 
 
 # -- static camera
@@ -209,7 +197,7 @@ def test_the_ate_alone_is_the_number_of_the_whole_evaluation(name):
         whole = evaluate(estimate, truth, protocol, input_timestamps=truth.timestamps).metrics["ate_rmse_m"]
         assert errors[-1] == pytest.approx(whole, rel=1e-12)
     assert errors[1] > errors[0], "holding still costs"
-    with pytest.raises(EvaluationError, match="only one pose"):
+    with pytest.raises(EvaluationError, match="only 1 of 1"):
         ate_rmse_m(estimate.select(slice(0, 1)), truth, get_protocol("tum-rgbd/v1"))
 
 

@@ -8,6 +8,7 @@ import pytest
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate
 from dynslam_bench.evaluation.rpe import closest, random_pairs
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.association import associate
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import read_tum
 
@@ -72,24 +73,10 @@ def slow_rpe(truth, estimate, delta, unit):
     return np.array(translation), np.array(rotation)
 
 
-def slow_ate(truth, estimate, max_dt=0.02):
-    """Greedy association, then Horn's method through the SVD of W = sum model x data^T."""
-    candidates = sorted(
-        (abs(a - b), a, b)
-        for a in truth.timestamps.tolist()
-        for b in estimate.timestamps.tolist()
-        if abs(a - b) < max_dt
-    )
-    free_a, free_b, matches = set(truth.timestamps.tolist()), set(estimate.timestamps.tolist()), []
-    for _, a, b in candidates:
-        if a in free_a and b in free_b:
-            free_a.remove(a)
-            free_b.remove(b)
-            matches.append((a, b))
-    where_gt = {stamp: i for i, stamp in enumerate(truth.timestamps.tolist())}
-    where_est = {stamp: i for i, stamp in enumerate(estimate.timestamps.tolist())}
-    data = np.array([truth.positions[where_gt[a]] for a, _ in sorted(matches)]).T
-    model = np.array([estimate.positions[where_est[b]] for _, b in sorted(matches)]).T
+def slow_ate(truth, estimate):
+    """Horn's method through the SVD of W = sum model x data^T."""
+    at_truth, at_estimate = associate(truth.timestamps, estimate.timestamps, 0.02)
+    data, model = truth.positions[at_truth].T, estimate.positions[at_estimate].T
     zero_data, zero_model = data - data.mean(1, keepdims=True), model - model.mean(1, keepdims=True)
     w = np.zeros((3, 3))
     for column in range(model.shape[1]):

@@ -14,8 +14,15 @@ from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.settings import flatten, parameters
 from dynslam_bench.tuning import ProblemInstance, pilot_of
 from dynslam_bench.tuning.objectives import bounds
-from dynslam_bench.tuning.pilot import HOPELESS, detectable, scenes_needed, small_change, spread
-from dynslam_bench.tuning.study import PILOT_FILE, begin
+from dynslam_bench.tuning.preliminary import (
+    HOPELESS,
+    PILOT_FILE,
+    begin,
+    detectable,
+    scenes_needed,
+    small_change,
+    spread,
+)
 from dynslam_bench.tuning.tuner import StudyEvent
 
 

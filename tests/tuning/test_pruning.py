@@ -21,7 +21,7 @@ from simulated import SimulatedTuner, make_spec, nothing, valley
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning import finish
 from dynslam_bench.tuning.objectives import ACCURACY
-from dynslam_bench.tuning.pruning import is_dominated, step_name, steps
+from dynslam_bench.tuning.samplers import is_dominated, step_name, steps
 from dynslam_bench.tuning.trials import errors_of
 from dynslam_bench.tuning.tuner import CRASHED_WORKER, StudyEvent
 

@@ -17,8 +17,7 @@ from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.settings import flatten, parameters
 from dynslam_bench.tuning import Outcome, ProblemInstance, screen_study
 from dynslam_bench.tuning.evaluate import InstanceFailedError
-from dynslam_bench.tuning.screening import KEPT, plan, size_of, stepped
-from dynslam_bench.tuning.study import SCREENING_FILE
+from dynslam_bench.tuning.preliminary import KEPT, SCREENING_FILE, plan, size_of, stepped
 
 SPACE = parameters(ToySettings)
 BASE = flatten(ToySettings())
@@ -82,9 +81,9 @@ def test_chaos_alone_is_hardly_ever_kept_and_a_dead_setting_never() -> None:
 
 
 def test_points_and_steps_stay_in_the_ranges() -> None:
-    for point in plan(SPACE, BASE, 6, 0):
+    for start, steps in plan(SPACE, BASE, 6, 0):
         for parameter in SPACE:
-            before, after = point.base[parameter.name], point.steps[parameter.name]
+            before, after = start[parameter.name], steps[parameter.name]
             assert before != after
             if parameter.low is not None:
                 assert parameter.low <= before <= parameter.high and parameter.low <= after <= parameter.high

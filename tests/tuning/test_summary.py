@@ -149,9 +149,9 @@ def test_a_study_is_a_frame(folders: list[str], tmp_path: Path) -> None:
     summary = finish(tuner)
     tuner.study.set_user_attr("command", ["/home/x/venv/bin/dynslam-bench", "tune", "run", "my study.toml"])
     page = write_page(tuner, summary).read_text().replace("&#39;", "'")
-    assert summary.verdict in page and "dynslam-bench tune run 'my study.toml'" in page
+    assert summary.conclusion in page and "dynslam-bench tune run 'my study.toml'" in page
     assert ("Use them" in page) == summary.improves
-    assert StudySummary.read(tuner.folder / "summary.json").verdict == summary.conclusion
+    assert StudySummary.read(tuner.folder / "summary.json").conclusion == summary.conclusion
 
     frame, trials = Study.open(tuner.folder).frame(), tuner.study.get_trials()
     assert frame.equals(Study.open(spec, tmp_path).frame()) and len(trials) == 5

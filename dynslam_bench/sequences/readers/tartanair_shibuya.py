@@ -14,7 +14,7 @@ from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import read_stamped_table, read_table
+from dynslam_bench.geometry.trajectory_files import read_stamps, read_table
 from dynslam_bench.sequences.readers.lists import Contents, find_names, stamped
 
 FOCAL = 772.5483399593904
@@ -36,7 +36,7 @@ def read(folder: Path, fps: float | None = None) -> Contents:
         TrajectoryError: The stamps or poses are malformed.
     """
     colour, depth = find_names(folder, "image_0/*.[pj][np]g"), find_names(folder, "depth_0/*.npy")
-    stamps = read_stamped_table(folder / "times.txt", 1, "timestamp")[1]
+    stamps = read_stamps(folder / "times.txt")
     try:
         rows = read_table(folder / "gt_pose.txt", 8, "timestamp tx ty tz qx qy qz qw")[:, 1:]
     except TrajectoryError:

@@ -1,21 +1,106 @@
-"""Association of an estimate with the ground truth, with the reasons for what was dropped."""
+"""Two trajectories prepared, associated and aligned under a protocol: what every metric is computed from."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record
+from dynslam_bench.evaluation.alignment import Similarity, align
+from dynslam_bench.evaluation.prepare import compared
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """An estimate beside the ground truth.
+
+    Attributes:
+        protocol: How they are compared.
+        estimate: All poses that take part, also those without ground truth (TUM's relative errors need them).
+        ground_truth: All true poses, corrected as the protocol has it.
+        estimate_index: Associated poses of the estimate ``[K]``.
+        truth_index: Their counterparts in the ground truth ``[K]``.
+        association: What was dropped.
+        similarity: The alignment.
+        input_timestamps: Stamps in seconds of all input frames; None where they are not known.
+        diagnostics: One line for each fact that the numbers depend on; metrics add to it.
+        n_pairs_rpe: Pairs of poses of each relative error; `relative_metrics` fills it in.
+    """
+
+    protocol: Protocol
+    estimate: Trajectory
+    ground_truth: Trajectory
+    estimate_index: Index
+    truth_index: Index
+    association: AssociationRecord
+    similarity: Similarity
+    input_timestamps: ArrayLike | None
+    diagnostics: list[str]
+    n_pairs_rpe: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def stamps(self) -> Array:
+        """Stamps of the associated poses of the estimate in seconds ``[K]``."""
+        return self.estimate.timestamps[self.estimate_index]
+
+    @cached_property
+    def aligned(self) -> Array:
+        """Associated poses of the estimate, aligned ``[K, 4, 4]``."""
+        return self.similarity.apply(self.estimate.T_world_cam[self.estimate_index])
+
+    @cached_property
+    def truth(self) -> Array:
+        """The true poses that they are compared with ``[K, 4, 4]``."""
+        return self.ground_truth.T_world_cam[self.truth_index]
+
+
+def compare(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    protocol: Protocol,
+    input_timestamps: ArrayLike | None = None,
+    diagnostics: list[str] | None = None,
+) -> Comparison:
+    """Prepare, associate and align an estimate; what the protocol makes of lost frames is left out.
+
+    Args:
+        estimate: Estimated camera-to-world poses.
+        ground_truth: True poses.
+        protocol: The protocol.
+        input_timestamps: Stamps in seconds of all input frames.
+        diagnostics: Takes a line on everything that the numbers depend on.
+
+    Raises:
+        EvaluationError: Fewer than two poses have ground truth (with the measured gaps).
+    """
+    diagnostics = [] if diagnostics is None else diagnostics
+    estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
+    estimate_index, truth_index, association = match(estimate, ground_truth, protocol)
+    dropped = association.describe(protocol.max_dt)
+    if len(estimate_index) < 2:
+        found = f"only {len(estimate_index)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s"
+        raise EvaluationError(f"{found}, at least 2 are needed", dropped)
+    if dropped:
+        diagnostics.append(dropped)
+    matched, truth = estimate.T_world_cam[estimate_index], ground_truth.T_world_cam[truth_index]
+    similarity = align(matched, truth, protocol.alignment)
+    return Comparison(
+        protocol, estimate, ground_truth, estimate_index, truth_index, association, similarity, input_timestamps,
+        diagnostics,
+    )  # fmt: skip
+
+
+# Association of the two, with the reasons for what was dropped.
 
 
 class AssociationRecord(Record):
@@ -42,48 +127,30 @@ class AssociationRecord(Record):
     largest_hole_s: float
     hole_at_s: float
 
-
-@dataclass(frozen=True, eq=False)
-class Association:
-    """Which estimated pose is compared with which true pose.
-
-    Attributes:
-        estimate: Indices into the estimate ``[K]``, ascending.
-        ground_truth: Indices into the ground truth ``[K]``.
-        record: What was dropped.
-    """
-
-    estimate: Index
-    ground_truth: Index
-    record: AssociationRecord
-
-    def __len__(self) -> int:
-        return len(self.estimate)
-
     def describe(self, max_dt: float) -> str:
         """One line with the measured numbers; empty if nothing was dropped."""
-        record = self.record
-        dropped = record.n_estimate - len(np.unique(self.estimate))
+        dropped = self.outside + self.in_holes + self.taken
         if not dropped:
             return ""
         reasons = [
-            (record.outside, f"{record.outside} outside the ground truth's time"),
-            (record.in_holes, f"{record.in_holes} in holes of it"),
-            (record.taken, f"{record.taken} not chosen, a closer one was there"),
+            (self.outside, f"{self.outside} outside the ground truth's time"),
+            (self.in_holes, f"{self.in_holes} in holes of it"),
+            (self.taken, f"{self.taken} not chosen, a closer one was there"),
         ]
         return (
-            f"no ground truth within {max_dt:g} s for {dropped} of {record.n_estimate} poses ("
+            f"no ground truth within {max_dt:g} s for {dropped} of {self.n_estimate} poses ("
             + ", ".join(text for count, text in reasons if count)
-            + f"; largest hole {record.largest_hole_s:.2f} s at t={record.hole_at_s:.6f}; median |dt| "
-            f"{record.median_dt_s:.4f} s)"
+            + f"; largest hole {self.largest_hole_s:.2f} s at t={self.hole_at_s:.6f}; median |dt| "
+            f"{self.median_dt_s:.4f} s)"
         )
 
 
-def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> Association:
+def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> tuple[Index, Index, AssociationRecord]:
     """Associate two trajectories under a protocol.
 
     Returns:
-        The association; its arrays are read-only, as equal stamps share one result.
+        Indices into the estimate and into the ground truth ``[K]``, ascending in the estimate, and what was dropped.
+        The arrays are read-only, as equal stamps share one result.
 
     Raises:
         EvaluationError: A trajectory is empty or no pair is close enough; the message carries the measured gap.
@@ -96,7 +163,9 @@ def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) ->
 
 
 @lru_cache(maxsize=256)
-def _matched(estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, one_to_one: bool) -> Association:
+def _matched(
+    estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, one_to_one: bool
+) -> tuple[Index, Index, AssociationRecord]:
     """`match`, once for equal stamps."""
     t_est, t_gt = np.frombuffer(estimate), np.frombuffer(ground_truth)
     if one_to_one:
@@ -110,7 +179,7 @@ def _matched(estimate: bytes, ground_truth: bytes, max_dt: float, strict: bool, 
     if not len(index_est):
         raise _nothing_matched(t_est, t_gt, max_dt)
     index_est.flags.writeable = index_gt.flags.writeable = False
-    return Association(index_est, index_gt, _record(t_est, t_gt, index_est, index_gt, max_dt, strict=strict))
+    return index_est, index_gt, _record(t_est, t_gt, index_est, index_gt, max_dt, strict=strict)
 
 
 def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) -> tuple[Index, Index]:
@@ -166,7 +235,6 @@ def _nothing_matched(t_est: Array, t_gt: Array, max_dt: float) -> EvaluationErro
         f"away; the estimate covers {t_est[0]:.3f} to {t_est[-1]:.3f} s, "
         f"the ground truth {t_gt[0]:.3f} to {t_gt[-1]:.3f} s"
     )
-    ratio = np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9)
-    if ratio > 1e5 or ratio < 1e-5:
-        return EvaluationError(message, "are the stamps of one file in nanoseconds or frame numbers?")
-    return EvaluationError(message, "check that the files belong together and that their clocks agree")
+    other_unit = not 1e-5 <= np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9) <= 1e5
+    hint = "are the stamps of one file in nanoseconds or frame numbers?"
+    return EvaluationError(message, hint if other_unit else "do the files belong together, and do their clocks agree?")
