@@ -9,6 +9,7 @@ from typing import Annotated, Optional
 import typer
 
 from dynslam_bench.cli import (
+    demo,
     interrupted,
     leave_interrupted,
     maintenance,
@@ -37,7 +38,7 @@ app = typer.Typer(
     add_completion=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command(rich_help_panel=START)(reports.demo)
+app.command(rich_help_panel=START)(demo.demo)
 app.add_typer(sequences.app, name="sequences", rich_help_panel=START)
 app.add_typer(trackers.app, name="trackers", rich_help_panel=START)
 running.add(app)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Annotated, Any, Optional, get_args
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
@@ -57,18 +58,24 @@ def _help_all(ctx: typer.Context, on: bool) -> None:
         raise typer.Exit
 
 
-def complete_trackers() -> Iterable[str]:
+def names_of(place: str) -> Callable[[], list[str]]:
+    """Shell completion by the names that an object holds, or a function of the package returns, loaded only then."""
+
+    def complete() -> list[str]:
+        names = resolve_name(f"dynslam_bench.{place}")
+        return list(names() if callable(names) else names)
+
+    return complete
+
+
+complete_sequences = names_of("sequences.catalogue:sequence_ids")
+
+
+def complete_trackers() -> list[str]:
     """Trackers by their id."""
     from dynslam_bench.trackers import TRACKERS
 
-    return [entry.spec.id for entry in TRACKERS.all()]
-
-
-def complete_sequences() -> Iterable[str]:
-    """Ids of the catalogue and of rendered sequences."""
-    from dynslam_bench.sequences.catalogue import summaries
-
-    return [summary.id for summary in summaries()]
+    return [tracker.spec.id for tracker in TRACKERS.all()]
 
 
 def complete_settings(ctx: typer.Context, incomplete: str) -> Iterable[str]:
@@ -89,31 +96,8 @@ def complete_presets(ctx: typer.Context) -> Iterable[str]:
     return [] if spec is None else list(spec.presets)
 
 
-def complete_suites() -> Iterable[str]:
-    """Names of the shipped suites, and TOML files."""
-    from dynslam_bench.suites import suite_names
-
-    return [*suite_names(), *map(str, Path().glob("*.toml"))]
-
-
-def complete_formats() -> Iterable[str]:
-    """Formats that `export` writes."""
-    from dynslam_bench.runs.exchange.export import FORMATS
-
-    return list(FORMATS)
-
-
-def complete_protocols() -> Iterable[str]:
-    """Protocols by their id."""
-    from dynslam_bench.evaluation.protocol import PROTOCOLS
-
-    return list(PROTOCOLS)
-
-
-def complete_statuses() -> Iterable[str]:
+def complete_statuses() -> tuple[str, ...]:
     """The statuses of runs."""
-    from typing import get_args
-
     from dynslam_bench.runs.record import Status
 
     return get_args(Status)
@@ -211,7 +195,7 @@ ProtocolId = Annotated[
         "--protocol",
         help="How to evaluate; see `protocols list`.",
         rich_help_panel=OUTPUT,
-        autocompletion=complete_protocols,
+        autocompletion=names_of("evaluation.protocol:PROTOCOLS"),
     ),
 ]
 Retry = Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
 import typer
 
@@ -17,7 +17,7 @@ from dynslam_bench.cli.options import (
     complete_sequences,
     gather_settings,
 )
-from dynslam_bench.cli.output import present, progress, write, write_fields, write_table
+from dynslam_bench.cli.output import fields, present, progress, table, write
 
 TrainingAssignments = Annotated[
     Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
@@ -63,8 +63,8 @@ def train(
             resume=resume,
             progress=lambda state: advance(state.done, state.total),
         )
-    facts = {"weights": str(result.best), "step": result.step, "iou": result.iou, "ended": result.stopped}
-    present(facts, lambda: write_fields(facts))
+    facts = {"weights": result.best, "step": result.step, "iou": result.iou, "ended": result.stopped}
+    present(facts, fields(facts))
 
 
 @app.command()
@@ -97,18 +97,13 @@ def evaluate(
             limit=limit,
             progress=advance,
         )
-    values: dict[str, Any] = score.model_dump(mode="json")
-    classes = values.pop("classes")
-
-    def show() -> None:
-        write_fields(values)
-        if classes:
-            write()
-            columns = sorted({key for quality in classes.values() for key in quality})
-            rows = [(name, *(quality.get(key) for key in columns)) for name, quality in classes.items()]
-            write_table(("class", *columns), rows)
-
-    present(score, show)
+    lines = [fields(score.model_dump(exclude={"classes"}))]
+    if score.classes:
+        qualities = {name: quality.model_dump() for name, quality in score.classes.items()}
+        columns = sorted({key for quality in qualities.values() for key in quality})
+        rows = [(name, *(quality.get(key) for key in columns)) for name, quality in qualities.items()]
+        lines += ["", table(("class", *columns), rows)]
+    present(score, *lines)
 
 
 @app.command()
@@ -154,9 +149,9 @@ def export(
     chosen = weights_of(source, side)
     done = export_network(chosen.path, output, size=parse_size(size), side=chosen.side)
     facts = {
-        "file": str(done.path),
+        "file": done.path,
         "megabytes": round(done.megabytes, 1),
         "input": f"image [1, 3, {done.size[0]}, {done.size[1]}], RGB in [0, 1]",
         "classes": len(done.classes),
     }
-    present(facts, lambda: write_fields(facts))
+    present(facts, fields(facts))

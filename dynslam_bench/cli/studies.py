@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
 from dynslam_bench.cli.options import AsJson, Jobs, Results
-from dynslam_bench.cli.output import Advance, note, present, progress, write, write_fields, write_table
+from dynslam_bench.cli.output import Advance, fields, note, present, progress, table, write
 from dynslam_bench.cli.running import event_text
 
 if TYPE_CHECKING:
@@ -41,17 +40,14 @@ def space(study: Study, as_json: AsJson = False) -> None:
     sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
     parameters = search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
 
-    def show() -> None:
-        rows = []
-        for parameter in parameters:
-            span = ", ".join(map(str, parameter.choices)) or f"{parameter.low:g} to {parameter.high:g}"
-            span += " (log)" * (parameter.scale == "log")
-            conditions = [f"{name} = {' or '.join(map(str, values))}" for name, values in parameter.when]
-            only_if = " and ".join(conditions)
-            rows.append((parameter.name, span, parameter.default, parameter.unit, only_if, parameter.meaning))
-        write_table(("setting", "range", "default", "unit", "only if", "meaning"), rows)
-
-    present([asdict(parameter) for parameter in parameters], show)
+    rows = []
+    for parameter in parameters:
+        span = ", ".join(map(str, parameter.choices)) or f"{parameter.low:g} to {parameter.high:g}"
+        span += " (log)" * (parameter.scale == "log")
+        conditions = [f"{name} = {' or '.join(map(str, values))}" for name, values in parameter.when]
+        only_if = " and ".join(conditions)
+        rows.append((parameter.name, span, parameter.default, parameter.unit, only_if, parameter.meaning))
+    present(parameters, table(("setting", "range", "default", "unit", "only if", "meaning"), rows))
 
 
 @app.command()
@@ -61,14 +57,9 @@ def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_j
 
     outcome = pilot_of(Tuner(read_study(study), results), jobs=jobs)
 
-    def show() -> None:
-        write(f"{outcome.sentence}.\n")
-        rows = [(f"{100 * n.effect:.0f} %", n.scenes, n.instances, f"{n.minutes:.0f}") for n in outcome.needs]
-        write_table(("gain", "scenes", "runs of one configuration", "minutes"), rows)
-        if outcome.warning:
-            write(f"\nWarning: {outcome.warning}.")
-
-    present(outcome, show)
+    rows = [(f"{100 * n.effect:.0f} %", n.scenes, n.instances, f"{n.minutes:.0f}") for n in outcome.needs]
+    lines = [f"{outcome.sentence}.\n", table(("gain", "scenes", "runs of one configuration", "minutes"), rows)]
+    present(outcome, *lines, *([f"\nWarning: {outcome.warning}."] if outcome.warning else []))
 
 
 @app.command()
@@ -87,23 +78,22 @@ def screen(
     with progress(f"screening {tuner.spec.name}") as advance:
         outcome = screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
 
-    def show() -> None:
-        verdicts = {name: "kept" for name in outcome.kept} | dict.fromkeys(outcome.dead, "no effect")
-        rows = [
-            (e.name, e.objective, f"{e.size:.3f}", f"[{e.low:.3f}, {e.high:.3f}]", verdicts.get(e.name, ""))
-            for e in outcome.effects
-        ]
-        write_table(("setting", "of", "effect (log ratio)", "90 % interval", ""), rows)
-        write()
-        for name, reason in outcome.failed.items():
-            write(f"{name} broke a run: {reason}")
-        if outcome.kept:
-            write(f"[space]\ninclude = [{', '.join(json.dumps(name) for name in outcome.kept)}]")
-        else:
-            extent = f"these {outcome.instances} instances ({outcome.runs} runs)"
-            write(f"No setting matters more than chance on {extent}: try more instances.")
-
-    present(outcome, show)
+    verdicts = {name: "kept" for name in outcome.kept} | dict.fromkeys(outcome.dead, "no effect")
+    rows = [
+        (e.name, e.objective, f"{e.size:.3f}", f"[{e.low:.3f}, {e.high:.3f}]", verdicts.get(e.name, ""))
+        for e in outcome.effects
+    ]
+    extent = f"these {outcome.instances} instances ({outcome.runs} runs)"
+    advice = f"No setting matters more than chance on {extent}: try more instances."
+    if outcome.kept:
+        advice = f"[space]\ninclude = [{', '.join(json.dumps(name) for name in outcome.kept)}]"
+    present(
+        outcome,
+        table(("setting", "of", "effect (log ratio)", "90 % interval", ""), rows),
+        "",
+        *(f"{name} broke a run: {reason}" for name, reason in outcome.failed.items()),
+        advice,
+    )
 
 
 @app.command()
@@ -148,18 +138,12 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
     tuner = Tuner(read_study(study), results, reading=True)
     facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.spec.trials}
     facts |= count_states(tuner.study)
-    leading, settings = best_trials(tuner.study, 1), {}
-    if leading:
-        facts |= {"best_trial": leading[0].number, "best_values": list(leading[0].values)}
-        settings = {"best_settings": leading[0].params}
-
-    def show() -> None:
-        write_fields(facts)
-        if leading:
-            write()
-            write_table(("setting", "value"), list(leading[0].params.items()))
-
-    present(facts | settings, show)
+    settings: dict[str, Any] = {}
+    for trial in best_trials(tuner.study, 1):
+        facts |= {"best_trial": trial.number, "best_values": trial.values}
+        settings = trial.params
+    lines = ["", table(("setting", "value"), list(settings.items()))] if settings else []
+    present(facts | {"best_settings": settings}, fields(facts), *lines)
 
 
 @app.command()
@@ -241,15 +225,8 @@ def show_summary(tuner: Tuner, summary: StudySummary, page: Path) -> None:
     from dynslam_bench.tuning.splits import seen_note
 
     preset = tuner.folder / "best.toml"
-
-    def show() -> None:
-        write(summary.conclusion)
-        if caution := seen_note(summary.seen):
-            write(caution)
-        write()
-        if summary.chosen is not None:
-            write_table(("setting", "value"), list(summary.candidates[0].params.items()))
-            write()
-        write(f"preset: {preset}\npage:   {page}")
-
-    present({"summary": summary, "page": page, "preset": preset}, show)
+    lines = [summary.conclusion, *filter(None, [seen_note(summary.seen)]), ""]
+    if summary.chosen is not None:
+        lines += [table(("setting", "value"), list(summary.candidates[0].params.items())), ""]
+    lines.append(f"preset: {preset}\npage:   {page}")
+    present({"summary": summary, "page": page, "preset": preset}, *lines)
