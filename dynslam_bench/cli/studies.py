@@ -26,7 +26,7 @@ def silence_optuna() -> None:
     """Studies: tune a tracker's settings through its environment."""  # the group's help
     import optuna
 
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
 
 
