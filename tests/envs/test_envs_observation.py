@@ -11,14 +11,14 @@ from envs_toys import CAMERA, TARGET, ToySequence, images
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.envs import STATS_LAYOUT, SlamEnv
-from dynslam_bench.envs.spaces import MAX_DEPTH_M, ObservationContext, stats_observation, stats_space
+from dynslam_bench.envs.spaces import MAX_DEPTH_M, stats_observation, stats_space
 from dynslam_bench.geometry import se3
 
 FRAME = Frame(3, 1.0, *images(3))
 
 
 def observe(result: TrackResult, frame: Frame = FRAME, motion: np.ndarray | None = None) -> dict[str, float]:
-    vector = stats_observation(frame, result, ObservationContext(3, 6, 0, motion))
+    vector = stats_observation(frame, result, progress=0.5, lost_streak=0, T_prev_cur=motion)
     assert vector in stats_space() and np.isfinite(vector).all()
     return dict(zip((name for name, _ in STATS_LAYOUT), vector.tolist(), strict=True))
 
