@@ -13,9 +13,8 @@ from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
 from dynslam_bench.core.errors import SequenceError, SettingsError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.stamps import refuse_close
-from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
-from dynslam_bench.sequences.settings import PreprocessingSettings
-from dynslam_bench.sequences.view import SequenceView
+from dynslam_bench.sequences import PreprocessingSettings, SequenceView, open_sequence
+from dynslam_bench.sequences.catalogue import parse_frames
 
 Frames = PySequence[int | None] | str | None
 """Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""

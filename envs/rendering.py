@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, Sequence
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Frame, Sequence, TrackResult
 from dynslam_bench.envs.episode import Episode
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError

@@ -12,10 +12,10 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts import Sequence as FrameSequence
+from dynslam_bench.contracts import Tracker, TrackerContext, TrackerSpec, Trajectory
 from dynslam_bench.contracts.checks import check_sensors, check_trajectory, tracker_code
-from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.contracts.sequence import exact_stamps
-from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
@@ -38,10 +38,8 @@ from dynslam_bench.envs.spaces import (
     stats_observation,
     stats_space,
 )
-from dynslam_bench.evaluation.online import OnlineError, OnlineSample
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.evaluation import OnlineError, OnlineSample, Protocol, get_protocol
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
@@ -150,7 +148,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._part = (data_root, camera, frames, stride)
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
-        self._tracker_key: object = None
         self._use_settings(settings)
         self._use_sequence(sequence)
         segmentation_source(self.settings, self.sequence, fetch=False)
@@ -318,7 +315,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def close(self) -> None:
         """Close the tracker; the environment may be reset again."""
-        tracker, self._tracker, self._tracker_key = self._tracker, None, None
+        tracker, self._tracker = self._tracker, None
         close = getattr(tracker, "close", None)
         if close is not None:
             with tracker_code():
@@ -371,6 +368,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         unknown = sorted(set(options) - {"sequence", "settings"})
         if unknown:
             raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings")
+        if options:
+            self.close()  # the next tracker is built for other settings or another sequence
         preprocessing, camera = preprocessing_of(self.settings), self.sequence.camera
         if "settings" in options:
             changes = options["settings"]
@@ -385,10 +384,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 raise SequenceError(f"images of {new_size} pixels do not fit the observation space of {size}")
 
     def _ready_tracker(self) -> Tracker:
-        """The tracker for the current settings and sequence; rebuilt only if one of them changed."""
-        key = (self.settings, self.sequence)
-        if self._tracker is None or self._tracker_key != key:
-            self.close()
+        """The tracker for the current settings and sequence."""
+        if self._tracker is None:
             context = TrackerContext(
                 sequence_id=self.sequence.id,
                 masks=self.sequence.masks,
@@ -399,7 +396,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             )
             with tracker_code():
                 self._tracker = build_tracker(self.tracker_spec, self.settings, context)
-            self._tracker_key = key
             if self._actions.parameters and not isinstance(self._tracker, Reconfigurable):
                 raise TrackerError(
                     f"tracker '{self.tracker_spec.id}' cannot change its settings in mid-episode",

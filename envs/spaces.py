@@ -11,8 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Camera, Frame, TrackResult
 from dynslam_bench.core.errors import SettingsError, did_you_mean
 from dynslam_bench.core.settings import (
     Parameter,
@@ -26,7 +25,6 @@ from dynslam_bench.core.settings import (
 )
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
 
 _ONLY = spaces.Discrete(1)
 """The action space without controlled settings; for membership alone, since each environment seeds its own."""

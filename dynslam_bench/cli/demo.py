@@ -32,8 +32,8 @@ STATIC, CULLING = "orb-slam2", {"mask-rcnn": "masks of people", "emfoa-oft": "ma
 """The tracker without culling, and those with it."""
 MIN_FACTOR = 1.5
 """Single runs scatter by some 30 %: a smaller ratio of errors shows nothing."""
-KERNEL_FRAMES, KERNEL_POINTS = 12, 64
-"""Frames and points with which every kernel is used once: keyframes, bundle adjustment, all phases of the flow."""
+KERNEL_FRAMES = 12
+"""Frames in which every kernel is used once: keyframes, bundle adjustment, all phases of the flow."""
 
 
 def demo(
@@ -140,62 +140,29 @@ def tell(rows: Iterable[RunRow]) -> list[str]:
 
 def compile_kernels() -> None:
     """Use all kernels once, so that they lie compiled beside their sources (or in the user's cache folder)."""
+    from dynslam_bench.envs import SlamEnv
     from dynslam_bench.sequences.synthetic import open_synthetic
+    from dynslam_bench.testing import CornerSequence
 
     open_synthetic("synthetic/walking_xyz?frames=2", None)[0]
-    compile_flow()
-    compile_tracking()
-
-
-def compile_flow() -> None:
-    """Use the kernels of the flow of `emfoa-oft`, about half of all that track."""
-    import numpy as np
-
-    from dynslam_bench.flow.registry import build_flow
-    from dynslam_bench.testing import CornerSequence
-    from dynslam_bench.trackers.systems.emfoa_oft import EmfoaOftSettings
-
-    scene = CornerSequence(2)
-    flow = build_flow(EmfoaOftSettings().flow)
-    target, reference = (flow.prepare(np.ascontiguousarray(scene[index].rgb[:, :, 1])) for index in (0, 1))
-    size = scene.camera.width - 1, scene.camera.height - 1
-    points = (np.random.default_rng(0).random((KERNEL_POINTS, 2)) * size).astype(np.float32)
-    flow.track(reference, target, points, guess=points)
-
-
-def compile_tracking() -> None:
-    """Use the kernels of features and of the map."""
-    from dynslam_bench.envs import SlamEnv
-    from dynslam_bench.testing import CornerSequence
-
-    env = SlamEnv(CornerSequence(KERNEL_FRAMES), "orb-slam2")
+    env = SlamEnv(CornerSequence(KERNEL_FRAMES), STUDIED)
     env.reset(seed=0)
     for _ in range(KERNEL_FRAMES - 1):
         env.step(env.neutral_action)
-    env.close()
 
 
 @contextmanager
 def compiled_ahead() -> Iterator[None]:
-    """Compile the kernels of flow and tracking in two processes while the body runs; stop them if the body fails.
+    """Compile the kernels in a process while the body runs; stop it if the body fails.
 
     Two runs at a time would otherwise compile the same kernels twice. Kernels that cannot be compiled here are left to
     the first runs, which report it.
     """
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import {work.__name__} as work; work()"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for work in (compile_flow, compile_tracking)
-    ]
+    command = [sys.executable, "-c", f"from {__name__} import compile_kernels; compile_kernels()"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield
-        for process in processes:
-            process.wait()
+        process.wait()
     finally:
-        for process in processes:
-            process.kill()
-            process.wait()
+        process.kill()
+        process.wait()

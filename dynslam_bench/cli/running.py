@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from dynslam_bench import runs
 from dynslam_bench.cli import options as opts
 from dynslam_bench.cli.output import (
     SOME_RUNS_FAILED,
@@ -85,7 +86,6 @@ def run(
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
     from dynslam_bench.api import checked, make_specs, run_specs
-    from dynslam_bench.runs import Limits
     from dynslam_bench.runs.many import pictures_asked
 
     overrides = opts.gather_settings(assignments, settings)
@@ -98,7 +98,7 @@ def run(
         frames=frames, stride=stride, camera=camera, data_root=None if data_root is None else str(data_root),
         device=device, threads=threads, realtime=realtime, drop_share=drop, cache=cache, video=video, sheet=sheet,
         rrd=rrd, save_map=save_map, label=label, degrade=opts.gather_settings(degrade),
-        limits=checked(Limits, time_s=time_limit, memory_mb=memory_limit),
+        limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )  # fmt: skip
     make = partial(run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol)
     finish(make, results, jobs, protocol, yes, pictures_asked(specs[0]))
@@ -164,12 +164,11 @@ def finish(
     pictures: Sequence[str] = (),
 ) -> None:
     """Make runs, show them, and exit with 3 if some failed, were lost or cannot be made, or lack a requested map."""
-    from dynslam_bench.runs import RunStore
     from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
     from dynslam_bench.segmentation.networks.checkpoints import fetch_checkpoint
     from dynslam_bench.slam.map_files import MAP_FILE
 
-    store = RunStore(results)
+    store = runs.RunStore(results)
     watched = WatchedRuns(store, jobs, protocol)
     try:
         records = watched.make(make)

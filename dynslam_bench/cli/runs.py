@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from dynslam_bench import runs as stored
 from dynslam_bench.cli.options import AsJson, ProtocolId, Results, complete_statuses
 from dynslam_bench.cli.output import announce, fields, json_mode, present, progress, table, warn, write
+from dynslam_bench.core.errors import RunError, did_you_mean
 from dynslam_bench.core.toml import label_text
 
 if TYPE_CHECKING:
@@ -48,10 +50,7 @@ app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
 def _open(results: Path) -> RunStore:
     """The store of a results folder that exists."""
-    from dynslam_bench.core.errors import RunError
-    from dynslam_bench.runs import RunStore
-
-    store = RunStore(results)
+    store = stored.RunStore(results)
     if not store.runs.is_dir():
         raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     return store
@@ -68,7 +67,6 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List the runs of a results folder, oldest first."""
-    from dynslam_bench.core.errors import RunError, did_you_mean
     from dynslam_bench.runs.store import list_runs
 
     if status not in (None, *complete_statuses()):
@@ -89,11 +87,9 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Show everything about a run."""
-    from dynslam_bench.runs import RunStore, score
-
-    store = RunStore(results)
+    store = stored.RunStore(results)
     record = store.read(run)
-    metrics = score(store, record, protocol)
+    metrics = stored.score(store, record, protocol)
     lines = [fields(run_facts(store, record))]
     if record.timings:
         stages = record.timings.items()
@@ -137,12 +133,9 @@ def rm(
     failed: Annotated[bool, typer.Option("--failed", help="All runs that failed.")] = False,
 ) -> None:
     """Delete runs and their metrics."""
-    from dynslam_bench.core.errors import RunError
-    from dynslam_bench.runs import RunStore
-
     if not runs and not failed:
         raise RunError("no run was named", "name ids, or --failed")
-    store = _open(results) if failed else RunStore(results)
+    store = _open(results) if failed else stored.RunStore(results)
     chosen = [store.find(run) for run in runs or ()]
     if failed:
         chosen += [record.run_id for record in store.all()[0] if record.failed]
@@ -190,11 +183,8 @@ def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
 
 def closed_loops(store: RunStore, run_id: str) -> int | None:
     """How many loops a run had closed at its end; None without that column, or if its table is damaged."""
-    from dynslam_bench.core.errors import RunError
-    from dynslam_bench.runs import load_frames
-
     try:
-        frames = load_frames(run_id, store.root)
+        frames = stored.load_frames(run_id, store.root)
     except RunError:
         return None
     counts = frames["stat_loops"].dropna() if "stat_loops" in frames else ()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from dynslam_bench import tuning
 from dynslam_bench.cli.options import AsJson, Jobs, Results
 from dynslam_bench.cli.output import Advance, fields, note, present, progress, table, write
 from dynslam_bench.cli.running import event_text
@@ -34,11 +35,10 @@ def silence_optuna() -> None:
 def space(study: Study, as_json: AsJson = False) -> None:
     """Show which settings a study tunes, and within which limits."""
     from dynslam_bench.trackers import TRACKERS
-    from dynslam_bench.tuning import read_study, search_space
 
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
-    parameters = search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
+    parameters = tuning.search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
 
     rows = []
     for parameter in parameters:
@@ -53,9 +53,7 @@ def space(study: Study, as_json: AsJson = False) -> None:
 @app.command()
 def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False) -> None:
     """Measure the spread of a study's instances: what it could show, and what 5, 10 and 20 % would take."""
-    from dynslam_bench.tuning import Tuner, pilot_of, read_study
-
-    outcome = pilot_of(Tuner(read_study(study), results), jobs=jobs)
+    outcome = tuning.pilot_of(tuning.Tuner(tuning.read_study(study), results), jobs=jobs)
 
     rows = [(f"{100 * n.effect:.0f} %", n.scenes, n.instances, f"{n.minutes:.0f}") for n in outcome.needs]
     lines = [f"{outcome.sentence}.\n", table(("gain", "scenes", "runs of one configuration", "minutes"), rows)]
@@ -72,11 +70,9 @@ def screen(
     as_json: AsJson = False,
 ) -> None:
     """Find which settings matter, before a study: one at a time, on several instances; print the few worth tuning."""
-    from dynslam_bench.tuning import Tuner, read_study, screen_study
-
-    tuner = Tuner(read_study(study), results)
+    tuner = tuning.Tuner(tuning.read_study(study), results)
     with progress(f"screening {tuner.spec.name}") as advance:
-        outcome = screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
+        outcome = tuning.screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
 
     verdicts = {name: "kept" for name in outcome.kept} | dict.fromkeys(outcome.dead, "no effect")
     rows = [
@@ -106,9 +102,8 @@ def run(
 ) -> None:
     """Run a study or continue it; then check the best on the held-out split, and write the page."""
     from dynslam_bench.api import tune
-    from dynslam_bench.tuning import read_study
 
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
         outcome = tune(
@@ -120,22 +115,19 @@ def run(
 @app.command()
 def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> None:
     """Only run trials of a study, beside other workers on the same storage."""
-    from dynslam_bench.tuning import read_study, run_study
-
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
-        run_study(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run)
+        tuning.run_study(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run)
     write(f"study '{spec.name}' has its {spec.trials} trials")
 
 
 @app.command()
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
-    from dynslam_bench.tuning import Tuner, read_study
     from dynslam_bench.tuning.trials import best_trials, count_states
 
-    tuner = Tuner(read_study(study), results, reading=True)
+    tuner = tuning.Tuner(tuning.read_study(study), results, reading=True)
     facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.spec.trials}
     facts |= count_states(tuner.study)
     settings: dict[str, Any] = {}
@@ -157,9 +149,8 @@ def best(
 ) -> None:
     """Write a study's settings as a preset that `run --settings` takes."""
     from dynslam_bench.core.records import write_atomic
-    from dynslam_bench.tuning import read_preset_text, read_study
 
-    text = read_preset_text(read_study(study), results, pick)
+    text = tuning.read_preset_text(tuning.read_study(study), results, pick)
     if output is not None:
         write_atomic(output, text)
     write(text.rstrip() if output is None else str(output))
@@ -168,21 +159,20 @@ def best(
 @app.command()
 def report(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Write a study's page; the best trials are checked first if they are not yet."""
-    from dynslam_bench.tuning import StudySummary, Tuner, finish, read_study, write_page
     from dynslam_bench.tuning.storage import study_folder
 
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     stored = study_folder(results, spec) / "summary.json"
-    tuner = Tuner(spec, results, reading=stored.is_file())
+    tuner = tuning.Tuner(spec, results, reading=stored.is_file())
     if stored.is_file():
-        summary = StudySummary.read(stored)
+        summary = tuning.StudySummary.read(stored)
     else:
         tuner.reference()
         with progress(f"checking the best of {spec.name}") as advance:
             bar = StudyBar(advance)
             tuner.on_run = bar.run
-            summary = finish(tuner, bar.note)
-    show_summary(tuner, summary, write_page(tuner, summary))
+            summary = tuning.finish(tuner, bar.note)
+    show_summary(tuner, summary, tuning.write_page(tuner, summary))
 
 
 class StudyBar:

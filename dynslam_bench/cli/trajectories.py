@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Optional
 
 import typer
 
+from dynslam_bench import runs
 from dynslam_bench.cli.options import (
     MEASURE,
     TRAJECTORY_FORMATS,
@@ -50,9 +51,8 @@ def evaluate(
     from dynslam_bench.evaluation import get_protocol, hints
     from dynslam_bench.evaluation.evaluate import evaluate_loaded
     from dynslam_bench.evaluation.prepare import truth_of_file
-    from dynslam_bench.runs import read_trajectory
 
-    loaded, truth = (read_trajectory(path, timestamps) for path in (estimate, ground_truth))
+    loaded, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
     result = evaluate_loaded(loaded, truth, protocol)
     prepared = truth_of_file(truth.trajectory, get_protocol(protocol))
     likely = hints(loaded.trajectory, prepared, protocol, notes=loaded.notes)
@@ -82,9 +82,8 @@ def compare(
 ) -> None:
     """Show how one trajectory scores under every protocol of the field."""
     from dynslam_bench.evaluation import compare_protocols
-    from dynslam_bench.runs import read_trajectory
 
-    estimated, truth = (read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth))
+    estimated, truth = (runs.read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth))
     scores = compare_protocols(estimated, truth, of_file=True)
     rows = [(score.metric, score.label, score.rmse_m, score.pairs, score.note) for score in scores]
     present(scores, table(("metric", "protocol", "rmse (m)", "pairs", "note"), rows))
@@ -112,10 +111,8 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Put a trajectory from elsewhere beside our own runs."""
-    from dynslam_bench.runs import RunStore, import_trajectory
-
-    store = RunStore(results)
-    record = import_trajectory(
+    store = runs.RunStore(results)
+    record = runs.import_trajectory(
         trajectory,
         tracker,
         sequence,
@@ -159,10 +156,8 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a stored run in a format of other tools, with its provenance beside it."""
-    from dynslam_bench.runs import export_run
-
     which: Literal["online", "final"] | None = None if online is None else ("online" if online else "final")
-    exported = export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
+    exported = runs.export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
     present(exported, *(str(exported.folder / name) for name in exported.files))
     for line in exported.notes:
         announce(line)

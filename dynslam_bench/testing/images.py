@@ -8,10 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
-from dynslam_bench.contracts.flow import FlowEstimator, FlowResult, stats_names_of
-from dynslam_bench.contracts.segmenter import Instances, Segmenter
-from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts import (
+    FeatureExtractor,
+    FlowEstimator,
+    FlowResult,
+    Frame,
+    Instances,
+    Keypoints,
+    Segmenter,
+    Sequence,
+)
+from dynslam_bench.contracts.features import MaskedExtractor
+from dynslam_bench.contracts.flow import stats_names_of
 from dynslam_bench.geometry.camera import inside
 from dynslam_bench.testing.report import (
     ConformanceReport,

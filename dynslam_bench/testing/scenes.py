@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource
+from dynslam_bench.contracts import Camera, Frame, FrameMasks, MaskSource, Trajectory
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
 
 
 class CornerSequence:
