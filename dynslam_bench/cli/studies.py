@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -27,7 +28,8 @@ def silence_optuna() -> None:
     """Studies: tune a tracker's settings through its environment."""  # the group's help
     import optuna
 
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    logging.getLogger("optuna.visualization").setLevel(logging.ERROR)  # it warns of trials that pruning never saw
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
 
 

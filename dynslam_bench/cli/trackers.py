@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -109,7 +110,7 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
 
 def _range(parameter: Parameter) -> str:
     if parameter.choices:
-        return " ".join(map(str, parameter.choices))
+        return shorten(", ".join(map(str, parameter.choices)), 50, placeholder=" ...")
     return f"{parameter.low:g} to {parameter.high:g}{' (log)' if parameter.scale == 'log' else ''}"
 
 

@@ -64,7 +64,7 @@ class ConformanceItem(pytest.Item):
 
     def reportinfo(self) -> tuple[str, None, str]:
         """Where the item stands, for pytest's output."""
-        return "dynslam-bench", None, self.name
+        return "dynslam-bench", None, f"check of {self.name}"
 
 
 def report_on(kind: str, subject: str) -> ConformanceReport:

@@ -1,7 +1,13 @@
 """The program as the tests of the command line call it, and a small sequence for it."""
 
+import sys
+from pathlib import Path
+
 import pytest
-from cli_helpers import write_folder
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "envs"))
+
+from envs_toys import write_sequence
 
 from dynslam_bench.cli import output
 from dynslam_bench.cli.app import start
@@ -28,4 +34,4 @@ def cli(capsys, monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     """The conformance scene as a folder in TUM layout."""
-    return write_folder(tmp_path_factory.mktemp("data") / "walk", CornerSequence(4))
+    return write_sequence(tmp_path_factory.mktemp("data") / "walk", CornerSequence(4))

@@ -19,8 +19,9 @@ def test_the_list_fits_one_screen_and_holds_every_tracker(cli):
     assert [name for name in rows if name.partition("?")[2] and name[name.index("?") :] not in shown] == []
 
 
-def test_info_describes_settings_and_presets(cli):
-    assert "| setting | default |" in cli("trackers", "info", "orb-slam2")[1]
+def test_info_describes_settings_and_presets_on_one_screen(cli):
+    lines = cli("trackers", "info", "emfoa-oft")[1].splitlines()
+    assert 24 < len(lines) <= 50 and any(line.startswith("flow.budget ") for line in lines)
     facts = json.loads(cli("trackers", "info", "emfoa-oft", "--json")[1])
     by_name = {setting["name"]: setting for setting in facts["parameters"]}
     threshold = by_name["segmentation.confidence"]
@@ -37,33 +38,35 @@ def test_trackers_info_tells_what_others_report_and_where(cli):
     assert json.loads(cli("trackers", "info", "never-move", "--json")[1])["reported"] == []
 
 
-def test_a_broken_plugin_is_explained_by_the_doctor(cli, monkeypatch, tmp_path):
-    (tmp_path / "broken.py").write_text("import nothing_of_this_name\n")
-    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", "broken.py:SPEC")
-    TRACKERS.refresh()
-    try:
-        code, out, _ = cli("trackers", "doctor")
-        assert code == 0 and "broken.py:SPEC" in out and "No module named 'nothing_of_this_name'" in out
-        assert cli("trackers", "list")[0] == 0
-    finally:
-        monkeypatch.undo()
+@pytest.fixture
+def plugin(cli, monkeypatch, tmp_path):
+    """Writes a plug-in and puts it on the list of them."""
+
+    def write(name, text):
+        (tmp_path / name).write_text(text)
+        monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"./{name}:SPEC")
         TRACKERS.refresh()
 
-
-@pytest.mark.parametrize("statement", ["import sys; sys.exit(0)", "import os; os._exit(0)"])
-def test_a_plugin_whose_import_ends_the_process_ends_neither_run_nor_list(cli, walk, monkeypatch, tmp_path, statement):
-    (tmp_path / "ends.py").write_text(statement)
-    code, out, err = cli("run", "./ends.py:SPEC", walk)
-    assert code == 1 and out == "" and "ends.py: that ends the process (exit code 0)" in one_line(err)
-    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", "./ends.py:SPEC")
+    yield write
+    monkeypatch.undo()
     TRACKERS.refresh()
-    try:
-        code, out, _ = cli("trackers", "list", "--json")
-        assert code == 0 and "never-move" in {each["id"] for each in json.loads(out)}
-        assert "that ends the process" in cli("trackers", "doctor")[1]
-    finally:
-        monkeypatch.undo()
-        TRACKERS.refresh()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("import nothing_of_this_name", "No module named 'nothing_of_this_name'"),
+        ("import sys; sys.exit(0)", "that ends the process (exit code 0)"),
+        ("import os; os._exit(0)", "that ends the process (exit code 0)"),
+    ],
+)
+def test_a_broken_plugin_is_explained_and_ends_neither_run_nor_list(cli, walk, plugin, text, reason):
+    plugin("broken.py", text)
+    code, out, _ = cli("trackers", "doctor")
+    assert code == 0 and "broken.py:SPEC" in out and reason in out
+    assert "never-move" in {row["id"] for row in json.loads(cli("trackers", "list", "--json")[1])}
+    code, out, err = cli("run", "./broken.py:SPEC", walk)
+    assert code == 1 and out == "" and reason in one_line(err)
 
 
 def test_a_new_tracker_passes_its_checks_and_runs(cli, walk):
