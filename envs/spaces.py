@@ -21,7 +21,7 @@ from dynslam_bench.core.settings import (
     flatten,
     parameters,
     value_of,
-    why_idle,
+    why_unused,
 )
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.geometry import se3
@@ -135,8 +135,8 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
 
 
 def _check_effect(settings: Settings, parameter: Parameter) -> None:
-    if idle := why_idle(settings, parameter):
-        raise SettingsError(f"setting '{parameter.name}' in control has no effect: {idle}", "leave it out of control")
+    if reason := why_unused(settings, parameter.name):
+        raise SettingsError(f"setting '{parameter.name}' in control has no effect: {reason}", "leave it out of control")
     value = value_of(settings, parameter.name)
     if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
         raise SettingsError(

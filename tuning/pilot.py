@@ -23,7 +23,7 @@ from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.tuning.evaluate import InstanceFailedError
 from dynslam_bench.tuning.instances import ProblemInstance, scenes
 from dynslam_bench.tuning.objectives import Objective, Outcomes
-from dynslam_bench.tuning.screening import live, stepped, toward
+from dynslam_bench.tuning.screening import stepped, toward
 
 EFFECTS = (0.05, 0.10, 0.20)
 """Gains, as shares, of which the pilot says what they would take."""
@@ -239,11 +239,10 @@ def some_of(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
 
 def small_change(space: Sequence[Parameter], base: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Scalar]:
     """Settings near the default: numbers moved toward drawn ones; choices too where there are no numbers."""
-    usable = live(space, base)
-    changed = {parameter.name: toward(parameter, base[parameter.name], rng) for parameter in usable}
+    changed = {parameter.name: toward(parameter, base[parameter.name], rng) for parameter in space}
     if any(changed[name] != base[name] for name in changed):
         return changed
-    return {parameter.name: stepped(parameter, base[parameter.name], rng) for parameter in usable}
+    return {parameter.name: stepped(parameter, base[parameter.name], rng) for parameter in space}
 
 
 def _paired(objective: Objective, outcomes: Outcomes, default: Outcomes) -> dict[ProblemInstance, float]:

@@ -46,23 +46,13 @@ class Point:
 
 
 def plan(space: Sequence[Parameter], base: Mapping[str, Any], points: int, seed: int) -> list[Point]:
-    """The points: the default first, then others near it; a step of each setting from each.
-
-    Settings that another one switches off at the default are no part of it: see `live`.
-    """
+    """The points: the default first, then others near it; a step of each setting from each."""
     chosen: list[Point] = []
     for number in range(points):
         rng = stream(seed, "screening", number)
         start = {p.name: base[p.name] if number == 0 else toward(p, base[p.name], rng) for p in space}
-        if number > 0:  # what switches others off stays as it is
-            start |= {name: base[name] for p in space for name, _ in p.when if name in start}
         chosen.append(Point(start, {p.name: stepped(p, start[p.name], rng) for p in space}))
     return chosen
-
-
-def live(space: Sequence[Parameter], base: Mapping[str, Any]) -> list[Parameter]:
-    """The settings whose conditions hold at the default."""
-    return [p for p in space if all(base.get(name) in allowed for name, allowed in p.when)]
 
 
 def stepped(parameter: Parameter, value: Scalar, rng: np.random.Generator) -> Scalar:

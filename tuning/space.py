@@ -16,7 +16,6 @@ from dynslam_bench.core.settings import (
     apply_overrides,
     field_names,
     parameters,
-    value_of,
     why_unused,
 )
 from dynslam_bench.tuning.splits import source_of_masks
@@ -24,9 +23,7 @@ from dynslam_bench.tuning.study_file import SpaceSpec
 
 
 def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
-    """The parameters of a study, those that conditions refer to before those that depend on them.
-
-    What can have no effect is no part of it: conditions that cannot hold, and what nothing reads as the rest is set.
+    """The parameters of a study; what has no effect as the fixed settings stand is no part of it.
 
     Args:
         settings: The tracker's settings class.
@@ -52,32 +49,21 @@ def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[
         and parameter.name not in spec.fixed
     ]
     fixed = _as_run(apply_overrides(settings(), spec.fixed), list(sequences))
-    tuned = {parameter.name for parameter in chosen}
-    dead = {parameter.name: why for parameter in chosen if (why := _why_dead(parameter, fixed, tuned))}
-    chosen = [parameter for parameter in chosen if parameter.name not in dead]
+    unused = {parameter.name: why for parameter in chosen if (why := why_unused(fixed, parameter.name))}
+    chosen = [parameter for parameter in chosen if parameter.name not in unused]
     if not chosen:
         raise StudyError("the space is empty: all that matches is excluded, fixed, or switched off by a fixed value")
     for name in spec.include:
-        if name in dead:
+        if name in unused:
             raise StudyError(
-                f"'{name}' has no effect in this study: {dead[name]}", "leave it out, or fix that otherwise"
+                f"'{name}' has no effect in this study: {unused[name]}", "leave it out, or fix that otherwise"
             )
-    return sorted(chosen, key=lambda parameter: len(parameter.when) > 0)
+    return chosen
 
 
-def suggest(trial: optuna.trial.BaseTrial, space: list[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Draw a configuration; parameters whose conditions do not hold are not drawn.
-
-    Args:
-        trial: Draws.
-        space: From `search_space`.
-        base: Values of all settings that are not tuned, dotted name to value.
-    """
-    values: dict[str, Scalar] = {}
-    for parameter in space:
-        if _takes_part(parameter, {**base, **values}):
-            values[parameter.name] = _draw(trial, parameter)
-    return values
+def suggest(trial: optuna.trial.BaseTrial, space: Sequence[Parameter]) -> dict[str, Scalar]:
+    """Draw a configuration from a space of `search_space`."""
+    return {parameter.name: _draw(trial, parameter) for parameter in space}
 
 
 def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
@@ -93,12 +79,7 @@ def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
 
 def default_configuration(space: list[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
     """The default settings as a configuration: what trial 0 runs."""
-    return {parameter.name: base[parameter.name] for parameter in space if _takes_part(parameter, base)}
-
-
-def _takes_part(parameter: Parameter, values: Mapping[str, Any]) -> bool:
-    """Whether the conditions of a parameter hold."""
-    return all(values.get(name) in allowed for name, allowed in parameter.when)
+    return {parameter.name: base[parameter.name] for parameter in space}
 
 
 def _draw(trial: optuna.trial.BaseTrial, parameter: Parameter) -> Scalar:
@@ -109,16 +90,6 @@ def _draw(trial: optuna.trial.BaseTrial, parameter: Parameter) -> Scalar:
     if parameter.kind == "int":
         return trial.suggest_int(parameter.name, int(parameter.low), int(parameter.high), log=log)
     return trial.suggest_float(parameter.name, parameter.low, parameter.high, log=log)
-
-
-def _why_dead(parameter: Parameter, settings: Settings, tuned: set[str]) -> str:
-    """Why a parameter can have no effect, whatever the others are tuned to; empty if it can."""
-    if reason := why_unused(settings, parameter.name):
-        return reason
-    for name, allowed in parameter.when:
-        if name not in tuned and (value := value_of(settings, name)) not in allowed:
-            return f"{name} is {value!r}"
-    return ""
 
 
 def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:

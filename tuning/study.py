@@ -19,7 +19,7 @@ from dynslam_bench.tuning.instances import ProblemInstance, scenes
 from dynslam_bench.tuning.objectives import ACCURACY, Cost, Objective, Outcomes, find_objective, own_objective, together
 from dynslam_bench.tuning.page import write_page
 from dynslam_bench.tuning.pilot import FEWEST, Pilot, refuse_hopeless, run_pilot
-from dynslam_bench.tuning.screening import Screening, live, plan, screen
+from dynslam_bench.tuning.screening import Screening, plan, screen
 from dynslam_bench.tuning.space import starting_point
 from dynslam_bench.tuning.storage import open_storage, study_folder
 from dynslam_bench.tuning.study_file import StudySpec, make_spec, read_study
@@ -312,10 +312,7 @@ def screen_study(
     def run(values: Mapping[str, Scalar]) -> Outcomes:
         return tuner.evaluate({**tuner.spec.space.fixed, **values}, chosen)
 
-    usable = live(tuner.space, tuner.base)
-    if not usable:
-        raise StudyError("no setting of the space has an effect at the default", "fix what switches them on")
-    steps = plan(usable, tuner.base, points, tuner.spec.sampler_seed)
+    steps = plan(tuner.space, tuner.base, points, tuner.spec.sampler_seed)
     screening = screen(steps, run, objectives, jobs=jobs, on_done=on_done)
     write_atomic(tuner.folder / SCREENING_FILE, screening.to_json())
     return screening

@@ -227,7 +227,7 @@ class Tuner:
     def _one(self, on_event: OnEvent | None) -> None:
         with self._lock:
             trial = self.study.ask()
-            values = suggest(trial, self.space, self.base)
+            values = suggest(trial, self.space)
         trial.set_user_attr("worker", worker_name())
         if on_event is not None:
             on_event(StudyEvent("started", trial.number, self.spec.trials, f"trial {trial.number}"))

@@ -14,6 +14,7 @@ from dynslam_bench import tuning
 from dynslam_bench.cli.options import AsJson, Jobs, Results
 from dynslam_bench.cli.output import Advance, fields, note, present, progress, table, write
 from dynslam_bench.cli.running import event_text
+from dynslam_bench.cli.trackers import range_text
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
@@ -42,14 +43,8 @@ def space(study: Study, as_json: AsJson = False) -> None:
     sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
     parameters = tuning.search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
 
-    rows = []
-    for parameter in parameters:
-        span = ", ".join(map(str, parameter.choices)) or f"{parameter.low:g} to {parameter.high:g}"
-        span += " (log)" * (parameter.scale == "log")
-        conditions = [f"{name} = {' or '.join(map(str, values))}" for name, values in parameter.when]
-        only_if = " and ".join(conditions)
-        rows.append((parameter.name, span, parameter.default, parameter.unit, only_if, parameter.meaning))
-    present(parameters, table(("setting", "range", "default", "unit", "only if", "meaning"), rows))
+    rows = [(p.name, range_text(p), p.default, p.unit, p.meaning) for p in parameters]
+    present(parameters, table(("setting", "range", "default", "unit", "meaning"), rows))
 
 
 @app.command()

@@ -94,7 +94,7 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     tunable = parameters(spec.settings)
     fixed = len(flatten(spec.settings())) - len(tunable)
     sources = [f"{source} ({count})" for source, count in Counter(row["source"] for row in reported).items()]
-    rows = [(p.name, p.default, _range(p), p.unit, p.online, p.meaning) for p in tunable]
+    rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in tunable]
     present(
         facts | details,
         fields(
@@ -108,7 +108,8 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     )
 
 
-def _range(parameter: Parameter) -> str:
+def range_text(parameter: Parameter) -> str:
+    """The values that a study may give a setting."""
     if parameter.choices:
         return shorten(", ".join(map(str, parameter.choices)), 50, placeholder=" ...")
     return f"{parameter.low:g} to {parameter.high:g}{' (log)' if parameter.scale == 'log' else ''}"

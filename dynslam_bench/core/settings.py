@@ -49,16 +49,8 @@ class Settings(BaseModel):
                 _check_default(cls, _describe(name, field, default))
 
     @property
-    def idle(self) -> str:
-        """Why nothing of this group has an effect as it is set, for a message; empty where it has one."""
-        return ""
-
-    @property
     def unused(self) -> Mapping[str, str]:
-        """Fields, or groups, without effect, each with the reason; see `idle` for all of a group at once.
-
-        As `idle`, it depends on fields only that are not tunable; for conditions on a tunable field there is ``when``.
-        """
+        """Fields that have no effect as the fields that are not tunable stand, each with the reason."""
         return {}
 
     def verify(self) -> None:
@@ -80,7 +72,6 @@ class Parameter:
         unit: Physical unit, empty for none.
         online: Whether it may change in mid-episode.
         meaning: One line.
-        when: Conditions ``(dotted name, values)`` that must all hold for the parameter to have an effect.
     """
 
     name: str
@@ -93,7 +84,6 @@ class Parameter:
     unit: str = ""
     online: bool = False
     meaning: str = ""
-    when: tuple[tuple[str, tuple[Scalar, ...]], ...] = ()
 
 
 def tunable(
@@ -106,7 +96,6 @@ def tunable(
     limits: tuple[float | None, float | None] | None = None,
     unit: str = "",
     online: bool = False,
-    when: Mapping[str, Sequence[Scalar]] | None = None,
     choices: Sequence[Scalar] | None = None,
 ) -> Any:
     """A field that studies may tune.
@@ -120,7 +109,6 @@ def tunable(
         limits: What validation accepts, where that is wider than the search range; None leaves an end open.
         unit: Physical unit, e.g. ``px``.
         online: True if the field may change in mid-episode.
-        when: Conditions on sibling fields (names relative to the model that holds this field).
         choices: The values that studies try, for fields that accept more than these (e.g. free text).
     """
     annotation: dict[str, Any] = {
@@ -129,7 +117,6 @@ def tunable(
         "scale": scale,
         "unit": unit,
         "online": online,
-        "when": {key: list(values) for key, values in (when or {}).items()},
         "choices": list(choices or ()),
     }
     if scale == "log" and (low is None or low <= 0):
@@ -310,15 +297,12 @@ def _annotation(field: FieldInfo) -> dict[str, Any] | None:
 def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
     note = _annotation(field)
     assert note is not None
-    prefix = name.rpartition(".")[0]
-    when = tuple((f"{prefix}.{key}" if prefix else key, tuple(values)) for key, values in note["when"].items())
     common: dict[str, Any] = {
         "name": name,
         "default": default,
         "unit": note["unit"],
         "online": note["online"],
         "meaning": field.description or "",
-        "when": when,
     }
     base = _strip_optional(field.annotation)
     if note["choices"]:
@@ -410,30 +394,16 @@ class Reconfigurable(Protocol):
 
 
 def online_parameters(settings: Settings) -> list[Parameter]:
-    """The online settings that have an effect with these settings, in order of definition.
-
-    A parameter is left out where a condition of its (``when``) does not hold, where a group that it lies in is idle
-    (`Settings.idle`), or where it or its group has no effect as the rest is set (`Settings.unused`).
-    """
+    """The online settings that have an effect with these settings (see `why_unused`), in order of definition."""
     online = parameters(type(settings), online_only=True)
-    return [parameter for parameter in online if not why_idle(settings, parameter)]
-
-
-def why_idle(settings: Settings, parameter: Parameter) -> str:
-    """Why a parameter has no effect with these settings, for a message; empty where it has one."""
-    if reason := why_unused(settings, parameter.name):
-        return reason
-    for name, allowed in parameter.when:
-        if (value := value_of(settings, name)) not in allowed:
-            return f"{name} is {value!r}"
-    return ""
+    return [parameter for parameter in online if not why_unused(settings, parameter.name)]
 
 
 def why_unused(settings: Settings, name: str) -> str:
-    """Why nothing reads a field, as the fields that are not tunable stand; empty where something does."""
+    """Why a field has no effect with these settings, for a message; empty where it has one."""
     node: Settings = settings
     for part in name.split("."):
-        if reason := node.idle or node.unused.get(part, ""):
+        if reason := node.unused.get(part, ""):
             return reason
         if part != "enabled" and not getattr(node, "enabled", True):
             return f"{type(node).__name__} is not enabled"

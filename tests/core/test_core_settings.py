@@ -21,9 +21,7 @@ from dynslam_bench.core.settings import (
 
 class Epipolar(Settings):
     enabled: bool = tunable(True, meaning="whether to test")
-    threshold_px: float = tunable(
-        1.0, low=0.1, high=5.0, scale="log", unit="px", online=True, meaning="distance", when={"enabled": [True]}
-    )
+    threshold_px: float = tunable(1.0, low=0.1, high=5.0, scale="log", unit="px", online=True, meaning="distance")
     wide: float = tunable(1.0, low=0.5, high=2.0, limits=(0.0, None), meaning="validated more widely than searched")
 
 
@@ -48,7 +46,6 @@ def test_parameters_describe_the_search_space():
     assert list(by_name) == ["epipolar.enabled", "epipolar.threshold_px", "epipolar.wide", "features", "method"]
     threshold = by_name["epipolar.threshold_px"]
     assert (threshold.kind, threshold.low, threshold.high, threshold.scale) == ("float", 0.1, 5.0, "log")
-    assert threshold.when == (("epipolar.enabled", (True,)),)
     assert by_name["features"].kind == "int"
     assert by_name["epipolar.enabled"].choices == (False, True)
     assert by_name["method"].choices == ("orb", "fast")

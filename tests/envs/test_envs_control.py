@@ -81,15 +81,15 @@ def test_every_neutral_action_of_every_tracker_is_its_default() -> None:
 
 
 class Wide(Settings):
-    on: bool = tunable(True, meaning="x")
-    value: float = tunable(1.0, low=0.2, high=10.0, limits=(0.0, 1e4), online=True, when={"on": [True]}, meaning="x")
+    enabled: bool = tunable(True, meaning="x")
+    value: float = tunable(1.0, low=0.2, high=10.0, limits=(0.0, 1e4), online=True, meaning="x")
 
 
 def test_what_an_action_could_not_keep_or_would_not_change_is_refused() -> None:
     with pytest.raises(SettingsError, match=r"'value' in control is 1000, actions span 0.2 to 10"):
         ActionMap(Wide(value=1000.0), ["value"])
-    with pytest.raises(SettingsError, match="'value' in control has no effect: on is False"):
-        ActionMap(Wide(on=False), ["value"])
+    with pytest.raises(SettingsError, match="'value' in control has no effect: Wide is not enabled"):
+        ActionMap(Wide(enabled=False), ["value"])
 
 
 def test_every_choice_has_an_equal_share() -> None:

@@ -10,9 +10,11 @@ from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.trackers.registry import all_specs
-from dynslam_bench.trackers.systems.composition import SystemSettings
+from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings
 
-OURS = [spec.id for spec in all_specs() if spec.sensors == "rgb" and issubclass(spec.settings, SystemSettings)]
+OURS = [
+    spec.id for spec in all_specs() if spec.sensors == "rgb" and issubclass(spec.settings, UnfilteredSystemSettings)
+]
 
 
 @pytest.fixture(scope="module")

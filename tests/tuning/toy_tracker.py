@@ -19,7 +19,7 @@ class ToySettings(Settings):
     gain: float = tunable(1.5, low=0.2, high=3.0, scale="log", meaning="scale of the motion; 1 is right")
     wobble: int = tunable(2, low=0, high=8, meaning="noise", unit="mm")
     mode: Literal["fine", "crash"] = tunable("fine", meaning="whether it crashes")
-    anger: float = tunable(0.5, low=0.0, high=1.0, meaning="nothing", when={"mode": ["crash"]})
+    anger: float = tunable(0.5, low=0.0, high=1.0, meaning="nothing")
     plain: str = "not tunable"
 
 

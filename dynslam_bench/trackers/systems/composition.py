@@ -49,17 +49,22 @@ class ObjectSettings(UnrepairedSettings):
     dilation_px: Literal[0] = Field(0, description="masks are not grown")
 
 
-class SystemSettings(Settings):
+class UnfilteredSystemSettings(Settings):
     """Settings of every system on this project's back end."""
 
     preprocessing: PreprocessingSettings = PreprocessingSettings()
     features: FeatureSettings = FeatureSettings()
     backend: BackendSettings = BackendSettings()
-    guard: GuardSettings = GuardSettings()
 
     def verify(self) -> None:
         """Raise `SettingsError` where the named map does not exist."""
         self.backend.map.verify()
+
+
+class SystemSettings(UnfilteredSystemSettings):
+    """A system with filters, and the guard that limits what they remove."""
+
+    guard: GuardSettings = GuardSettings()
 
 
 class SemanticSystemSettings(SystemSettings):
@@ -117,7 +122,7 @@ def composed(*filters: tuple[str, ...]) -> Callable[[Any, TrackerContext], Track
             system's settings that the class takes.
     """
 
-    def build(settings: SystemSettings, context: TrackerContext) -> Tracker:
+    def build(settings: UnfilteredSystemSettings, context: TrackerContext) -> Tracker:
         blocks = [
             load_object(f"dynslam_bench.culling.{name}")(*(getattr(settings, group) for group in groups))
             for name, *groups in filters
@@ -128,7 +133,7 @@ def composed(*filters: tuple[str, ...]) -> Callable[[Any, TrackerContext], Track
 
 
 def compose(
-    settings: SystemSettings,
+    settings: UnfilteredSystemSettings,
     context: TrackerContext,
     filters: Sequence[DynamicFilter] = (),
     flow: FlowMethodSettings | None = None,

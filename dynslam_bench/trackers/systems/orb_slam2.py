@@ -5,24 +5,17 @@ No dynamic handling beyond the robust kernel and the chi-square tests of the pos
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 from dynslam_bench.contracts.tracker import TrackerSpec
-from dynslam_bench.trackers.systems.composition import BACKEND, MonocularSystemSettings, SystemSettings, composed
+from dynslam_bench.slam.settings import MonocularBackendSettings
+from dynslam_bench.trackers.systems.composition import BACKEND, UnfilteredSystemSettings, composed
 
 
-class UnfilteredSettings(SystemSettings):
-    """Settings of a system without any filter."""
-
-    @property
-    def unused(self) -> Mapping[str, str]:
-        """The guard of the filters."""
-        return {"guard": "the system has no filter"}
-
-
-class UnfilteredMonocularSettings(MonocularSystemSettings, UnfilteredSettings):
+class UnfilteredMonocularSettings(UnfilteredSystemSettings):
     """Settings of a system without depth and without any filter."""
+
+    backend: MonocularBackendSettings = MonocularBackendSettings()
 
 
 build = composed()
@@ -38,7 +31,7 @@ SPEC = TrackerSpec(
     id="orb-slam2",
     entry_point=f"{__name__}:build",
     label="ORB-SLAM2 style (our back end)",
-    settings=UnfilteredSettings,
+    settings=UnfilteredSystemSettings,
     summary="the shared RGB-D back end without dynamic handling: the reference of every ratio",
     provenance="own",
     published_as=("ORB-SLAM2",),

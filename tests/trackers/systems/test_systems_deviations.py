@@ -12,12 +12,12 @@ from dynslam_bench.trackers.registry import all_specs
 from dynslam_bench.trackers.systems.composition import (
     PublishedFlowSettings,
     SemanticSystemSettings,
-    SystemSettings,
+    UnfilteredSystemSettings,
     describe_masks,
     describe_tracks,
 )
 
-SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, SystemSettings)]
+SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)]
 OBJECTS = ("ds-slam", "di-slam", "yolo-slam", "dynatm-slam", "ngd-slam", "sgc-slam", "detect-slam", "dgs-slam")
 """Systems that judge by boxes or by whole objects."""
 
