@@ -53,19 +53,19 @@ def plugin(cli, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "reason"),
+    ("name", "text", "reason"),
     [
-        ("import nothing_of_this_name", "No module named 'nothing_of_this_name'"),
-        ("import sys; sys.exit(0)", "that ends the process (exit code 0)"),
-        ("import os; os._exit(0)", "that ends the process (exit code 0)"),
+        ("raises.py", "import nothing_of_this_name", "No module named 'nothing_of_this_name'"),
+        ("exits.py", "import sys; sys.exit(0)", "that ends the process (exit code 0)"),
+        ("ends.py", "import os; os._exit(0)", "that ends the process (exit code 0)"),
     ],
 )
-def test_a_broken_plugin_is_explained_and_ends_neither_run_nor_list(cli, walk, plugin, text, reason):
-    plugin("broken.py", text)
+def test_a_broken_plugin_is_explained_and_ends_neither_run_nor_list(cli, walk, plugin, name, text, reason):
+    plugin(name, text)
     code, out, _ = cli("trackers", "doctor")
-    assert code == 0 and "broken.py:SPEC" in out and reason in out
+    assert code == 0 and f"{name}:SPEC" in out and reason in out
     assert "never-move" in {row["id"] for row in json.loads(cli("trackers", "list", "--json")[1])}
-    code, out, err = cli("run", "./broken.py:SPEC", walk)
+    code, out, err = cli("run", f"./{name}:SPEC", walk)
     assert code == 1 and out == "" and reason in one_line(err)
 
 
