@@ -22,7 +22,6 @@ REPORT, CARE = "Report and tune", "Extend and care"
 FRAMES, SETTINGS = "Which frames, how often", "The tracker's settings"
 MACHINE, OUTPUT = "The machine, and how much of it", "What is kept and shown"
 """Headings of the options' help."""
-TRAJECTORY_FORMATS = "TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP"
 
 
 class DefaultGroup(TyperGroup):
@@ -205,71 +204,6 @@ Retry = Annotated[
         help="Run again what ended so: failed, or a status.",
         rich_help_panel=OUTPUT,
         autocompletion=complete_statuses,
-    ),
-]
-Preset = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        "--preset", help="A preset of the tracker.", rich_help_panel=SETTINGS, autocompletion=complete_presets
-    ),
-]
-Realtime = Annotated[
-    bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.", rich_help_panel=FRAMES)
-]
-Drop = Annotated[
-    float,
-    typer.Option("--drop", min=0.0, max=0.99, help="Drop this share of the frames at random.", rich_help_panel=FRAMES),
-]
-Degrade = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option(
-        "--degrade",
-        metavar="KIND=STRENGTH",
-        help="Spoil the frames: lighting, glare, shadow, blur, noise, depth_noise; repeatable.",
-        rich_help_panel=FRAMES,
-    ),
-]
-Cache = Annotated[
-    bool, typer.Option("--cache", help="Take features and masks from the stage cache.", rich_help_panel=MACHINE)
-]
-Video = Annotated[bool, typer.Option("--video", help="Write video.webm beside the run.", rich_help_panel=OUTPUT)]
-Sheet = Annotated[
-    bool,
-    typer.Option(
-        "--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.", rich_help_panel=OUTPUT
-    ),
-]
-Recording = Annotated[
-    bool, typer.Option("--rrd", help="Write recording.rrd beside the run, for rerun's viewer.", rich_help_panel=OUTPUT)
-]
-SaveMap = Annotated[
-    bool,
-    typer.Option("--save-map", help="Write map.npz beside the run, for --map of a later one.", rich_help_panel=OUTPUT),
-]
-StartMap = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option(
-        "--map", metavar="FILE", help="Begin in the map of an earlier run (--save-map).", rich_help_panel=SETTINGS
-    ),
-]
-LocalisationOnly = Annotated[
-    bool,
-    typer.Option("--localisation-only", help="Leave that map as it is: poses alone.", rich_help_panel=SETTINGS),
-]
-Label = Annotated[
-    str, typer.Option("--label", help="Name in tables, in place of the tracker's.", rich_help_panel=SETTINGS)
-]
-Trackers = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=complete_trackers),
-]
-Scheduler = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs.",
-        rich_help_panel=MACHINE,
     ),
 ]
 TimeLimit = Annotated[

@@ -142,12 +142,13 @@ def cell_text(value: object) -> str:
 def report_table(source: Table, names: Sequence[str] = (), most: int | None = None) -> str:
     """A report's table as text: the columns of these names, or all in which something is written."""
     source = source.displayed()
-    chosen = [at for at, column in enumerate(source.columns) if not names or column.name in names]
+    titles = [column.name if names else column.key for column in source.columns]
+    chosen = [titles.index(name) for name in names or titles if name in titles]
     cells = [
         [" ".join(filter(None, (row[at].text, row[at].small, row[at].tag))) for at in chosen]
         for row in source.rows[:most]
     ]
-    return table([source.columns[at].name if names else source.columns[at].key for at in chosen], cells)
+    return table([titles[at] for at in chosen], cells)
 
 
 def wrapped(text: str, most: int = 120) -> str:

@@ -56,7 +56,15 @@ def run(
     offset: opts.Offsets = None,
     assignments: opts.Assignments = None,
     settings: opts.SettingsFile = None,
-    preset: opts.Preset = None,
+    preset: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--preset",
+            help="A preset of the tracker.",
+            rich_help_panel=opts.SETTINGS,
+            autocompletion=opts.complete_presets,
+        ),
+    ] = None,
     results: opts.Results = Path("results"),
     data_root: opts.DataRoot = None,
     camera: opts.Camera = None,
@@ -65,18 +73,70 @@ def run(
     device: opts.Device = "auto",
     threads: opts.Threads = 1,
     jobs: opts.Jobs = 1,
-    realtime: opts.Realtime = False,
-    drop: opts.Drop = 0.0,
-    degrade: opts.Degrade = None,
-    cache: opts.Cache = False,
-    video: opts.Video = False,
-    sheet: opts.Sheet = False,
-    rrd: opts.Recording = False,
-    save_map: opts.SaveMap = False,
-    start_map: opts.StartMap = None,
-    localisation_only: opts.LocalisationOnly = False,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.", rich_help_panel=opts.FRAMES)
+    ] = False,
+    drop: Annotated[
+        float,
+        typer.Option(
+            "--drop", min=0.0, max=0.99, help="Drop this share of the frames at random.", rich_help_panel=opts.FRAMES
+        ),
+    ] = 0.0,
+    degrade: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--degrade",
+            metavar="KIND=STRENGTH",
+            help="Spoil the frames: lighting, glare, shadow, blur, noise, depth_noise; repeatable.",
+            rich_help_panel=opts.FRAMES,
+        ),
+    ] = None,
+    cache: Annotated[
+        bool,
+        typer.Option("--cache", help="Take features and masks from the stage cache.", rich_help_panel=opts.MACHINE),
+    ] = False,
+    video: Annotated[
+        bool, typer.Option("--video", help="Write video.webm beside the run.", rich_help_panel=opts.OUTPUT)
+    ] = False,
+    sheet: Annotated[
+        bool,
+        typer.Option(
+            "--sheet",
+            help="Write sheet.png beside the run: input, frames, keyframes, map, track.",
+            rich_help_panel=opts.OUTPUT,
+        ),
+    ] = False,
+    rrd: Annotated[
+        bool,
+        typer.Option(
+            "--rrd", help="Write recording.rrd beside the run, for rerun's viewer.", rich_help_panel=opts.OUTPUT
+        ),
+    ] = False,
+    save_map: Annotated[
+        bool,
+        typer.Option(
+            "--save-map", help="Write map.npz beside the run, for --map of a later one.", rich_help_panel=opts.OUTPUT
+        ),
+    ] = False,
+    start_map: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "--map",
+            metavar="FILE",
+            help="Begin in the map of an earlier run (--save-map).",
+            rich_help_panel=opts.SETTINGS,
+        ),
+    ] = None,
+    localisation_only: Annotated[
+        bool,
+        typer.Option(
+            "--localisation-only", help="Leave that map as it is: poses alone.", rich_help_panel=opts.SETTINGS
+        ),
+    ] = False,
     retry: opts.Retry = None,
-    label: opts.Label = "",
+    label: Annotated[
+        str, typer.Option("--label", help="Name in tables, in place of the tracker's.", rich_help_panel=opts.SETTINGS)
+    ] = "",
     time_limit: opts.TimeLimit = None,
     memory_limit: opts.MemoryLimit = None,
     protocol: opts.ProtocolId = "tum-rgbd/v1",
@@ -114,14 +174,27 @@ def bench(
     ],
     results: opts.Results = Path("results"),
     data_root: opts.DataRoot = None,
-    tracker: opts.Trackers = None,
+    tracker: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            "--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=opts.complete_trackers
+        ),
+    ] = None,
     seed: opts.Seeds = None,
     offset: opts.Offsets = None,
     frames: opts.Frames = None,
     device: opts.Device = "auto",
     threads: Annotated[Optional[int], typer.Option(min=1, help="Threads of a run.")] = None,  # noqa: UP045
     jobs: opts.Jobs = 1,
-    scheduler: opts.Scheduler = None,
+    scheduler: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs.",
+            rich_help_panel=opts.MACHINE,
+        ),
+    ] = None,
     retry: opts.Retry = None,
     time_limit: opts.TimeLimit = None,
     memory_limit: opts.MemoryLimit = None,

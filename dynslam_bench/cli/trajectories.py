@@ -10,7 +10,6 @@ import typer
 from dynslam_bench import runs
 from dynslam_bench.cli.options import (
     MEASURE,
-    TRAJECTORY_FORMATS,
     AsJson,
     Camera,
     DataRoot,
@@ -90,7 +89,10 @@ def compare(
 
 
 def import_(
-    trajectory: Annotated[Path, typer.Argument(help=f"A trajectory: {TRAJECTORY_FORMATS}.")],
+    trajectory: Annotated[
+        Path,
+        typer.Argument(help="TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP."),
+    ],
     tracker: Annotated[str, typer.Option(help="Name of the system that made it.")],
     sequence: Annotated[str, typer.Option(help="Id or folder of the sequence that it was made on.")],
     label: Annotated[str, typer.Option(help="Name for tables.")] = "",
