@@ -30,8 +30,6 @@ from dynslam_bench.core.toml import label_text
 if TYPE_CHECKING:
     from dynslam_bench.api import RunResult
     from dynslam_bench.core.errors import DynslamError
-    from dynslam_bench.runs import RunEvent, RunRecord, RunSpec, RunStore
-    from dynslam_bench.runs.identity import ResolvedRun
     from dynslam_bench.segmentation.networks.checkpoints import Checkpoint
 
 
@@ -295,23 +293,23 @@ class WatchedRuns:
         faults: Messages of the runs that cannot be made, each of them written once.
     """
 
-    def __init__(self, store: RunStore, jobs: int, protocol: str) -> None:
+    def __init__(self, store: runs.RunStore, jobs: int, protocol: str) -> None:
         self.store, self.jobs, self.protocol = store, jobs, protocol
-        self.specs: dict[str, RunSpec] = {}
+        self.specs: dict[str, runs.RunSpec] = {}
         self.reused: set[str] = set()
         self.faults: set[str] = set()
         self._shares: dict[str, float] = {}
 
-    def make(self, make: Callable[..., list[RunResult]]) -> list[RunRecord]:
+    def make(self, make: Callable[..., list[RunResult]]) -> list[runs.RunRecord]:
         """Call a function of `api` that makes runs, with a progress bar."""
         with progress("runs") as self._advance:
             runs = make(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
         return [run.record for run in runs]
 
-    def _plan(self, runs: Collection[ResolvedRun]) -> None:
+    def _plan(self, runs: Collection[runs.ResolvedRun]) -> None:
         announce(describe_plan(runs, self.store, self.jobs, self.protocol))
 
-    def _event(self, event: RunEvent) -> None:
+    def _event(self, event: runs.RunEvent) -> None:
         self.specs[event.run_id] = event.spec
         if event.kind == "progress" and event.partial is not None:
             self._shares[event.run_id] = event.partial["frames_done"] / max(event.partial["frames"], 1)
@@ -321,13 +319,13 @@ class WatchedRuns:
             note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
         self._advance(sum(self._shares.values()), event.total, event_text(event))
 
-    def _fault(self, _: RunSpec, error: DynslamError) -> None:
+    def _fault(self, _: runs.RunSpec, error: DynslamError) -> None:
         if str(error) not in self.faults:
             self.faults.add(str(error))
             write_error(error)
 
 
-def event_text(event: RunEvent) -> str:
+def event_text(event: runs.RunEvent) -> str:
     """Tracker, sequence and progress of a run, for a progress bar."""
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
     if event.kind != "progress" or event.partial is None:
@@ -335,7 +333,7 @@ def event_text(event: RunEvent) -> str:
     return f"{text}, frame {event.partial['frames_done']} of {event.partial['frames']}"
 
 
-def describe_plan(runs: Collection[ResolvedRun], store: RunStore, jobs: int, protocol: str) -> str:
+def describe_plan(runs: Collection[runs.ResolvedRun], store: runs.RunStore, jobs: int, protocol: str) -> str:
     """How many frames will be tracked, and the expected time by stored runs of the same trackers."""
     from dynslam_bench.runs.store import list_runs
 

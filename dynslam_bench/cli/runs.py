@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import Annotated, Any, Optional
 
 import typer
 
@@ -15,10 +15,6 @@ from dynslam_bench.cli.options import AsJson, ProtocolId, Results, complete_stat
 from dynslam_bench.cli.output import announce, fields, json_mode, present, progress, table, warn, write
 from dynslam_bench.core.errors import RunError, did_you_mean
 from dynslam_bench.core.toml import label_text
-
-if TYPE_CHECKING:
-    from dynslam_bench.runs import RunRecord, RunSpec, RunStore
-    from dynslam_bench.runs.run_index import Row
 
 COLUMNS = {
     "run": "run_id",
@@ -48,7 +44,7 @@ _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
 
-def _open(results: Path) -> RunStore:
+def _open(results: Path) -> stored.RunStore:
     """The store of a results folder that exists."""
     store = stored.RunStore(results)
     if not store.runs.is_dir():
@@ -144,7 +140,7 @@ def rm(
         write(run_id)
 
 
-def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
+def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
     from dynslam_bench.core.toml import assignments
     from dynslam_bench.runs.run_index import part_words
@@ -181,7 +177,7 @@ def run_facts(store: RunStore, record: RunRecord) -> dict[str, Any]:
     }
 
 
-def closed_loops(store: RunStore, run_id: str) -> int | None:
+def closed_loops(store: stored.RunStore, run_id: str) -> int | None:
     """How many loops a run had closed at its end; None without that column, or if its table is damaged."""
     try:
         frames = stored.load_frames(run_id, store.root)
@@ -191,7 +187,9 @@ def closed_loops(store: RunStore, run_id: str) -> int | None:
     return int(counts.iloc[-1]) if len(counts) else None
 
 
-def show_runs(records: Sequence[RunRecord], store: RunStore, protocol: str, reused: Collection[str] = ()) -> None:
+def show_runs(
+    records: Sequence[stored.RunRecord], store: stored.RunStore, protocol: str, reused: Collection[str] = ()
+) -> None:
     """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are marked as from the store."""
     from dynslam_bench.runs.run_index import run_row
 
@@ -199,7 +197,7 @@ def show_runs(records: Sequence[RunRecord], store: RunStore, protocol: str, reus
     show_rows([run_row(*pair) | {"from_store": pair[0].run_id in reused} for pair in scored], store, protocol)
 
 
-def show_rows(rows: Sequence[Row], store: RunStore, protocol: str) -> None:
+def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: str) -> None:
     """The same for rows that `list_runs` gave; the table has the columns in which a run has a value."""
     if json_mode():
         present([row | {"protocol": protocol, "folder": store.folder(row["run_id"])} for row in rows])
@@ -223,7 +221,7 @@ def shown_cell(name: str, value: Any) -> Any:
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 
-def show_files(records: Sequence[RunRecord], store: RunStore, names: Sequence[str]) -> set[str]:
+def show_files(records: Sequence[stored.RunRecord], store: stored.RunStore, names: Sequence[str]) -> set[str]:
     """Write the paths of the requested pictures and maps, and to standard error why a run has none.
 
     Returns:
@@ -242,7 +240,7 @@ def show_files(records: Sequence[RunRecord], store: RunStore, names: Sequence[st
     return missing
 
 
-def training_scene_note(records: Sequence[RunRecord]) -> str:
+def training_scene_note(records: Sequence[stored.RunRecord]) -> str:
     """One line on the runs on scenes that the segmentation network was trained on; empty without any."""
     from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 
@@ -256,7 +254,7 @@ def training_scene_note(records: Sequence[RunRecord]) -> str:
     )
 
 
-def drift_note(records: Sequence[RunRecord], store: RunStore) -> str:
+def drift_note(records: Sequence[stored.RunRecord], store: stored.RunStore) -> str:
     """One line on the first run with a long path and without loop closing; empty without any."""
     for record in records:
         if record.settings.get("backend.loop_closing.enabled") is not False or record.tracker.sensors != "rgbd":
@@ -270,7 +268,9 @@ def drift_note(records: Sequence[RunRecord], store: RunStore) -> str:
     return ""
 
 
-def recording_note(specs: Mapping[str, RunSpec], records: Sequence[RunRecord], store: RunStore, protocol: str) -> str:
+def recording_note(
+    specs: Mapping[str, stored.RunSpec], records: Sequence[stored.RunRecord], store: stored.RunStore, protocol: str
+) -> str:
     """One line on a fault of the first recording whose run failed, was lost or was no better than a static camera.
 
     Empty without such a run, or where a short check of the recording finds no fault.

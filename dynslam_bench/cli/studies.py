@@ -18,7 +18,6 @@ from dynslam_bench.cli.trackers import range_text
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
-    from dynslam_bench.tuning import StudyEvent, StudySummary, Tuner
 
 app = typer.Typer(help="Studies: tune a tracker's settings through its environment.", no_args_is_help=True)
 Study = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The study.")]
@@ -183,7 +182,7 @@ class StudyBar:
         self._advance, self._runs = advance, 0
         self._part, self._at = "pilot", (0.0, None)
 
-    def event(self, event: StudyEvent) -> None:
+    def event(self, event: tuning.StudyEvent) -> None:
         """A trial has started or finished, or the study has begun another part."""
         if event.kind in ("pilot", "finished"):
             note(event.text)
@@ -207,7 +206,7 @@ class StudyBar:
         self._advance(done, total, part)
 
 
-def show_summary(tuner: Tuner, summary: StudySummary, page: Path) -> None:
+def show_summary(tuner: tuning.Tuner, summary: tuning.StudySummary, page: Path) -> None:
     """The conclusion, the chosen settings and the paths of page and preset."""
     from dynslam_bench.tuning.splits import seen_note
 

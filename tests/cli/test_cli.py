@@ -232,12 +232,6 @@ def test_eval_and_protocols(cli, walk, tmp_path):
     assert code == 0 and out.splitlines()[0].split()[:2] == ["metric", "protocol"]
 
 
-def test_import(cli, walk):
-    code, out, _ = cli("import", walk / "groundtruth.txt", "--tracker", "theirs", "--sequence", walk, "--json")
-    (row,) = json.loads(out)
-    assert code == 0 and row["tracker"] == "theirs" and row["ate_rmse_m"] < 1e-6
-
-
 def test_kitti_trajectories_with_their_stamps(cli, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     write_kitti(tmp_path / "kitti.txt", read_tum(truth))
@@ -248,6 +242,12 @@ def test_kitti_trajectories_with_their_stamps(cli, walk, tmp_path):
     assert code == 0 and json.loads(out)[0]["ate_rmse_m"] < 1e-6
     code, _, err = cli("eval", tmp_path / "kitti.txt", truth)
     assert code == 1 and "--timestamps FILE" in one_line(err)
+
+
+def test_doctor(cli):
+    rows = json.loads(cli("doctor", "--json")[1])
+    assert {"program", "weights", "folder", "device"} <= {row["part"] for row in rows}
+    assert "embedded" in cli("doctor")[1]
 
 
 def test_envs(cli):
@@ -273,8 +273,8 @@ def test_bench(cli, walk, tmp_path):
 
 
 def test_audit_of_the_paper(cli, tmp_path):
-    found = json.loads(cli("report", "audit-paper", "--json")[1])
-    assert found and {"check", "printed", "expected", "holds"} <= set(found[0])
+    findings = json.loads(cli("report", "audit-paper", "--json")[1])
+    assert findings and {"check", "printed", "expected", "holds"} <= set(findings[0])
     assert cli("report", "audit-paper", "-o", "audit.md")[0] == 0 and (tmp_path / "audit.md").is_file()
 
 
