@@ -1,15 +1,10 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
-import functools
-import hashlib
-import http.server
 import json
 import re
 import shutil
 import sys
-import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +14,6 @@ from envs_toys import write_folder
 from dynslam_bench.cli import output, running, runs
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.geometry.trajectory_files import read_tum
-from dynslam_bench.segmentation import build_segmenter
 from dynslam_bench.segmentation.networks import checkpoints
 
 
@@ -83,43 +77,27 @@ def test_a_mistake_is_one_line_and_leaves_nothing(cli, walk, tmp_path, arguments
 
 
 @pytest.fixture
-def published(tmp_path, monkeypatch):
-    """The COCO checkpoint as a file of a server on this machine, and an empty cache; the network is the embedded one.
-
-    Returns the served file; it is requested only where somebody agrees.
-    """
-    served = tmp_path / "served"
-    served.mkdir()
-    content = checkpoints.embedded_weights().read_bytes()
-    (served / "network.pth").write_bytes(content)
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(served))
-    monkeypatch.setattr(http.server.SimpleHTTPRequestHandler, "log_message", lambda *_: None)
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-    prefix = hashlib.sha256(content).hexdigest()[:8]
-    stub = replace(checkpoints.COCO, url=f"http://127.0.0.1:{server.server_port}/network.pth", sha256_prefix=prefix)
-    monkeypatch.setattr(build_segmenter.NetworkNotFetched, "checkpoint", stub)
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights"))
-    yield tmp_path / "weights" / stub.file
-    server.shutdown()
-    server.server_close()
+def fetched(tmp_path, monkeypatch):
+    """Where the COCO checkpoint lies once it is fetched; a copy of the embedded network takes its place."""
+    file = tmp_path / "weights" / checkpoints.COCO.file
+    file.parent.mkdir()
+    monkeypatch.setattr(checkpoints, "fetch_checkpoint", lambda _: shutil.copy(checkpoints.embedded_weights(), file))
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(file.parent))
+    return file
 
 
-def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, published, monkeypatch):
+def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetched, monkeypatch):
     command = ("run", "mask-rcnn", walk)
     code, out, err = cli(*command)
-    _, *options = err.splitlines()
-    assert code == 1 and not out and not published.exists() and len(options) == 4
-    monkeypatch.setattr(running, "is_interactive", lambda: True)
-    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
-    code, _, err = cli(*command)
-    assert code == 1 and "170 MB" in err and str(published.parent) in err and not published.exists()
-    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
-    (row,) = json.loads(cli(*command, "--json")[1])
-    assert (row["status"], row["segmentation"]) == ("ok", "coco") and published.is_file()
-    published.unlink()
+    assert code == 1 and not out and not fetched.exists() and len(err.splitlines()) == 5, "an error and four cures"
+    for agrees in (False, True):
+        monkeypatch.setattr(running, "is_interactive", lambda: True)
+        monkeypatch.setattr(running.typer, "confirm", lambda *_, agrees=agrees, **__: agrees)
+        code, _, err = cli(*command)
+        assert code == 1 - agrees and "170 MB" in err and fetched.is_file() is agrees
+    fetched.unlink()
     monkeypatch.setattr(running, "is_interactive", lambda: False)
-    assert cli(*command, "--frames", "0:3", "--yes")[0] == 0 and published.is_file()
+    assert cli(*command, "--frames", "0:3", "--yes")[0] == 0 and fetched.is_file()
     assert cli(*command, "--frames", "0:2")[0] == 0, "nobody is asked again"
 
 

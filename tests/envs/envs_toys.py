@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -165,39 +168,32 @@ class ToyTracker:
 def misbehave(mode: str, result: TrackResult) -> TrackResult:
     """One of the ways in which a tracker can fail."""
     pose = np.array(result.T_world_cam)
-    if mode == "lost":
-        return replace(result, T_world_cam=None, state="lost")
-    if mode == "initialising":
-        return replace(result, T_world_cam=None, state="initialising")
-    if mode == "nan":
-        return replace(result, T_world_cam=pose * np.nan)
-    if mode == "scaled":
-        return replace(result, T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0]) @ pose)
-    if mode == "mirrored":
-        return replace(result, T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0]))
-    if mode == "none":
-        return replace(result, T_world_cam=None)
-    if mode == "string":
-        return "nonsense"  # type: ignore[return-value]
-    if mode == "raise":
-        raise ValueError("the toy tracker raised on purpose")
-    if mode == "hang":
-        import time
-
-        time.sleep(3600)
-    if mode == "segfault":
-        import ctypes
-
-        ctypes.string_at(0)
-    if mode == "exit":
-        import os
-
-        os._exit(3)
-    if mode == "memory":
-        hoard = [np.ones(2**23) for _ in range(64)]  # 4 GiB, 64 MiB at a time
-        assert hoard
-    if mode == "memoryerror":
-        raise MemoryError("the toy tracker ran out of memory on purpose")
+    match mode:
+        case "lost" | "initialising":
+            return replace(result, T_world_cam=None, state=mode)
+        case "nan":
+            return replace(result, T_world_cam=pose * np.nan)
+        case "scaled":
+            return replace(result, T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0]) @ pose)
+        case "mirrored":
+            return replace(result, T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0]))
+        case "none":
+            return replace(result, T_world_cam=None)
+        case "string":
+            return "nonsense"  # type: ignore[return-value]
+        case "raise":
+            raise ValueError("the toy tracker raised on purpose")
+        case "hang":
+            time.sleep(3600)
+        case "segfault":
+            ctypes.string_at(0)
+        case "exit":
+            os._exit(3)
+        case "memory":
+            hoard = [np.ones(2**23) for _ in range(64)]  # 4 GiB, 64 MiB at a time
+            assert hoard
+        case "memoryerror":
+            raise MemoryError("the toy tracker ran out of memory on purpose")
     raise AssertionError(f"unknown mode {mode}")
 
 
