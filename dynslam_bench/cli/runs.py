@@ -183,8 +183,8 @@ def closed_loops(store: stored.RunStore, run_id: str) -> int | None:
         frames = stored.load_frames(run_id, store.root)
     except RunError:
         return None
-    counts = frames["stat_loops"].dropna() if "stat_loops" in frames else ()
-    return int(counts.iloc[-1]) if len(counts) else None
+    counts = frames["stat_loops"].dropna().tolist() if "stat_loops" in frames else []
+    return int(counts[-1]) if counts else None
 
 
 def show_runs(

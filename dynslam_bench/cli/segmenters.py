@@ -99,9 +99,8 @@ def evaluate(
         )
     lines = [fields(score.model_dump(exclude={"classes"}))]
     if score.classes:
-        qualities = {name: quality.model_dump() for name, quality in score.classes.items()}
-        columns = sorted({key for quality in qualities.values() for key in quality})
-        rows = [(name, *(quality.get(key) for key in columns)) for name, quality in qualities.items()]
+        columns = sorted({key for quality in score.classes.values() for key in quality})
+        rows = [(name, *map(quality.get, columns)) for name, quality in score.classes.items()]
         lines += ["", table(("class", *columns), rows)]
     present(score, *lines)
 

@@ -1,7 +1,6 @@
 """Each check finds the fault that it is for, and names it."""
 
 import re
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -325,15 +324,13 @@ class Once(Configured):
         self.seen = None
 
 
-FIXED = type("Fixed", (Configured,), {"configure": None})
-DEAF = type("Deaf", (Configured,), {"configure": lambda self, settings: None})
-LEAKY = type("Leaky", (Configured,), {"reset": Good.reset})
-INERT = type("Inert", (Configured,), {"track": Good.track})
+Fixed = type("Fixed", (Configured,), {"configure": None})
+Deaf = type("Deaf", (Configured,), {"configure": lambda self, settings: None})
+Leaky = type("Leaky", (Configured,), {"reset": Good.reset})
+Inert = type("Inert", (Configured,), {"track": Good.track})
 
 
 def online_check(tracker):
-    module = sys.modules[tracker.__module__]
-    setattr(module, tracker.__name__, tracker)
     spec = TrackerSpec("t", f"{__file__}:{tracker.__name__}", "T", settings=Online)
     (check,) = [c for c in tracker_report(spec, frames=4).checks if c.name == "online settings"]
     return check
@@ -343,12 +340,12 @@ def online_check(tracker):
     ("tracker", "status", "words"),
     [
         (Configured, "passed", ""),
-        (FIXED, "failed", "class Fixed has no method configure.settings., but shift is online"),
-        (DEAF, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
-        (LEAKY, "failed", "reset.. does not bring back the settings: frame 0, shift"),
+        (Fixed, "failed", "class Fixed has no method configure.settings., but shift is online"),
+        (Deaf, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
+        (Leaky, "failed", "reset.. does not bring back the settings: frame 0, shift"),
         (Late, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
         (Once, "failed", "configure.. in mid-episode changes nothing, although building with shift does"),
-        (INERT, "skipped", "shift change nothing on this scene"),
+        (Inert, "skipped", "shift change nothing on this scene"),
     ],
 )
 def test_online_settings_are_checked(tracker, status, words):
