@@ -52,7 +52,7 @@ class CornerSequence:
 
     def __getitem__(self, index: int) -> Frame:
         index = range(self._count)[index]
-        rgb, depth, _ = draw(type(self), index)
+        rgb, depth, _ = draw(type(self), index)  # type: ignore[arg-type]  # mypy: a class is no Hashable
         return Frame(index, float(self.timestamps[index]), rgb.copy(), depth.copy())
 
     @staticmethod
@@ -94,7 +94,7 @@ class _Masks:
         self._sequence = sequence
 
     def __getitem__(self, index: int) -> FrameMasks:
-        panel = draw(type(self._sequence), range(len(self._sequence))[index])[2]
+        panel = draw(type(self._sequence), range(len(self._sequence))[index])[2]  # type: ignore[arg-type]
         return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index and panel.any() else ()))
 
 

@@ -1,5 +1,6 @@
 """The program as the tests of the command line call it, and a small sequence for it."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -35,3 +36,15 @@ def cli(capsys, monkeypatch, tmp_path):
 def walk(tmp_path_factory):
     """The conformance scene as a folder in TUM layout."""
     return write_sequence(tmp_path_factory.mktemp("data") / "walk", CornerSequence(4))
+
+
+@pytest.fixture
+def facts(cli):
+    """Runs the program with ``--json`` and returns what it writes; it exits with `code`, and with 0 without a word."""
+
+    def call(*arguments, code=0):
+        ended, out, err = cli(*arguments, "--json")
+        assert ended == code and (code or not err), err
+        return json.loads(out)
+
+    return call

@@ -17,11 +17,11 @@ from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.segmentation.networks import checkpoints
 
 
-def test_a_row_names_the_part_the_settings_and_its_origin(cli, walk):
+def test_a_row_names_the_part_the_settings_and_its_origin(cli, facts, walk):
     command = ("run", "constant-velocity", walk, "--frames", "0:3", "--stride", "2", "--set", "frames=4")
     assert "from the store" not in cli(*command, "--label", "my control")[1]
     assert "from the store" in cli(*command)[1]
-    (row,) = json.loads(cli(*command, "--json")[1])
+    (row,) = facts(*command)
     assert row["from_store"] is True and row["settings"] == "frames=4" and row["frames"] == "0:3, every 2nd"
     assert "0:3, every 2nd" in cli("runs", "list")[1] and "my control" in cli("runs", "show")[1]
 
@@ -35,11 +35,11 @@ def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(c
     assert cli(*command, "frames=5", "--json")[2] == ""
 
 
-def test_a_row_names_files_without_their_folders(cli, walk):
+def test_a_row_names_files_without_their_folders(cli, facts, walk):
     command = ("run", f"replay:{walk / 'groundtruth.txt'}", walk, "--set", "tolerance_s=0.02")
     code, out, _ = cli(*command)
     assert code == 0 and "replay:groundtruth.txt" in out and str(walk) not in out
-    (row,) = json.loads(cli(*command, "--json")[1])
+    (row,) = facts(*command)
     assert row["tracker"] == f"replay:{walk / 'groundtruth.txt'}", "scripts get the whole name"
     assert runs.shown_cell("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
         "a=1, s.source=onnx:net.onnx, v=ORBvoc.txt, r=recorded:n"
@@ -115,11 +115,11 @@ def test_bench_has_limits(cli, walk, tmp_path):
 
 
 @pytest.mark.parametrize(("option", "name"), [("--sheet", "sheet.png"), ("--video", "video.webm")])
-def test_pictures_of_a_stored_run_are_made(cli, walk, option, name):
-    folder = Path(json.loads(cli("run", "orb-slam2", walk, "--json")[1])[0]["folder"])
+def test_pictures_of_a_stored_run_are_made(facts, walk, option, name):
+    folder = Path(facts("run", "orb-slam2", walk)[0]["folder"])
     assert not (folder / name).exists()
     for from_store in (False, True):
-        (row,) = json.loads(cli("run", "orb-slam2", walk, option, "--json")[1])
+        (row,) = facts("run", "orb-slam2", walk, option)
         assert row["from_store"] is from_store and Path(row["folder"]) == folder and (folder / name).is_file()
 
 
@@ -151,8 +151,8 @@ def test_a_long_path_without_loop_closing_is_noted(cli, walk, monkeypatch):
     assert sum("without loop closing" in text for text in notes) == 1, "of new runs only"
 
 
-def test_show_counts_closed_loops(cli, walk):
-    (row,) = json.loads(cli("run", "orb-slam2", walk, "--json")[1])
+def test_show_counts_closed_loops(cli, facts, walk):
+    (row,) = facts("run", "orb-slam2", walk)
     table = Path(row["folder"]) / "frames.csv"
     heading, *lines = table.read_text().splitlines()
     cells = lines[-1].split(",")
