@@ -130,7 +130,8 @@ def run(
     Raises:
         DynslamError: The tracker, the sequence or an option is unknown or does not fit.
     """
-    specs = make_specs(tracker, [str(sequence)], settings=settings, preset=preset, **options)
+    repeat = {"seeds": [options.pop("seed", 0)], "offsets": [options.pop("offset", 0)]}
+    specs = make_specs(tracker, [str(sequence)], settings=settings, preset=preset, **repeat, **options)
     return run_specs(specs, results=results, protocol=protocol)[0]
 
 
@@ -140,8 +141,8 @@ def make_specs(
     *,
     settings: Mapping[str, Any] | None = None,
     preset: str | None = None,
-    seeds: Sequence[int] = (),
-    offsets: Sequence[int] = (),
+    seeds: Sequence[int] = (0,),
+    offsets: Sequence[int] = (0,),
     **options: Any,
 ) -> list[RunSpec]:
     """The runs of a tracker on sequences, with all seeds and offsets.
@@ -154,13 +155,11 @@ def make_specs(
     if preset is not None and preset not in presets:
         raise SettingsError(f"tracker '{tracker}' has no preset '{preset}'", did_you_mean(preset, presets))
     overrides = {**presets.get(preset or "", {}), **(settings or {})}
-    repeats = [{"seed": seed} for seed in seeds] or [{}]
-    starts = [{"offset": offset} for offset in offsets] or [{}]
     return [
-        checked(RunSpec, tracker=tracker, sequence=sequence, settings=overrides, **options, **repeat, **start)
+        checked(RunSpec, tracker=tracker, sequence=sequence, settings=overrides, seed=seed, offset=offset, **options)
         for sequence in sequences
-        for repeat in repeats
-        for start in starts
+        for seed in seeds
+        for offset in offsets
     ]
 
 

@@ -73,11 +73,6 @@ class Episode:
         """Index of the frame that comes next."""
         return len(self.outcomes)
 
-    @property
-    def tracked(self) -> int:
-        """How many frames have state ``ok``."""
-        return sum(outcome.state == "ok" for outcome in self.outcomes)
-
     def trajectory(self) -> Trajectory:
         """The online trajectory: the poses of the frames with state ``ok``, each as it was when the frame came."""
         tracked = [(o.timestamp, o.T_world_cam) for o in self.outcomes if o.T_world_cam is not None]

@@ -26,9 +26,6 @@ from dynslam_bench.core.settings import (
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.geometry import se3
 
-_ONLY = spaces.Discrete(1)
-"""The action space without controlled settings; for membership alone, since each environment seeds its own."""
-
 
 class ActionMap:
     """Maps actions to settings.
@@ -81,9 +78,9 @@ class ActionMap:
             SettingsError: The action is none of the space: not 0, of another shape, no numbers, or NaN.
         """
         if not self.parameters:
-            if not _ONLY.contains(action):
+            if not self.space().contains(action):
                 raise SettingsError(
-                    f"the action {reprlib.repr(action)} is not in {_ONLY}",
+                    f"the action {reprlib.repr(action)} is not in Discrete(1)",
                     "without control the only action is 0; name settings in control to change them",
                 )
             return self.base

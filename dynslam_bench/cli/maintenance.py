@@ -6,18 +6,12 @@ from typing import Annotated
 
 import typer
 
-from dynslam_bench.cli.options import START, AsJson
+from dynslam_bench.cli.options import AsJson
 from dynslam_bench.cli.output import present, table, write
 
 cache = typer.Typer(
     help="The stage cache: results that do not depend on the settings under study.", no_args_is_help=True
 )
-
-
-def add(app: typer.Typer) -> None:
-    """Add the verbs without a group."""
-    app.command(rich_help_panel=START)(envs)
-    app.command(rich_help_panel=START)(doctor)
 
 
 def doctor(as_json: AsJson = False) -> None:

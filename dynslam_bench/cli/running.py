@@ -33,12 +33,6 @@ if TYPE_CHECKING:
     from dynslam_bench.segmentation.networks.checkpoints import Checkpoint
 
 
-def add(app: typer.Typer) -> None:
-    """Add the verbs."""
-    for verb in (run, bench):
-        app.command(rich_help_panel=opts.MEASURE, cls=opts.ShortHelp)(verb)
-
-
 def run(
     tracker: Annotated[
         str,

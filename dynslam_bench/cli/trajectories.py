@@ -9,7 +9,6 @@ import typer
 
 from dynslam_bench import runs
 from dynslam_bench.cli.options import (
-    MEASURE,
     AsJson,
     Camera,
     DataRoot,
@@ -29,14 +28,6 @@ Estimate = Annotated[
     typer.Argument(help="A trajectory: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps."),
 ]
 GroundTruth = Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.")]
-
-
-def add(app: typer.Typer) -> None:
-    """Add the verbs."""
-    app.command("eval", rich_help_panel=MEASURE)(evaluate)
-    app.add_typer(protocols, name="protocols", rich_help_panel=MEASURE)
-    app.command("import", rich_help_panel=MEASURE)(import_)
-    app.command("export", rich_help_panel=MEASURE)(export)
 
 
 def evaluate(
