@@ -250,8 +250,8 @@ def test_cache(cli, facts, monkeypatch, tmp_path):
     monkeypatch.setenv("DYNSLAM_BENCH_CACHE", str(tmp_path / "stages"))
     StageCache().put("masks", "ab" * 16, {"a": np.zeros(10)}, 0.5)
     for entries in ({"masks": 1}, {}):
-        facts = facts("cache", "info")
-        assert facts["entries_by_stage"] == entries and (facts["bytes"] > 0) == bool(entries)
+        usage = facts("cache", "info")
+        assert usage["entries_by_stage"] == entries and (usage["bytes"] > 0) == bool(entries)
         assert cli("cache", "clear", "--yes")[0] == 0
 
 
