@@ -22,11 +22,11 @@ def test_the_list_fits_one_screen_and_holds_every_tracker(cli, facts):
 def test_info_describes_settings_and_presets_on_one_screen(cli, facts):
     lines = cli("trackers", "info", "emfoa-oft")[1].splitlines()
     assert 24 < len(lines) <= 50 and any(line.startswith("flow.budget ") for line in lines)
-    facts = facts("trackers", "info", "emfoa-oft")
-    by_name = {setting["name"]: setting for setting in facts["parameters"]}
+    described = facts("trackers", "info", "emfoa-oft")
+    by_name = {setting["name"]: setting for setting in described["parameters"]}
     threshold = by_name["segmentation.confidence"]
     assert (threshold["low"], threshold["high"], threshold["scale"]) == (0.1, 0.9, "linear")
-    assert by_name["segmentation.source"]["tunable"] is False and facts["presets"]["fast"]["flow.budget"] == 24
+    assert by_name["segmentation.source"]["tunable"] is False and described["presets"]["fast"]["flow.budget"] == 24
 
 
 def test_trackers_info_tells_what_others_report_and_where(facts):
