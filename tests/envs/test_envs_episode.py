@@ -216,8 +216,10 @@ def test_steps_out_of_order() -> None:
 
 def test_reset_options() -> None:
     env = SlamEnv(ToySequence(6), TARGET)
-    env.reset(seed=0, options={"settings": {"noise.level_m": 0.05}, "sequence": ToySequence(9)})
-    assert len(env.sequence) == 9 and env.settings.noise.level_m == 0.05
+    env.reset(seed=0)
+    env.reset(seed=0, options={"settings": {"noise.enabled": False}, "sequence": ToySequence(9)})
+    assert len(env.sequence) == 9 and env.settings.noise.enabled is False
+    assert env.step(0)[4]["frame_error_trans_m"] == pytest.approx(0, abs=1e-12), "another tracker"
     with pytest.raises(SettingsError, match="unknown reset option 'sequnce'"):
         env.reset(options={"sequnce": "x"})
 
