@@ -24,7 +24,7 @@ from dynslam_bench.cli.output import (
     warn,
     write_error,
 )
-from dynslam_bench.cli.runs import drift_note, recording_note, show_files, show_runs, training_scene_note
+from dynslam_bench.cli.runs import recording_note, show_files, show_runs, training_scene_note
 from dynslam_bench.core.toml import label_text
 
 if TYPE_CHECKING:
@@ -246,8 +246,7 @@ def finish(
         raise typer.Exit(1)
     show_runs(records, store, protocol, watched.reused)
     missing = show_files(records, store, pictures)
-    new = [record for record in records if record.run_id not in watched.reused]
-    for caution in filter(None, (training_scene_note(records), drift_note(new, store))):
+    if caution := training_scene_note(records):
         note(caution)
     unscored = [record for record in records if not record.sequence.ground_truth and not record.failed]
     for record in unscored[:1]:

@@ -35,8 +35,6 @@ COLUMNS = {
     "study": "study",
 }
 """Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
-LONG_PATH_M = 20.0
-"""Path length from which drift may need loop closing (docs/backend.md, Loops)."""
 HINT_FRAMES = 60
 """Frames of a recording that are checked when a run on it fails: a few seconds."""
 _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
@@ -170,21 +168,10 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
         "keyframes": record.keyframes,
         "map_points": record.map_points,
         "maps": record.maps,
-        "loops closed": closed_loops(store, record.run_id),
         "overrides": assignments(record.overrides),
         "notes": record.notes,
         "command": " ".join(record.command),
     }
-
-
-def closed_loops(store: stored.RunStore, run_id: str) -> int | None:
-    """How many loops a run had closed at its end; None without that column, or if its table is damaged."""
-    try:
-        frames = stored.load_frames(run_id, store.root)
-    except RunError:
-        return None
-    counts = frames["stat_loops"].dropna().tolist() if "stat_loops" in frames else []
-    return int(counts[-1]) if counts else None
 
 
 def show_runs(
@@ -252,20 +239,6 @@ def training_scene_note(records: Sequence[stored.RunRecord]) -> str:
         f"{ids[0]}: a best case, which reports mark and do not rank; scenes 100-199 are held out, e.g. "
         f"{ids[0].partition('?')[0].partition('@')[0]}?scene=100"
     )
-
-
-def drift_note(records: Sequence[stored.RunRecord], store: stored.RunStore) -> str:
-    """One line on the first run with a long path and without loop closing; empty without any."""
-    for record in records:
-        if record.settings.get("backend.loop_closing.enabled") is not False or record.tracker.sensors != "rgbd":
-            continue
-        trajectory = store.trajectory(record.run_id)
-        if trajectory is not None and trajectory.path_length_m > LONG_PATH_M:
-            return (
-                f"the path on {record.sequence.id} is {trajectory.path_length_m:.0f} m long, without loop closing: "
-                "drift stays, with every frame ok; loops are closed with --set backend.loop_closing.enabled=true"
-            )
-    return ""
 
 
 def recording_note(

@@ -19,14 +19,6 @@ from dynslam_bench.cli.options import (
 )
 from dynslam_bench.cli.output import fields, present, progress, table, write
 
-TrainingAssignments = Annotated[
-    Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
-    typer.Option("--set", metavar="NAME=VALUE", help="Set one of the training's, e.g. iterations=1200; repeatable."),
-]
-TrainingFile = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--settings", help="TOML file of the training's settings."),
-]
 MaskAssignments = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--set", metavar="NAME=VALUE", help="Set one of the masks', e.g. classes=person; repeatable."),
@@ -38,8 +30,16 @@ app = typer.Typer(help="Train, measure and export segmentation networks, record 
 @app.command()
 def train(
     output: Annotated[Path, typer.Argument(help="Folder of the training run.")],
-    assignments: TrainingAssignments = None,
-    settings: TrainingFile = None,
+    assignments: Annotated[
+        Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Set one of the training's, e.g. iterations=1200; repeatable."
+        ),
+    ] = None,
+    settings: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--settings", help="TOML file of the training's settings."),
+    ] = None,
     data_cache: Annotated[Optional[Path], typer.Option(help="Where prepared images are kept.")] = None,  # noqa: UP045
     device: Device = "auto",
     threads: Threads = 1,

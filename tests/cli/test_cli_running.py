@@ -136,34 +136,6 @@ def test_a_run_that_was_lost_is_no_success(cli, walk):
     assert json.loads(out)[0]["status"] == "lost" and code == 3
 
 
-def test_a_long_path_without_loop_closing_is_noted(cli, walk, monkeypatch):
-    notes: list[str] = []
-    monkeypatch.setattr(running, "note", notes.append)
-    monkeypatch.setattr(runs, "LONG_PATH_M", 0.001)
-    for tracker, *settings in (
-        ("orb-slam2-mono",),  # its unit of length is not known
-        ("constant-velocity",),  # it has no loop closing
-        ("orb-slam2", "--set", "backend.loop_closing.enabled=true"),
-    ):
-        assert cli("run", tracker, walk, *settings)[0] in (0, 3)
-    assert not any("without loop closing" in text for text in notes)
-    assert cli("run", "orb-slam2", walk)[0] == cli("run", "orb-slam2", walk)[0] == 0
-    assert sum("without loop closing" in text for text in notes) == 1, "of new runs only"
-
-
-def test_show_counts_closed_loops(cli, facts, walk):
-    (row,) = facts("run", "orb-slam2", walk)
-    table = Path(row["folder"]) / "frames.csv"
-    heading, *lines = table.read_text().splitlines()
-    cells = lines[-1].split(",")
-    cells[heading.split(",").index("stat_loops")] = "2.0"
-    table.write_text("\n".join([heading, *lines[:-1], ",".join(cells), ""]))
-    assert re.search(r"^loops closed +2$", cli("runs", "show")[1], re.MULTILINE)
-    table.write_text("damaged")
-    code, out, _ = cli("runs", "show")
-    assert code == 0 and "loops closed" not in out
-
-
 def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
     monkeypatch.setattr(output, "HEARTBEAT_S", 0.05)
     with output.progress("3 runs") as advance:
