@@ -18,7 +18,9 @@ The names are loaded on first use, so that ``import dynslam_bench`` stays fast. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import logging
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,7 +29,8 @@ from pydantic import ValidationError
 
 from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean
 from dynslam_bench.core.records import Record
-from dynslam_bench.runs import DEFAULT_PROTOCOL, RunRecord, RunSpec, RunStore, load_frames, run_many
+from dynslam_bench.core.version import install_hint
+from dynslam_bench.runs import DEFAULT_PROTOCOL, Limits, RunRecord, RunSpec, RunStore, load_frames, run_many
 from dynslam_bench.trackers import TRACKERS
 
 if TYPE_CHECKING:
@@ -37,6 +40,8 @@ if TYPE_CHECKING:
     from dynslam_bench.contracts import Trajectory
     from dynslam_bench.evaluation.protocol import Protocol
     from dynslam_bench.reports import ReportPaths
+    from dynslam_bench.runs import ResolvedRun, RunEvent
+    from dynslam_bench.runs.running import OnFault
     from dynslam_bench.tuning import StudySpec, StudySummary, Tuner
 
 R = TypeVar("R", bound=Record)
@@ -125,8 +130,9 @@ def run(
     Raises:
         DynslamError: The tracker, the sequence or an option is unknown or does not fit.
     """
-    specs = make_specs(tracker, [str(sequence)], settings=settings, preset=preset, **options)
-    return _make(specs, results, protocol)[0]
+    repeat = {"seeds": [options.pop("seed", 0)], "offsets": [options.pop("offset", 0)]}
+    specs = make_specs(tracker, [str(sequence)], settings=settings, preset=preset, **repeat, **options)
+    return run_specs(specs, results=results, protocol=protocol)[0]
 
 
 def make_specs(
@@ -135,8 +141,8 @@ def make_specs(
     *,
     settings: Mapping[str, Any] | None = None,
     preset: str | None = None,
-    seeds: Sequence[int] = (),
-    offsets: Sequence[int] = (),
+    seeds: Sequence[int] = (0,),
+    offsets: Sequence[int] = (0,),
     **options: Any,
 ) -> list[RunSpec]:
     """The runs of a tracker on sequences, with all seeds and offsets.
@@ -149,13 +155,11 @@ def make_specs(
     if preset is not None and preset not in presets:
         raise SettingsError(f"tracker '{tracker}' has no preset '{preset}'", did_you_mean(preset, presets))
     overrides = {**presets.get(preset or "", {}), **(settings or {})}
-    repeats = [{"seed": seed} for seed in seeds] or [{}]
-    starts = [{"offset": offset} for offset in offsets] or [{}]
     return [
-        checked(RunSpec, tracker=tracker, sequence=sequence, settings=overrides, **options, **repeat, **start)
+        checked(RunSpec, tracker=tracker, sequence=sequence, settings=overrides, seed=seed, offset=offset, **options)
         for sequence in sequences
-        for repeat in repeats
-        for start in starts
+        for seed in seeds
+        for offset in offsets
     ]
 
 
@@ -179,6 +183,13 @@ def bench(
     results: str | Path = "results",
     jobs: int = 1,
     protocol: str = DEFAULT_PROTOCOL,
+    scheduler: str | None = None,
+    retry: Collection[str] = (),
+    time_limit_s: float | None = None,
+    memory_limit_mb: float | None = None,
+    on_plan: Callable[[Collection[ResolvedRun]], None] | None = None,
+    on_event: Callable[[RunEvent], None] | None = None,
+    on_fault: OnFault | None = None,
     **choice: Any,
 ) -> list[RunResult]:
     """Run a suite: every tracker on every sequence; a second call continues an interrupted one.
@@ -188,6 +199,13 @@ def bench(
         results: The results folder.
         jobs: Runs at a time.
         protocol: How to evaluate.
+        scheduler: Address of a Dask scheduler whose workers make the runs.
+        retry: See `run_many`, as the callbacks `on_plan`, `on_event` and `on_fault`.
+        time_limit_s: Seconds that a run may take, in place of the suite's limit.
+        memory_limit_mb: Memory that a run may take, in place of the suite's limit.
+        on_plan: Called before the first run.
+        on_event: Called with every `RunEvent`.
+        on_fault: Called with every run that cannot be made.
         **choice: Arguments of `Suite.specs`: ``trackers``, ``seeds``, ``offsets``, ``frames``, ``data_root``, ...
 
     Raises:
@@ -195,14 +213,57 @@ def bench(
     """
     from dynslam_bench.suites import load_suite
 
-    return _make(load_suite(suite).specs(**choice), results, protocol, jobs)
-
-
-def _make(specs: Iterable[RunSpec], results: str | Path, protocol: str, jobs: int = 1) -> list[RunResult]:
-    store = RunStore(results)
-    return [
-        RunResult(record, store, protocol) for record in run_many(specs, results=store, jobs=jobs, protocol=protocol)
+    asked = {"time_s": time_limit_s, "memory_mb": memory_limit_mb}
+    limits = {name: value for name, value in asked.items() if value is not None}
+    specs = [
+        spec.model_copy(update={"limits": checked(Limits, **(spec.limits.model_dump() | limits))})
+        for spec in load_suite(suite).specs(**choice)
     ]
+    how: dict[str, Any] = {"on_plan": on_plan, "on_event": on_event, "on_fault": on_fault, "retry": retry}
+    return run_specs(specs, results=results, protocol=protocol, jobs=jobs, scheduler=scheduler, **how)
+
+
+def run_specs(
+    specs: Iterable[RunSpec],
+    *,
+    results: str | Path = "results",
+    protocol: str = DEFAULT_PROTOCOL,
+    scheduler: str | None = None,
+    **how: Any,
+) -> list[RunResult]:
+    """Make runs that are given one by one.
+
+    Args:
+        specs: The runs, e.g. of `make_specs`.
+        results: The results folder.
+        protocol: How to evaluate.
+        scheduler: Address of a Dask scheduler whose workers make the runs.
+        **how: Further arguments of `run_many`.
+
+    Raises:
+        DynslamError: See `run_many`; or the scheduler does not answer.
+    """
+    store = RunStore(results)
+    executor = None if scheduler is None else dask_executor(scheduler)
+    records = run_many(specs, results=store, protocol=protocol, executor=executor, **how)
+    return [RunResult(record, store, protocol) for record in records]
+
+
+def dask_executor(address: str) -> Executor:
+    """The executor of a Dask cluster.
+
+    Raises:
+        RunError: ``distributed`` is not installed, or the scheduler does not answer.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise RunError("a scheduler needs the package distributed", install_hint("cluster")) from error
+    try:
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # it logs a lost scheduler with a traceback
+        return Client(address, timeout="10s").get_executor()  # type: ignore[no-any-return]
+    except (OSError, ValueError) as error:
+        raise RunError(f"no Dask scheduler answers at {address}: {error}", "for example tcp://host:8786") from error
 
 
 def tune(

@@ -1,4 +1,4 @@
-"""The arguments of an environment: the sequence and its part, the device, and the names of modes."""
+"""The arguments of an environment: the sequence and its part, and the device."""
 
 from __future__ import annotations
 
@@ -12,31 +12,12 @@ import numpy as np
 from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
 from dynslam_bench.core.errors import SequenceError, SettingsError
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.stamps import refuse_close
-from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
-from dynslam_bench.sequences.settings import PreprocessingSettings
-from dynslam_bench.sequences.view import SequenceView
+from dynslam_bench.sequences import PreprocessingSettings, SequenceView, open_sequence
+from dynslam_bench.sequences.catalogue import parse_frames
 
-RENDER_MODES = ("rgb_array",)
 Frames = PySequence[int | None] | str | None
 """Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
-
-
-def check_arguments(render_mode: str | None, observation: str, lost_after: int | None, threads: int) -> None:
-    """Refuse arguments with which no environment can be made.
-
-    Raises:
-        SettingsError: Names the first such argument and its value.
-    """
-    if render_mode not in (None, *RENDER_MODES):
-        raise SettingsError(f"unknown render mode '{render_mode}'", "known: " + ", ".join(RENDER_MODES))
-    if observation not in ("stats", "rgbd"):
-        raise SettingsError(f"unknown observation '{observation}'", "known: stats, rgbd")
-    if lost_after is not None and lost_after < 1:
-        raise SettingsError(f"lost_after is {lost_after}", "give a number of frames >= 1, or None")
-    if threads < 1:
-        raise SettingsError(f"threads is {threads}", "give a number >= 1")
 
 
 def open_frames(
@@ -112,18 +93,6 @@ def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
     """The group ``preprocessing`` of a tracker's settings; None for trackers without one."""
     group = getattr(settings, "preprocessing", None)
     return group if isinstance(group, PreprocessingSettings) else None
-
-
-def check_same_size(old: Camera, new: Camera) -> None:
-    """Refuse images that do not fit an observation space.
-
-    Raises:
-        SequenceError: Carries both sizes.
-    """
-    if (old.width, old.height) != (new.width, new.height):
-        raise SequenceError(
-            f"images of {new.width}x{new.height} do not fit the observation space of {old.width}x{old.height}"
-        )
 
 
 def resolve_device(name: str = "auto") -> str:

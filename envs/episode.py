@@ -11,16 +11,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts import Frame, Sequence, Tracker, TrackResult, Trajectory
 from dynslam_bench.contracts.checks import check_frame, check_result, tracker_code
-from dynslam_bench.contracts.sequence import Frame, Sequence
-from dynslam_bench.contracts.tracker import Tracker, TrackResult
 from dynslam_bench.core.errors import DynslamError, EvaluationError, SequenceError
-from dynslam_bench.evaluation.evaluate import evaluate
-from dynslam_bench.evaluation.online import OnlineSample
+from dynslam_bench.evaluation import OnlineSample, Protocol, evaluate
 from dynslam_bench.evaluation.prepare import tracked_frames
-from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
 
 FrameState = Literal["initialising", "ok", "lost", "dropped"]
 FrameTransform = Callable[[Frame], Frame]
@@ -76,11 +72,6 @@ class Episode:
     def next_index(self) -> int:
         """Index of the frame that comes next."""
         return len(self.outcomes)
-
-    @property
-    def tracked(self) -> int:
-        """How many frames have state ``ok``."""
-        return sum(outcome.state == "ok" for outcome in self.outcomes)
 
     def trajectory(self) -> Trajectory:
         """The online trajectory: the poses of the frames with state ``ok``, each as it was when the frame came."""

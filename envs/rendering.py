@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, Sequence
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Frame, Sequence, TrackResult
 from dynslam_bench.envs.episode import Episode
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
@@ -48,20 +46,21 @@ class Canvas:
     """
 
     def __init__(self, sequence: Sequence, label: str) -> None:
-        camera = sequence.camera
-        self._scale = HEIGHT / camera.height
-        self._width = 2 * round(camera.width * self._scale / 2)
+        self._scale = HEIGHT / sequence.camera.height
+        self._width = 2 * round(sequence.camera.width * self._scale / 2)
         self._title = f"{label}  |  {sequence.id}"
         self._frames = len(sequence)
         self._truth = _truth_from_first(sequence)
-        self._plan = _Plan(self._truth)
+        positions = np.array([pose[:3, 3] for pose in self._truth.values()]).reshape(-1, 3)
+        self._view = main_view(positions)
+        self._truth_path = positions @ VIEWS[self._view].T
 
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
         """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
-        picture = self.picture(frame, result)
-        path = align_to_truth(episode, self._truth)
-        body = np.concatenate([picture, self._plan.draw(episode, path)], axis=1)
-        return np.concatenate([body, self._strip(result, episode, path.ate_m, body.shape[1])], axis=0)
+        centres, pieces, ate_m = align_to_truth(episode, self._truth)
+        plot = self._plot(centres @ VIEWS[self._view].T, pieces, episode.outcomes[-1].index)
+        body = np.concatenate([self.picture(frame, result), plot], axis=1)
+        return np.concatenate([body, self._strip(result, episode, ate_m, body.shape[1])], axis=0)
 
     def picture(self, frame: Frame, result: TrackResult) -> Image:
         """The image alone with its features and mask, uint8 ``[480, W, 3]``, red first."""
@@ -81,119 +80,70 @@ class Canvas:
                     cv2.circle(image, (x, y), 2, colour, -1, cv2.LINE_AA)
         return image
 
+    def _plot(self, estimate: Array, pieces: list[slice], now: int) -> Image:
+        """A square plot of the estimated centres ``[N, 2]`` over the ground truth up to frame `now` and ahead."""
+        plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
+        points = np.concatenate([self._truth_path, estimate, np.zeros((1, 2))])
+        low, high = points.min(axis=0), points.max(axis=0)
+        centre, metres_a_pixel = (low + high) / 2, max(float((high - low).max()), 0.1) / (HEIGHT - 120)
+
+        def to_pixels(points: Array) -> Array:
+            offset = (points - centre) / metres_a_pixel
+            return np.stack([HEIGHT / 2 + offset[:, 0], HEIGHT / 2 - offset[:, 1]], axis=1)
+
+        _grid(plot, centre, metres_a_pixel)
+        passed = self._truth_path[: sum(index <= now for index in self._truth)]
+        for path, colour, thickness in ((self._truth_path, TRUTH_AHEAD, 1), (passed, TRUTH, 2)):
+            if len(path) > 1:
+                _polyline(plot, to_pixels(path), colour, thickness)
+        for piece in pieces:
+            _polyline(plot, to_pixels(estimate[piece]), ESTIMATE, 2)
+        if len(estimate):
+            x, y = to_pixels(estimate[-1:])[0].round().astype(int).tolist()
+            cv2.circle(plot, (x, y), 5, ESTIMATE, -1, cv2.LINE_AA)
+        _scale_bar(plot, metres_a_pixel)
+        _text(plot, self._view, (HEIGHT - 215, HEIGHT - 13), (120, 120, 120), 0.42)
+        cv2.rectangle(plot, (0, 0), (HEIGHT - 1, HEIGHT - 1), (200, 200, 200), 1)
+        return plot
+
     def _strip(self, result: TrackResult, episode: Episode, ate_m: float | None, width: int) -> Image:
         strip = np.full((STRIP, width, 3), 235, np.uint8)
         last = episode.outcomes[-1]
         _text(strip, self._title, (10, 24), _INK, 0.5)
-        state = str(last.state)
-        _text(strip, state, (10, 50), _STATE_COLOUR[state], 0.5, 2)
-        stats = result.stats
+        _text(strip, last.state, (10, 50), _STATE_COLOUR[last.state], 0.5, 2)
         parts = [f"frame {last.index + 1}/{self._frames}", f"t {last.timestamp - episode.outcomes[0].timestamp:.2f} s"]
-        for key, name in (("keypoints", "features"), ("culled", "culled"), ("inliers", "inliers"), ("keyframes", "kf")):
-            if key in stats:
-                parts.append(f"{name} {stats[key]:.0f}")
-        if last.error is not None:
+        names = {"keypoints": "features", "culled": "culled", "inliers": "inliers", "keyframes": "kf"}
+        parts += [f"{name} {result.stats[key]:.0f}" for key, name in names.items() if key in result.stats]
+        if last.error is None:
+            parts.append("no ground truth here")
+        else:
             parts.append(f"pose error {100 * last.error.trans_m:.1f} cm, {last.error.rot_deg:.2f} deg")
             if last.error.frame_trans_m is not None:
                 parts.append(f"frame error {1000 * last.error.frame_trans_m:.1f} mm")
-        else:
-            parts.append("no ground truth here")
         if ate_m is not None:
             parts.append(f"ATE so far {1000 * ate_m:.1f} mm")
         _text(strip, "   ".join(parts), (130, 50), _INK, 0.45)
-        x = width - 470
-        for name, colour in (("kept", KEPT), ("culled", CULLED), ("mask", MASK)):
-            cv2.circle(strip, (x, 19), 5, colour, -1, cv2.LINE_AA)
-            _text(strip, name, (x + 10, 24), _INK, 0.45)
-            x += 75
-        for name, colour in (("estimate", ESTIMATE), ("ground truth", TRUTH)):
-            cv2.line(strip, (x, 19), (x + 20, 19), colour, 3, cv2.LINE_AA)
-            _text(strip, name, (x + 26, 24), _INK, 0.45)
-            x += 110
+        for x, name, colour in ((470, "kept", KEPT), (395, "culled", CULLED), (320, "mask", MASK)):
+            cv2.circle(strip, (width - x, 19), 5, colour, -1, cv2.LINE_AA)
+            _text(strip, name, (width - x + 10, 24), _INK, 0.45)
+        for x, name, colour in ((245, "estimate", ESTIMATE), (135, "ground truth", TRUTH)):
+            cv2.line(strip, (width - x, 19), (width - x + 20, 19), colour, 3, cv2.LINE_AA)
+            _text(strip, name, (width - x + 26, 24), _INK, 0.45)
         return strip
 
 
-@dataclass(frozen=True)
-class Plane:
-    """Two axes of the first camera's frame: what is to the right, what is up, and what the view is called."""
-
-    right: int
-    up: int
-    sign: int
-    name: str
-
-    def __call__(self, positions: Array) -> Array:
-        """Coordinates ``[N, 2]`` of positions ``[N, 3]``, to the right and up."""
-        return positions[:, [self.right, self.up]] * (1, self.sign)
+VIEWS = {
+    "from above: x right, z up": np.array([[1.0, 0, 0], [0, 0, 1]]),
+    "from behind: x right, y down": np.array([[1.0, 0, 0], [0, -1, 0]]),
+    "from the side: z right, y down": np.array([[0, 0, 1.0], [0, -1, 0]]),
+}
+"""Projections ``[2, 3]`` of the first camera's frame to the right and up, by the name of the view."""
 
 
-PLANES = (
-    Plane(0, 2, 1, "from above: x right, z up"),
-    Plane(0, 1, -1, "from behind: x right, y down"),
-    Plane(2, 1, -1, "from the side: z right, y down"),
-)
-
-
-def main_plane(positions: Array) -> Plane:
-    """The plane in which positions ``[N, 3]`` spread most; that from above for fewer than two, and for a tie."""
+def main_view(positions: Array) -> str:
+    """The view in which positions ``[N, 3]`` spread most; that from above for fewer than two, and for a tie."""
     spread = positions.std(axis=0) if len(positions) > 1 else np.zeros(3)
-    return max(PLANES, key=lambda plane: float(np.round(spread[plane.right] + spread[plane.up], 9)))
-
-
-@dataclass(frozen=True)
-class AlignedPath:
-    """Estimated centres ``[N, 3]`` in the truth's frame, the pieces without a gap, and the ATE where it is known."""
-
-    centres: Array
-    pieces: list[slice]
-    ate_m: float | None = None
-
-
-class _Plan:
-    """A square map of the trajectory."""
-
-    def __init__(self, truth: dict[int, Array]) -> None:
-        self._truth = {index: pose[:3, 3] for index, pose in sorted(truth.items())}
-        positions = np.array(list(self._truth.values())).reshape(-1, 3)
-        self._plane = main_plane(positions)
-        self._truth_path = self._plane(positions)
-
-    def draw(self, episode: Episode, path: AlignedPath) -> Image:
-        plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
-        estimate = self._plane(path.centres)
-        to_pixel, metres_a_pixel = self._view(estimate)
-        _grid(plot, to_pixel, metres_a_pixel)
-        if len(self._truth_path) > 1:
-            _polyline(plot, to_pixel(self._truth_path), TRUTH_AHEAD, 1)
-        now = episode.outcomes[-1].index
-        passed = self._truth_path[: sum(index <= now for index in self._truth)]
-        if len(passed) > 1:
-            _polyline(plot, to_pixel(passed), TRUTH, 2)
-        for piece in path.pieces:
-            _polyline(plot, to_pixel(estimate[piece]), ESTIMATE, 2)
-        if len(estimate):
-            x, y = to_pixel(estimate[-1:])[0].round().astype(int).tolist()
-            cv2.circle(plot, (x, y), 5, ESTIMATE, -1, cv2.LINE_AA)
-        _scale_bar(plot, metres_a_pixel)
-        _text(plot, self._plane.name, (HEIGHT - 215, HEIGHT - 13), (120, 120, 120), 0.42)
-        cv2.rectangle(plot, (0, 0), (HEIGHT - 1, HEIGHT - 1), (200, 200, 200), 1)
-        return plot
-
-    def _view(self, estimate: Array) -> tuple[_ToPixel, float]:
-        points = np.concatenate([self._truth_path, estimate, np.zeros((1, 2))])
-        low, high = points.min(axis=0), points.max(axis=0)
-        extent = max(float((high - low).max()), 0.1)
-        metres_a_pixel = extent / (HEIGHT - 120)
-        return _ToPixel((low + high) / 2, metres_a_pixel), metres_a_pixel
-
-
-class _ToPixel:
-    def __init__(self, centre: Array, metres_a_pixel: float) -> None:
-        self.centre, self.metres_a_pixel = centre, metres_a_pixel
-
-    def __call__(self, points: Array) -> Array:
-        offset = (np.asarray(points).reshape(-1, 2) - self.centre) / self.metres_a_pixel
-        return np.stack([HEIGHT / 2 + offset[:, 0], HEIGHT / 2 - offset[:, 1]], axis=1)
+    return max(VIEWS, key=lambda view: float(np.round((np.abs(VIEWS[view]) @ spread).sum(), 9)))
 
 
 def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
@@ -207,15 +157,18 @@ def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
     return {i: origin @ pose for i, pose in defined.items()}
 
 
-def align_to_truth(episode: Episode, truth: dict[int, Array]) -> AlignedPath:
+def align_to_truth(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice], float | None]:
     """The estimate in the truth's frame.
 
     They are joined at the first frame that has both, and aligned by least squares over all frames so far (as for the
     ATE) from `ALIGN_FROM` frames on.
+
+    Returns:
+        Camera centres ``[N, 3]`` in metres, the pieces of them without a gap, and the ATE in metres where it is known.
     """
     tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
     if not tracked:
-        return AlignedPath(np.zeros((0, 3)), [])
+        return np.zeros((0, 3)), [], None
     poses = np.array([pose for _, pose in tracked])
     both = [row for row, (index, _) in enumerate(tracked) if index in truth]
     true = np.array([truth[tracked[row][0]] for row in both])
@@ -229,7 +182,7 @@ def align_to_truth(episode: Episode, truth: dict[int, Array]) -> AlignedPath:
         placed = se3.inverse(poses[0]) @ poses
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
     bounds = [0, *breaks.tolist(), len(placed)]
-    return AlignedPath(placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m)
+    return placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:
@@ -243,15 +196,13 @@ def _nice_length(metres: float) -> float:
     return float(max(step * power for step in (1, 2, 5) if step * power <= metres * (1 + 1e-9)))
 
 
-def _grid(plot: Image, to_pixel: _ToPixel, metres_a_pixel: float) -> None:
+def _grid(plot: Image, centre: Array, metres_a_pixel: float) -> None:
     step = _nice_length(metres_a_pixel * HEIGHT / 4)
     half = HEIGHT / 2 * metres_a_pixel
-    for axis in (0, 1):
-        first = np.ceil((to_pixel.centre[axis] - half) / step) * step
-        for value in np.arange(first, to_pixel.centre[axis] + half, step):
-            point = np.array(to_pixel.centre, dtype=np.float64)
-            point[axis] = value
-            at = round(float(to_pixel(point)[0][axis]))
+    for axis, sign in ((0, 1), (1, -1)):
+        first = np.ceil((centre[axis] - half) / step) * step
+        for value in np.arange(first, centre[axis] + half, step):
+            at = round(float(HEIGHT / 2 + sign * ((value - centre[axis]) / metres_a_pixel)))
             start, end = ((at, 0), (at, HEIGHT)) if axis == 0 else ((0, at), (HEIGHT, at))
             cv2.line(plot, start, end, (232, 232, 232), 1)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -12,42 +12,38 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts import Sequence as FrameSequence
+from dynslam_bench.contracts import Tracker, TrackerContext, TrackerSpec, Trajectory
 from dynslam_bench.contracts.checks import check_sensors, check_trajectory, tracker_code
-from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.contracts.sequence import exact_stamps
-from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
-from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
 from dynslam_bench.envs.arguments import (
-    RENDER_MODES,
     Frames,
-    check_arguments,
     check_frames,
-    check_same_size,
     open_frames,
     preprocessing_of,
     resolve_device,
 )
 from dynslam_bench.envs.episode import Episode, FrameOutcome, FrameTransform, episode_metrics, frame_info, track_one
 from dynslam_bench.envs.spaces import (
+    REWARDS,
     ActionMap,
-    ObservationContext,
     ObservationKind,
     RewardKind,
-    reward_named,
     rgbd_observation,
     rgbd_space,
     stats_observation,
     stats_space,
 )
-from dynslam_bench.evaluation.online import OnlineError
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.evaluation import OnlineError, OnlineSample, Protocol, get_protocol
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
+
+RENDER_MODES = ("rgb_array",)
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -61,10 +57,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     The tracker then needs the method of `core.settings.Reconfigurable`, ``configure(settings)``: it takes the complete
     settings, of which only online fields differ from those it was built with, and ``reset`` brings those back.
 
-    **Observation.** ``stats``: float32 ``[24]`` (see `observation.STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
+    **Observation.** ``stats``: float32 ``[24]`` (see `STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
     ``depth`` and ``stats``. Neither holds anything of the ground truth.
 
-    **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `reward.REWARDS`). Frames without a tracked pose, and
+    **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `REWARDS`). Frames without a tracked pose, and
     all remaining ones when `lost_after` ends an episode, cost twice the true motion (``neg_rpe``: not having moved, and
     having to catch up), or the length of the true path so far (``neg_pose_error``).
 
@@ -127,14 +123,24 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
-        check_arguments(render_mode, observation, lost_after, threads)
+        modes: tuple[tuple[str, str | None, Iterable[str | None]], ...] = (
+            ("render mode", render_mode, (None, *RENDER_MODES)),
+            ("observation", observation, ("stats", "rgbd")),
+            ("reward", reward, REWARDS),
+        )
+        for title, value, choices in modes:
+            if value not in choices:
+                raise SettingsError(f"unknown {title} '{value}'", f"choose {' or '.join(filter(None, choices))}")
+        for title, number in (("lost_after", lost_after), ("threads", threads)):
+            if number is not None and number < 1:
+                raise SettingsError(f"{title} is {number}", "give a number >= 1")
         self.render_mode = render_mode
         self.protocol = get_protocol(protocol)
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
         self.frame_transforms: list[FrameTransform] = []
         """Applied in order to every frame before the tracker sees it; wrappers add to it."""
         self._observation: ObservationKind = observation
-        self._reward = reward_named(reward)
+        self._reward_of = REWARDS[reward]
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
@@ -142,7 +148,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._part = (data_root, camera, frames, stride)
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
-        self._tracker_key: object = None
         self._use_settings(settings)
         self._use_sequence(sequence)
         segmentation_source(self.settings, self.sequence, fetch=False)
@@ -151,11 +156,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.episode = Episode()
         self._final: Trajectory | None = None
         self._canvas: Any = None
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Dotted names of the controlled settings, in the order of the action's coordinates."""
-        return self._actions.names
 
     @property
     def neutral_action(self) -> Any:
@@ -283,12 +283,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if not 0 <= count <= left:
             raise DynslamError(f"cannot drop {count} frames, {left} are left before the last one")
         total = 0.0
-        for _ in range(count):
-            stamp = float(self.sequence.timestamps[self.episode.next_index])
+        for index in range(self.episode.next_index, self.episode.next_index + count):
+            stamp = float(self.sequence.timestamps[index])
             error = self._errors.update(stamp, None, False)
-            reward = self._reward(error)
-            self.episode.add(FrameOutcome(self.episode.next_index, stamp, "dropped", None, {}, {}, error, reward))
-            total += reward
+            outcome = FrameOutcome(index, stamp, "dropped", None, {}, {}, error, self._reward(error))
+            self.episode.add(outcome)
+            total += outcome.reward
         return total
 
     def episode_metrics(self) -> dict[str, float]:
@@ -315,7 +315,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def close(self) -> None:
         """Close the tracker; the environment may be reset again."""
-        tracker, self._tracker, self._tracker_key = self._tracker, None, None
+        tracker, self._tracker = self._tracker, None
         close = getattr(tracker, "close", None)
         if close is not None:
             with tracker_code():
@@ -368,6 +368,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         unknown = sorted(set(options) - {"sequence", "settings"})
         if unknown:
             raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings")
+        if options:
+            self.close()  # the next tracker is built for other settings or another sequence
         preprocessing, camera = preprocessing_of(self.settings), self.sequence.camera
         if "settings" in options:
             changes = options["settings"]
@@ -377,14 +379,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 options = {"sequence": self._source, **options}
         if "sequence" in options:
             self._use_sequence(options["sequence"])
-            if self._observation == "rgbd":
-                check_same_size(camera, self.sequence.camera)
+            size, new_size = ((c.width, c.height) for c in (camera, self.sequence.camera))
+            if self._observation == "rgbd" and size != new_size:
+                raise SequenceError(f"images of {new_size} pixels do not fit the observation space of {size}")
 
     def _ready_tracker(self) -> Tracker:
-        """The tracker for the current settings and sequence; rebuilt only if one of them changed."""
-        key = (self.settings, self.sequence)
-        if self._tracker is None or self._tracker_key != key:
-            self.close()
+        """The tracker for the current settings and sequence."""
+        if self._tracker is None:
             context = TrackerContext(
                 sequence_id=self.sequence.id,
                 masks=self.sequence.masks,
@@ -395,7 +396,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             )
             with tracker_code():
                 self._tracker = build_tracker(self.tracker_spec, self.settings, context)
-            self._tracker_key = key
             if self._actions.parameters and not isinstance(self._tracker, Reconfigurable):
                 raise TrackerError(
                     f"tracker '{self.tracker_spec.id}' cannot change its settings in mid-episode",
@@ -425,6 +425,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         here = outcomes[-1].T_world_cam
         before = outcomes[-2].T_world_cam if len(outcomes) > 1 else None
         motion = se3.inverse(before) @ here if here is not None and before is not None else None
-        context = ObservationContext(outcomes[-1].index, len(self.sequence) - 1, self.episode.lost_streak, motion)
-        make = stats_observation if self._observation == "stats" else rgbd_observation
-        return make(self.frame, self.result, context)
+        stats = stats_observation(
+            self.frame,
+            self.result,
+            progress=outcomes[-1].index / max(len(self.sequence) - 1, 1),
+            lost_streak=self.episode.lost_streak,
+            T_prev_cur=motion,
+        )
+        return stats if self._observation == "stats" else rgbd_observation(self.frame, stats)
+
+    def _reward(self, error: OnlineSample | None) -> float:
+        return 0.0 if error is None else self._reward_of(error)

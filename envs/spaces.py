@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Camera, Frame, TrackResult
 from dynslam_bench.core.errors import SettingsError, did_you_mean
 from dynslam_bench.core.settings import (
     Parameter,
@@ -27,10 +25,6 @@ from dynslam_bench.core.settings import (
 )
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-
-_ONLY = spaces.Discrete(1)
-"""The action space without controlled settings; for membership alone, since each environment seeds its own."""
 
 
 class ActionMap:
@@ -68,11 +62,6 @@ class ActionMap:
         """The action ``[k]`` that leaves the settings exactly as they are."""
         return self._neutral.copy()
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Dotted names of the controlled settings, in the order of the action's coordinates."""
-        return tuple(parameter.name for parameter in self.parameters)
-
     def space(self) -> spaces.Space[NDArray[np.float32]] | spaces.Discrete:
         """The action space."""
         if not self.parameters:
@@ -89,9 +78,9 @@ class ActionMap:
             SettingsError: The action is none of the space: not 0, of another shape, no numbers, or NaN.
         """
         if not self.parameters:
-            if not _ONLY.contains(action):
+            if not self.space().contains(action):
                 raise SettingsError(
-                    f"the action {reprlib.repr(action)} is not in {_ONLY}",
+                    f"the action {reprlib.repr(action)} is not in Discrete(1)",
                     "without control the only action is 0; name settings in control to change them",
                 )
             return self.base
@@ -103,11 +92,13 @@ class ActionMap:
             vector = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
             raise SettingsError(
-                f"the action {reprlib.repr(action)} holds no numbers", f"one in [-1, 1] for each of {self.names}"
+                f"the action {reprlib.repr(action)} holds no numbers",
+                f"one in [-1, 1] for each of {list(self._values)}",
             ) from None
-        if vector.shape != (len(self.parameters),):
+        if vector.shape != (len(self._values),):
             raise SettingsError(
-                f"the action has shape {vector.shape}, {len(self.parameters)} settings are controlled: {self.names}"
+                f"the action has shape {vector.shape}, {len(self._values)} settings are controlled: "
+                f"{', '.join(self._values)}"
             )
         if np.isnan(vector).any():
             raise SettingsError(f"the action holds NaN: {vector.tolist()}")
@@ -207,23 +198,6 @@ STATS_SIZE = len(STATS_LAYOUT)
 _SIGNED = np.array([name.startswith("motion_") for name, _ in STATS_LAYOUT])
 
 
-@dataclass(frozen=True)
-class ObservationContext:
-    """What an observation may use beside the frame and the tracker's result.
-
-    Attributes:
-        index: Index of the frame.
-        last_index: Index of the sequence's last frame.
-        lost_streak: Frames lost in a row, this one included.
-        T_prev_cur: Estimated motion since the previous frame, None if either frame has no pose.
-    """
-
-    index: int
-    last_index: int
-    lost_streak: int
-    T_prev_cur: NDArray[np.float64] | None
-
-
 def stats_space() -> spaces.Box:
     """``Box`` of float32 ``[24]``: entries in [0, 1], the motion's in [-1, 1]; see `STATS_LAYOUT`."""
     low = np.where(_SIGNED, -1.0, 0.0).astype(np.float32)
@@ -242,15 +216,23 @@ def rgbd_space(camera: Camera) -> spaces.Dict:
     )
 
 
-def stats_observation(frame: Frame, result: TrackResult, context: ObservationContext) -> NDArray[np.float32]:
-    """The vector of `STATS_LAYOUT` for one tracked frame; finite whatever the tracker reports."""
+def stats_observation(
+    frame: Frame, result: TrackResult, *, progress: float, lost_streak: int, T_prev_cur: NDArray[np.float64] | None
+) -> NDArray[np.float32]:
+    """The vector of `STATS_LAYOUT` for one tracked frame; finite whatever the tracker reports.
+
+    Args:
+        frame: The frame.
+        result: What the tracker gave for it.
+        progress: Index of the frame, over that of the sequence's last one.
+        lost_streak: Frames lost in a row, this one included.
+        T_prev_cur: Estimated motion since the previous frame ``[4, 4]``; None if either frame has no pose.
+    """
     stats = result.stats
     keypoints = _stat(stats, "keypoints")
     culled = _stat(stats, "culled")
     matches = _stat(stats, "matches")
-    motion = np.zeros(6)
-    if context.T_prev_cur is not None:
-        motion = np.tanh(se3.log(context.T_prev_cur) / 0.1)
+    motion = np.zeros(6) if T_prev_cur is None else np.tanh(se3.log(T_prev_cur) / 0.1)
     gray = frame.rgb[::4, ::4].mean(axis=2, dtype=np.float32)
     depth = frame.depth[::4, ::4]
     valid = depth[(depth > 0) & np.isfinite(depth)]
@@ -258,8 +240,8 @@ def stats_observation(frame: Frame, result: TrackResult, context: ObservationCon
         float(result.state == "initialising"),
         float(result.state == "ok"),
         float(result.state == "lost"),
-        _saturate(context.lost_streak, 10.0),
-        context.index / max(context.last_index, 1),
+        _saturate(lost_streak, 10.0),
+        progress,
         _saturate(keypoints, 1000.0),
         _ratio(culled, keypoints),
         _ratio(matches, keypoints - culled),
@@ -275,19 +257,16 @@ def stats_observation(frame: Frame, result: TrackResult, context: ObservationCon
         valid.size / max(depth.size, 1),
         _saturate(float(np.median(valid)), 3.0) if valid.size else 0.0,
     ]
-    vector = np.asarray(values, dtype=np.float32)
-    return np.clip(vector, np.where(_SIGNED, -1.0, 0.0), 1.0).astype(np.float32)
+    return np.clip(np.asarray(values, dtype=np.float32), np.where(_SIGNED, -1.0, 0.0), 1.0).astype(np.float32)
 
 
-def rgbd_observation(
-    frame: Frame, result: TrackResult, context: ObservationContext
-) -> dict[str, NDArray[np.uint8] | NDArray[np.float32]]:
+def rgbd_observation(frame: Frame, stats: NDArray[np.float32]) -> dict[str, NDArray[np.uint8] | NDArray[np.float32]]:
     """Copies of the images, and the vector of `stats_observation`."""
     depth = np.nan_to_num(frame.depth, nan=0.0, posinf=MAX_DEPTH_M, neginf=0.0)
     return {
         "rgb": np.array(frame.rgb, dtype=np.uint8),
         "depth": np.clip(depth, 0.0, MAX_DEPTH_M).astype(np.float32),
-        "stats": stats_observation(frame, result, context),
+        "stats": stats,
     }
 
 
@@ -332,15 +311,3 @@ REWARDS: dict[str, Callable[[OnlineSample], float]] = {
 
 The sum over an episode is not the ATE, which the last step's ``episode_metrics`` give under the protocol.
 """
-
-
-def reward_named(name: str) -> Callable[[OnlineSample | None], float]:
-    """The reward of a name, as a function of a frame's error (None where there is no ground truth).
-
-    Raises:
-        SettingsError: There is none of that name.
-    """
-    if name not in REWARDS:
-        raise SettingsError(f"unknown reward '{name}'", did_you_mean(name, REWARDS))
-    of_sample = REWARDS[name]
-    return lambda error: 0.0 if error is None else of_sample(error)

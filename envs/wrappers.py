@@ -54,25 +54,27 @@ class RecordTimings(SlamWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset, with the times of frame 0 in ``info``."""
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation, info | {"timings": self._last()}
+        return observation, info | {"timings": self._base.timings[-1]}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step, with the frame's times in ``info``."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, info | {"timings": self._last()}
+        return (
+            observation,
+            reward,
+            terminated,
+            truncated,
+            info | {"timings": self._base.timings[-1]},
+        )
 
     def summary(self) -> dict[str, dict[str, float]]:
         """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
         frames = [frame for frame in self._base.timings if frame]
-        stages = dict.fromkeys(stage for frame in frames for stage in frame)
-        series = {stage: [frame.get(stage, 0.0) for frame in frames] for stage in stages}
-        return {
-            stage: {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
-            for stage, values in series.items()
-        }
-
-    def _last(self) -> dict[str, float]:
-        return {stage: float(seconds) for stage, seconds in self._base.episode.outcomes[-1].timings.items()}
+        summary = {}
+        for stage in dict.fromkeys(stage for frame in frames for stage in frame):
+            seconds = [frame.get(stage, 0.0) for frame in frames]
+            summary[stage] = {"median": float(np.median(seconds)), "p95": float(np.percentile(seconds, 95))}
+        return summary
 
 
 class RecordTrajectory(SlamWrapper):
@@ -185,7 +187,8 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
         if min(width, height) < 1:
             raise SettingsError(f"an image of {width} x {height} pixels has none")
         self._size = (width, height)
-        images = {name: spaces.Box(0, 255, (height, width, depth), np.uint8) for name, depth in _CHANNELS.items()}
+        images = {"rgb": spaces.Box(0, 255, (height, width, 3), np.uint8)}
+        images["depth"] = spaces.Box(0, 255, (height, width, 1), np.uint8)
         self.observation_space = spaces.Dict({**space.spaces, **images})
 
     def observation(self, observation: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -196,9 +199,6 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
         return {**observation, "rgb": rgb, "depth": steps.astype(np.uint8)[..., None]}
 
 
-_CHANNELS = {"rgb": 3, "depth": 1}
-
-
 class DegradeFrames(SlamWrapper):
     """Adds seeded lighting changes, glare, shadow, motion blur and noise to every frame.
 
@@ -207,6 +207,22 @@ class DegradeFrames(SlamWrapper):
 
     Args:
         env: A `SlamEnv`, wrapped or not.
+        **strengths: The fields of `Degradation`.
+
+    Raises:
+        SettingsError: A strength lies outside [0, 1].
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], **strengths: Any) -> None:
+        super().__init__(env, **strengths)
+        self._base.frame_transforms.append(Degradation(**strengths))
+
+
+@dataclasses.dataclass(frozen=True)
+class Degradation:
+    """Degrades frames, the same way for the same index.
+
+    Attributes:
         lighting: Brightness and colour balance drift slowly and flicker: gain between 1 and ``1 - 0.75 * lighting``.
         glare: A bright blob that wanders over the image and saturates it: up to ``0.45 * glare`` of the image's width.
         shadow: A soft-edged half plane that sweeps over the image and darkens it to ``1 - 0.85 * shadow``.
@@ -215,32 +231,7 @@ class DegradeFrames(SlamWrapper):
         depth_noise: Depth noise of standard deviation ``0.02 * depth_noise * z^2`` metres (z in metres), and a share
             ``0.3 * depth_noise`` of the pixels loses its depth.
         seed: Seed of the degradation, apart from the tracker's.
-
-    Raises:
-        SettingsError: A strength lies outside [0, 1].
     """
-
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        *,
-        lighting: float = 0.0,
-        glare: float = 0.0,
-        shadow: float = 0.0,
-        blur: float = 0.0,
-        noise: float = 0.0,
-        depth_noise: float = 0.0,
-        seed: int = 0,
-    ) -> None:
-        strengths = {"lighting": lighting, "glare": glare, "shadow": shadow, "blur": blur, "noise": noise}
-        super().__init__(env, **strengths, depth_noise=depth_noise, seed=seed)
-        self.degradation = Degradation(**strengths, depth_noise=depth_noise, seed=seed)
-        self._base.frame_transforms.append(self.degradation)
-
-
-@dataclasses.dataclass(frozen=True)
-class Degradation:
-    """Degrades frames; see `DegradeFrames` for the meaning of the strengths in [0, 1]."""
 
     lighting: float = 0.0
     glare: float = 0.0
@@ -251,10 +242,9 @@ class Degradation:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.name != "seed" and not 0.0 <= value <= 1.0:
-                raise SettingsError(f"degradation '{field.name}' is {value}, expected a strength in [0, 1]")
+        for name, value in vars(self).items():
+            if name != "seed" and not 0.0 <= value <= 1.0:
+                raise SettingsError(f"degradation '{name}' is {value}, expected a strength in [0, 1]")
 
     def __call__(self, frame: Frame) -> Frame:
         """The degraded copy of a frame."""

@@ -9,6 +9,7 @@ from typing import Annotated, Optional
 import typer
 
 from dynslam_bench.cli import (
+    demo,
     interrupted,
     leave_interrupted,
     maintenance,
@@ -21,7 +22,7 @@ from dynslam_bench.cli import (
     trackers,
     trajectories,
 )
-from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START
+from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START, ShortHelp
 from dynslam_bench.cli.output import download_bar, set_json_mode, write_error
 from dynslam_bench.core.download import show_downloads
 from dynslam_bench.core.errors import DynslamError
@@ -37,17 +38,22 @@ app = typer.Typer(
     add_completion=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command(rich_help_panel=START)(reports.demo)
+app.command(rich_help_panel=START)(demo.demo)
 app.add_typer(sequences.app, name="sequences", rich_help_panel=START)
 app.add_typer(trackers.app, name="trackers", rich_help_panel=START)
-running.add(app)
+for verb in (running.run, running.bench):
+    app.command(rich_help_panel=MEASURE, cls=ShortHelp)(verb)
 app.add_typer(runs.app, name="runs", rich_help_panel=MEASURE)
-trajectories.add(app)
+app.command("eval", rich_help_panel=MEASURE)(trajectories.evaluate)
+app.add_typer(trajectories.protocols, name="protocols", rich_help_panel=MEASURE)
+app.command("import", rich_help_panel=MEASURE)(trajectories.import_)
+app.command(rich_help_panel=MEASURE)(trajectories.export)
 app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
 app.add_typer(reports.app, name="report", rich_help_panel=REPORT)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 app.add_typer(maintenance.cache, name="cache", rich_help_panel=CARE)
-maintenance.add(app)
+app.command(rich_help_panel=START)(maintenance.envs)
+app.command(rich_help_panel=START)(maintenance.doctor)
 
 
 def _version(asked: bool) -> None:

@@ -6,35 +6,23 @@ from typing import Annotated
 
 import typer
 
-from dynslam_bench.cli.options import START, AsJson
-from dynslam_bench.cli.output import present, write, write_table
+from dynslam_bench.cli.options import AsJson
+from dynslam_bench.cli.output import present, table, write
 
 cache = typer.Typer(
     help="The stage cache: results that do not depend on the settings under study.", no_args_is_help=True
 )
 
 
-def add(app: typer.Typer) -> None:
-    """Add the verbs without a group."""
-    app.command(rich_help_panel=START)(envs)
-    app.command(rich_help_panel=START)(doctor)
-
-
 def doctor(as_json: AsJson = False) -> None:
     """Show what is installed here, which weights, sequences and extras there are, and how to get what is missing."""
-    from dynslam_bench.testing.installation import examine, torch_device
+    from dynslam_bench.testing.installation import examine
 
-    findings = [*examine(), torch_device()]
-
-    def show() -> None:
-        write_table(("part", "name", "found"), [(finding.part, finding.name, finding.state) for finding in findings])
-        missing = [finding for finding in findings if finding.missing]
-        needless = "nothing of it is needed for rendered sequences unless it is a package"
-        write(f"\nMissing, and how to get it ({needless}):" if missing else "\nNothing is missing.")
-        for finding in missing:
-            write(f"- {finding.part} {finding.name}: {finding.hint or finding.state}")
-
-    present([vars(finding) for finding in findings], show)
+    findings = examine()
+    rows = [(finding.part, finding.name, finding.state) for finding in findings]
+    missing = [f"- {f.part} {f.name}: {f.hint or f.state}" for f in findings if f.missing]
+    heading = "\nMissing, and how to get it (of this, rendered sequences need the packages alone):"
+    present(findings, table(("part", "name", "found"), rows), *([heading, *missing] if missing else []))
 
 
 def envs(as_json: AsJson = False) -> None:
@@ -42,7 +30,7 @@ def envs(as_json: AsJson = False) -> None:
     from dynslam_bench.envs import register_envs
 
     ids = register_envs()
-    present(ids, lambda: write("\n".join(ids)))
+    present(ids, *ids)
 
 
 @cache.command()
@@ -51,15 +39,13 @@ def info(as_json: AsJson = False) -> None:
     from dynslam_bench.core.stage_cache import StageCache
 
     usage = StageCache().info()
-    sizes, entries = usage.bytes_by_stage, usage.entries_by_stage
-    facts = {"folder": usage.folder, "max_bytes": usage.max_bytes, "bytes": sum(sizes.values())}
-
-    def show() -> None:
-        write(f"{usage.folder}: {sum(sizes.values()) / 1e6:.1f} of {usage.max_bytes / 1e6:.0f} MB")
-        if sizes:
-            write_table(("stage", "entries", "MB"), [(name, entries[name], size / 1e6) for name, size in sizes.items()])
-
-    present(facts | {"bytes_by_stage": sizes, "entries_by_stage": entries}, show)
+    total = sum(usage.bytes_by_stage.values())
+    rows = [(stage, usage.entries_by_stage[stage], size / 1e6) for stage, size in usage.bytes_by_stage.items()]
+    present(
+        {"bytes": total, **vars(usage)},
+        f"{usage.folder}: {total / 1e6:.1f} of {usage.max_bytes / 1e6:.0f} MB",
+        table(("stage", "entries", "MB"), rows),
+    )
 
 
 @cache.command()
@@ -67,7 +53,7 @@ def clear(yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] 
     """Delete all entries."""
     from dynslam_bench.core.stage_cache import StageCache
 
-    stored = StageCache()
+    stage_cache = StageCache()
     if not yes:
-        typer.confirm(f"delete all entries below {stored.folder}?", abort=True)
-    write(f"freed {stored.clear() / 1e6:.1f} MB")
+        typer.confirm(f"delete all entries below {stage_cache.folder}?", abort=True)
+    write(f"freed {stage_cache.clear() / 1e6:.1f} MB")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Annotated, Any, Optional, get_args
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
@@ -21,7 +22,6 @@ REPORT, CARE = "Report and tune", "Extend and care"
 FRAMES, SETTINGS = "Which frames, how often", "The tracker's settings"
 MACHINE, OUTPUT = "The machine, and how much of it", "What is kept and shown"
 """Headings of the options' help."""
-TRAJECTORY_FORMATS = "TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP"
 
 
 class DefaultGroup(TyperGroup):
@@ -57,18 +57,24 @@ def _help_all(ctx: typer.Context, on: bool) -> None:
         raise typer.Exit
 
 
-def complete_trackers() -> Iterable[str]:
+def names_of(place: str) -> Callable[[], list[str]]:
+    """Shell completion by the names that an object holds, or a function of the package returns, loaded only then."""
+
+    def complete() -> list[str]:
+        names = resolve_name(f"dynslam_bench.{place}")
+        return list(names() if callable(names) else names)
+
+    return complete
+
+
+complete_sequences = names_of("sequences.catalogue:sequence_ids")
+
+
+def complete_trackers() -> list[str]:
     """Trackers by their id."""
     from dynslam_bench.trackers import TRACKERS
 
-    return [entry.spec.id for entry in TRACKERS.all()]
-
-
-def complete_sequences() -> Iterable[str]:
-    """Ids of the catalogue and of rendered sequences."""
-    from dynslam_bench.sequences.catalogue import summaries
-
-    return [summary.id for summary in summaries()]
+    return [tracker.spec.id for tracker in TRACKERS.all()]
 
 
 def complete_settings(ctx: typer.Context, incomplete: str) -> Iterable[str]:
@@ -89,31 +95,8 @@ def complete_presets(ctx: typer.Context) -> Iterable[str]:
     return [] if spec is None else list(spec.presets)
 
 
-def complete_suites() -> Iterable[str]:
-    """Names of the shipped suites, and TOML files."""
-    from dynslam_bench.suites import suite_names
-
-    return [*suite_names(), *map(str, Path().glob("*.toml"))]
-
-
-def complete_formats() -> Iterable[str]:
-    """Formats that `export` writes."""
-    from dynslam_bench.runs.exchange.export import FORMATS
-
-    return list(FORMATS)
-
-
-def complete_protocols() -> Iterable[str]:
-    """Protocols by their id."""
-    from dynslam_bench.evaluation.protocol import PROTOCOLS
-
-    return list(PROTOCOLS)
-
-
-def complete_statuses() -> Iterable[str]:
+def complete_statuses() -> tuple[str, ...]:
     """The statuses of runs."""
-    from typing import get_args
-
     from dynslam_bench.runs.record import Status
 
     return get_args(Status)
@@ -211,7 +194,7 @@ ProtocolId = Annotated[
         "--protocol",
         help="How to evaluate; see `protocols list`.",
         rich_help_panel=OUTPUT,
-        autocompletion=complete_protocols,
+        autocompletion=names_of("evaluation.protocol:PROTOCOLS"),
     ),
 ]
 Retry = Annotated[
@@ -221,71 +204,6 @@ Retry = Annotated[
         help="Run again what ended so: failed, or a status.",
         rich_help_panel=OUTPUT,
         autocompletion=complete_statuses,
-    ),
-]
-Preset = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        "--preset", help="A preset of the tracker.", rich_help_panel=SETTINGS, autocompletion=complete_presets
-    ),
-]
-Realtime = Annotated[
-    bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.", rich_help_panel=FRAMES)
-]
-Drop = Annotated[
-    float,
-    typer.Option("--drop", min=0.0, max=0.99, help="Drop this share of the frames at random.", rich_help_panel=FRAMES),
-]
-Degrade = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option(
-        "--degrade",
-        metavar="KIND=STRENGTH",
-        help="Spoil the frames: lighting, glare, shadow, blur, noise, depth_noise; repeatable.",
-        rich_help_panel=FRAMES,
-    ),
-]
-Cache = Annotated[
-    bool, typer.Option("--cache", help="Take features and masks from the stage cache.", rich_help_panel=MACHINE)
-]
-Video = Annotated[bool, typer.Option("--video", help="Write video.webm beside the run.", rich_help_panel=OUTPUT)]
-Sheet = Annotated[
-    bool,
-    typer.Option(
-        "--sheet", help="Write sheet.png beside the run: input, frames, keyframes, map, track.", rich_help_panel=OUTPUT
-    ),
-]
-Recording = Annotated[
-    bool, typer.Option("--rrd", help="Write recording.rrd beside the run, for rerun's viewer.", rich_help_panel=OUTPUT)
-]
-SaveMap = Annotated[
-    bool,
-    typer.Option("--save-map", help="Write map.npz beside the run, for --map of a later one.", rich_help_panel=OUTPUT),
-]
-StartMap = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option(
-        "--map", metavar="FILE", help="Begin in the map of an earlier run (--save-map).", rich_help_panel=SETTINGS
-    ),
-]
-LocalisationOnly = Annotated[
-    bool,
-    typer.Option("--localisation-only", help="Leave that map as it is: poses alone.", rich_help_panel=SETTINGS),
-]
-Label = Annotated[
-    str, typer.Option("--label", help="Name in tables, in place of the tracker's.", rich_help_panel=SETTINGS)
-]
-Trackers = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=complete_trackers),
-]
-Scheduler = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="A Dask scheduler, e.g. tcp://host:8786; its workers make the runs.",
-        rich_help_panel=MACHINE,
     ),
 ]
 TimeLimit = Annotated[

@@ -1,28 +1,17 @@
-"""``report make|publish|compare|audit-paper`` and ``demo``."""
+"""``report make|publish|compare|audit-paper``."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import Annotated, Optional
 
 import typer
 
-from dynslam_bench.cli.options import AsJson, DataRoot, DefaultGroup, Jobs, ProtocolId, Results
-from dynslam_bench.cli.output import (
-    SOME_RUNS_FAILED,
-    present,
-    progress,
-    wrapped,
-    write,
-    write_report_table,
-    write_table,
-)
+from dynslam_bench.cli.options import AsJson, DataRoot, DefaultGroup, ProtocolId
+from dynslam_bench.cli.output import present, progress, report_table, wrapped
 
-if TYPE_CHECKING:
-    from dynslam_bench.reports.tables.table import Table
-
-
+MOST_ROWS = 5
+"""Rows of the leaderboard that `report` shows."""
 app = typer.Typer(
     cls=DefaultGroup,
     help="Reports of stored runs: `report [RESULTS...] [-o DIR]` is short for `report make ...`.",
@@ -76,26 +65,17 @@ def make(
             on_progress=advance,
         )
 
-    def show() -> None:
-        show_top(paths.leaderboard)
-        if paths.trials:
-            write(wrapped(f"Left out: {trial_words(paths.trials)}."))
-        write(str(paths.html))
-
-    present({name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")}, show)
-
-
-def show_top(leaderboard: Table, most: int = 5) -> None:
-    """The first lines of a leaderboard, as far as the terminal is wide."""
-    names = [column.name for column in leaderboard.columns]
-    shown = ["#", "tracker", "ATE ratio", "success", "coverage", "× real time"]
-    cells = [
-        [" ".join(filter(None, (cell.text, cell.small))) for cell in (row[names.index(name)] for name in shown)]
-        for row in leaderboard.rows[:most]
-    ]
-    write_table(shown, cells, shrink=("tracker",), spare=("× real time", "coverage", "success"))
-    more = len(leaderboard.rows) - most
-    write((f"... and {more} more; " if more > 0 else "") + leaderboard.brief)
+    top = ["#", "tracker", "ATE ratio", "success", "coverage", "× real time"]
+    board = paths.leaderboard
+    more = len(board.rows) - MOST_ROWS
+    left_out = [wrapped(f"Left out: {trial_words(paths.trials)}.")] if paths.trials else []
+    present(
+        {name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")},
+        report_table(board, top, MOST_ROWS),
+        (f"... and {more} more; " if more > 0 else "") + board.brief,
+        *left_out,
+        str(paths.html),
+    )
 
 
 @app.command()
@@ -120,8 +100,7 @@ def publish(
             results, output, study=study, title=title, note=remark, picture_seconds=picture_seconds,
             protocol=protocol, on_progress=advance,
         )  # fmt: skip
-    facts = {"index": site.index, "files": site.files, "size_mb": site.size_mb}
-    present(facts, lambda: write(f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)"))
+    present(site, f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")
 
 
 @app.command()
@@ -135,18 +114,11 @@ def compare(
     from dynslam_bench.reports import compare as compare_results
 
     result = compare_results(a, b, protocol=protocol)
-    overall = {
-        name: {end: None if math.isnan(number) else number for end, number in vars(interval).items()}
-        for name, interval in result.overall.items()
-    }
-
-    def show() -> None:
-        write_report_table(result.table)
-        if result.only_a or result.only_b:
-            write(f"\nonly in {a}: {result.only_a} runs; only in {b}: {result.only_b} runs")
-
     facts = {"differences": result.differences, "only_a": result.only_a, "only_b": result.only_b}
-    present({"overall": overall} | facts, show)
+    lines = [result.table.title, report_table(result.table), "", wrapped(result.table.caption)]
+    if result.only_a or result.only_b:
+        lines.append(f"\nonly in {a}: {result.only_a} runs; only in {b}: {result.only_b} runs")
+    present({"overall": result.overall} | facts, *lines)
 
 
 @app.command("audit-paper")
@@ -156,8 +128,6 @@ def audit_paper(
     as_json: AsJson = False,
 ) -> None:
     """Hold the numbers that the paper prints against arithmetic, and against a static camera."""
-    from dataclasses import asdict
-
     from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.core.records import write_atomic
     from dynslam_bench.geometry.trajectory_files import read_tum
@@ -175,34 +145,8 @@ def audit_paper(
     if output is not None:
         write_atomic(output, findings.to_markdown())
 
-    def show() -> None:
-        if output is not None:
-            write(str(output))
-            return
-        for table in (findings.summary(), findings.details()):
-            write_report_table(table)
-            write()
-
-    present([asdict(finding) for finding in findings.findings], show)
-
-
-def demo(
-    results: Results = Path("results"),
-    frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 60,
-    jobs: Jobs = 2,
-    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
-) -> None:
-    """Run trackers on rendered sequences, report them, tune one: all steps, with no download."""
-    from dynslam_bench.cli.demo import run_demo
-
-    outcome = run_demo(results, frames=frames, jobs=jobs, trials=trials)
-    write()
-    write(outcome.leaderboard)
-    write()
-    for line in (*outcome.story, f"The study: {outcome.conclusion}"):
-        write(wrapped(line))
-    write()
-    write(f"report: {outcome.report}")
-    write(f"study:  {outcome.study}")
-    if outcome.failed:
-        raise typer.Exit(SOME_RUNS_FAILED)
+    lines = [] if output is None else [str(output)]
+    for findings_table in (findings.summary(), findings.details()) if output is None else ():
+        caption = wrapped(findings_table.caption)
+        lines += [findings_table.title, report_table(findings_table), "", caption, ""]
+    present(findings.findings, *lines)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
 import typer
 
@@ -17,16 +17,8 @@ from dynslam_bench.cli.options import (
     complete_sequences,
     gather_settings,
 )
-from dynslam_bench.cli.output import present, progress, write, write_fields, write_table
+from dynslam_bench.cli.output import fields, present, progress, table, write
 
-TrainingAssignments = Annotated[
-    Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
-    typer.Option("--set", metavar="NAME=VALUE", help="Set one of the training's, e.g. iterations=1200; repeatable."),
-]
-TrainingFile = Annotated[
-    Optional[Path],  # noqa: UP045
-    typer.Option("--settings", help="TOML file of the training's settings."),
-]
 MaskAssignments = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--set", metavar="NAME=VALUE", help="Set one of the masks', e.g. classes=person; repeatable."),
@@ -38,8 +30,16 @@ app = typer.Typer(help="Train, measure and export segmentation networks, record 
 @app.command()
 def train(
     output: Annotated[Path, typer.Argument(help="Folder of the training run.")],
-    assignments: TrainingAssignments = None,
-    settings: TrainingFile = None,
+    assignments: Annotated[
+        Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="Set one of the training's, e.g. iterations=1200; repeatable."
+        ),
+    ] = None,
+    settings: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--settings", help="TOML file of the training's settings."),
+    ] = None,
     data_cache: Annotated[Optional[Path], typer.Option(help="Where prepared images are kept.")] = None,  # noqa: UP045
     device: Device = "auto",
     threads: Threads = 1,
@@ -63,8 +63,8 @@ def train(
             resume=resume,
             progress=lambda state: advance(state.done, state.total),
         )
-    facts = {"weights": str(result.best), "step": result.step, "iou": result.iou}
-    present(facts, lambda: write_fields(facts))
+    facts = {"weights": result.best, "step": result.step, "iou": result.iou, "ended": result.stopped}
+    present(facts, fields(facts))
 
 
 @app.command()
@@ -97,18 +97,12 @@ def evaluate(
             limit=limit,
             progress=advance,
         )
-    values: dict[str, Any] = score.model_dump(mode="json")
-    classes = values.pop("classes")
-
-    def show() -> None:
-        write_fields(values)
-        if classes:
-            write()
-            columns = sorted({key for quality in classes.values() for key in quality})
-            rows = [(name, *(quality.get(key) for key in columns)) for name, quality in classes.items()]
-            write_table(("class", *columns), rows)
-
-    present(score, show)
+    lines = [fields(score.model_dump(exclude={"classes"}))]
+    if score.classes:
+        columns = sorted({key for quality in score.classes.values() for key in quality})
+        rows = [(name, *map(quality.get, columns)) for name, quality in score.classes.items()]
+        lines += ["", table(("class", *columns), rows)]
+    present(score, *lines)
 
 
 @app.command()
@@ -153,9 +147,9 @@ def export(
 
     done = export_network(source, output, size=parse_size(size), side=side)
     facts = {
-        "file": str(done.path),
+        "file": done.path,
         "megabytes": round(done.megabytes, 1),
         "input": f"image [1, 3, {done.size[0]}, {done.size[1]}], RGB in [0, 1]",
         "classes": len(done.classes),
     }
-    present(facts, lambda: write_fields(facts))
+    present(facts, fields(facts))

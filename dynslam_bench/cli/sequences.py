@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import fnmatch
 from dataclasses import asdict
+from fnmatch import fnmatch
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from dynslam_bench.cli.options import AsJson, Camera, DataRoot, Frames, complete_sequences
-from dynslam_bench.cli.output import (
-    VERIFICATION_FAILED,
-    note,
-    present,
-    progress,
-    warn,
-    write,
-    write_fields,
-    write_table,
-)
+from dynslam_bench.cli.output import VERIFICATION_FAILED, fields, note, present, progress, table, warn, write
 
 if TYPE_CHECKING:
-    from dynslam_bench.sequences.catalogue import Summary
+    from dynslam_bench.sequences.calibration import Quantity
 
 app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="Id, published folder name or path.", autocompletion=complete_sequences)]
@@ -46,39 +37,22 @@ def list_(
     if tag is not None and tag not in tags:
         raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
     patterns = (pattern, f"{pattern.rstrip('/')}/*")
-    pattern = next((p for p in patterns if any(fnmatch.fnmatch(s.id, p) for s in everything)), "")
-    if not pattern:
+    matches = [summary for summary in everything if any(fnmatch(summary.id, glob) for glob in patterns)]
+    if not matches:
         ids = [summary.id for summary in everything]
-        raise SequenceError(f"no sequence matches '{patterns[0]}'", did_you_mean(patterns[0], ids))
-    matches = [
-        summary
-        for summary in everything
-        if fnmatch.fnmatch(summary.id, pattern) and (tag is None or tag in summary.tags) and (summary.here or not here)
-    ]
-
-    def show() -> None:
-        if not matches:
-            limits = [f"'{pattern}'", *([f"with the tag {tag}"] if tag else []), *(["on this machine"] if here else [])]
-            write(f"no sequence matches {' '.join(limits)}; all {len(everything)}: dynslam-bench sequences list")
-        for title, group in groupby(matches, key=lambda summary: summary.dataset):
-            _write_group(title, list(group))
-
-    present([asdict(summary) for summary in matches], show)
-
-
-def _write_group(title: str, group: list[Summary]) -> None:
-    """The sequences of a data set below a line of their common facts."""
-    first = group[0]
-    facts = [f"{len(group)} listed, {sum(summary.here for summary in group)} here", f"licence: {first.license}"]
-    facts += [f"layout: {first.layout} on the publisher's files"] if first.layout else []
-    facts += [f"by hand: {first.by_hand}"] if first.by_hand else []
-    write(f"{title} ({'; '.join(facts)})")
-    write_table(
-        ("sequence", "here", "size", "tags", "split", "ground truth", "checksum"),
-        [(s.id, s.here, s.size, s.tags, s.split, s.ground_truth, s.checksum) for s in group],
-        spare=("checksum", "ground truth", "split"),
-    )
-    write()
+        raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, ids))
+    matches = [s for s in matches if (tag is None or tag in s.tags) and (s.here or not here)]
+    lines = []
+    for title, members in groupby(matches, key=lambda summary: summary.dataset):
+        group = list(members)
+        facts = [f"{len(group)} listed, {sum(s.here for s in group)} here", f"licence: {group[0].license}"]
+        facts += [f"layout: {group[0].layout} on the publisher's files"] if group[0].layout else []
+        facts += [f"by hand: {group[0].by_hand}"] if group[0].by_hand else []
+        columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum")
+        rows = [(s.id, s.here, s.size, s.tags, s.split, s.ground_truth, s.checksum) for s in group]
+        lines += [f"{title} ({'; '.join(facts)})", table(columns, rows), ""]
+    none = f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"
+    present(matches, *(lines or [none]))
 
 
 @app.command()
@@ -91,8 +65,8 @@ def info(
     """Show the facts of a sequence, and its contents if it is on this machine."""
     from dynslam_bench.sequences.catalogue import describe
 
-    facts: dict[str, Any] = describe(name, data_root=data_root, camera=camera)
-    present(facts, lambda: write_fields(facts))
+    facts = describe(name, data_root=data_root, camera=camera)
+    present(facts, fields(facts))
 
 
 @app.command()
@@ -140,21 +114,17 @@ def verify(
     from dynslam_bench.sequences.catalogue import expand
     from dynslam_bench.sequences.fetch import verify as verify_one
 
-    reports = []
+    reports, lines = [], []
     for name in expand(names):
         with progress(name) as advance:
-            reports.append(verify_one(name, data_root=data_root, camera=camera, progress=advance))
-
-    def show() -> None:
-        for report in reports:
-            verdict = "ok" if report.ok else f"{len(report.faults)} faults"
-            how = "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
-            write(f"{report.id}: {verdict}, {report.frames} frames, {how}")
-            dropped = [] if report.dropped is None else [report.dropped.describe()]
-            for line in (*dropped, *report.faults):
-                write(f"  {line}")
-
-    present([{**asdict(report), "ok": report.ok} for report in reports], show)
+            report = verify_one(name, data_root=data_root, camera=camera, progress=advance)
+        reports.append(report)
+        verdict = "ok" if report.ok else f"{len(report.faults)} faults"
+        how = "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
+        lines.append(f"{report.id}: {verdict}, {report.frames} frames, {how}")
+        lines += [f"  {report.dropped.describe()}"] if report.dropped is not None else []
+        lines += [f"  {fault}" for fault in report.faults]
+    present([{**asdict(report), "ok": report.ok} for report in reports], *lines)
     if not all(report.ok for report in reports):
         raise typer.Exit(VERIFICATION_FAILED)
 
@@ -171,15 +141,13 @@ def doctor(
 
     with progress(name) as advance:
         diagnosis = diagnose(name, data_root=data_root, camera=camera, progress=advance)
-
-    def show() -> None:
-        faults = sum(finding.severity == "fault" for finding in diagnosis.findings)
-        verdict = "no fault found" if diagnosis.ok else f"{faults} fault{'s' * (faults != 1)}"
-        write(f"{diagnosis.id}: {verdict}, {diagnosis.frames} frames compared")
-        for finding in diagnosis.findings:
-            write(f"  {finding.severity} {finding.id}: {finding.text}\n    cure: {finding.cure}")
-
-    present({**asdict(diagnosis), "ok": diagnosis.ok}, show)
+    faults = sum(finding.severity == "fault" for finding in diagnosis.findings)
+    verdict = "no fault found" if diagnosis.ok else f"{faults} fault{'s' * (faults != 1)}"
+    present(
+        {**asdict(diagnosis), "ok": diagnosis.ok},
+        f"{diagnosis.id}: {verdict}, {diagnosis.frames} frames compared",
+        *(f"  {f.severity} {f.id}: {f.text}\n    cure: {f.cure}" for f in diagnosis.findings),
+    )
     if not diagnosis.ok:
         raise typer.Exit(VERIFICATION_FAILED)
 
@@ -197,14 +165,11 @@ def unpack(
     from dynslam_bench.sequences.bags import unpack_bag
 
     unpacked = unpack_bag(bag, folder, colour=colour, depth=depth, truth=truth)
-
-    def show() -> None:
-        for line in unpacked.notes:
-            note(line)
-        poses = f", poses from {unpacked.truth}" if unpacked.truth else ", no ground truth"
-        write(f"{unpacked.folder}: {unpacked.frames} frames from {unpacked.colour} and {unpacked.depth}{poses}")
-
-    present({**asdict(unpacked), "folder": str(unpacked.folder)}, show)
+    for line in unpacked.notes:
+        note(line)
+    poses = f", poses from {unpacked.truth}" if unpacked.truth else ", no ground truth"
+    frames = f"{unpacked.frames} frames from {unpacked.colour} and {unpacked.depth}"
+    present(unpacked, f"{unpacked.folder}: {frames}{poses}")
 
 
 @app.command()
@@ -244,30 +209,27 @@ def calibrate(
     sequence = open_sequence(name, data_root=data_root, camera=camera, frames=frames)
     with progress(name) as advance:
         result = measure(sequence, progress=advance)
-    written = output is not None and result.measured
+    written = result.measured and output is not None
     if output is not None and written:
         write_camera(output, result.camera, fps=sequence.fps)
-
-    def show() -> None:
-        write_table(
-            ("quantity", "estimate", "95 % interval", "camera.toml", "why"), list(map(_calibrated, result.quantities))
-        )
-        write(f"{result.windows} windows of {result.frames} frames, keypoints to {result.pixel_noise:.2f} px")
-        if written:
-            write(str(output))
-        elif output is not None:
-            note(f"nothing to write: {output} is left alone")
-
-    present({**asdict(result), "file": str(output) if written else None}, show)
+    columns = ("quantity", "estimate", "95 % interval", "camera.toml", "why")
+    present(
+        {**asdict(result), "file": output if written else None},
+        table(columns, [_calibrated(quantity) for quantity in result.quantities]),
+        f"{result.windows} windows of {result.frames} frames, keypoints to {result.pixel_noise:.2f} px",
+        *([str(output)] if written else []),
+    )
+    if output is not None and not written:
+        note(f"nothing to write: {output} is left alone")
 
 
-def _calibrated(quantity: Any) -> tuple[str, ...]:
+def _calibrated(quantity: Quantity) -> tuple[str, ...]:
     """A row of the table of `calibrate`."""
     scale, unit = (1.0, "a metre") if quantity.name == "depth_factor" else (1e3, "ms")
-    value, low, high = (
-        None if v is None else f"{scale * v:.4g}" for v in (quantity.value, quantity.low, quantity.high)
-    )
-    interval = "" if low is None or high is None else f"{low} to {high}"
-    verdict = "kept" if quantity.written is None else f"{quantity.written:g}"
-    verdict = verdict if quantity.observable else "not observable"
-    return quantity.name, "" if value is None else f"{value} {unit}", interval, verdict, quantity.reason
+    value, interval = "", ""
+    if quantity.value is not None:
+        value = f"{scale * quantity.value:.4g} {unit}"
+    if quantity.low is not None and quantity.high is not None:
+        interval = f"{scale * quantity.low:.4g} to {scale * quantity.high:.4g}"
+    written = "kept" if quantity.written is None else f"{quantity.written:g}"
+    return quantity.name, value, interval, written if quantity.observable else "not observable", quantity.reason

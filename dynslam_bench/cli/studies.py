@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import json
+import logging
 import warnings
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from dynslam_bench import tuning
 from dynslam_bench.cli.options import AsJson, Jobs, Results
-from dynslam_bench.cli.output import Advance, note, present, progress, write, write_fields, write_table
+from dynslam_bench.cli.output import Advance, fields, note, present, progress, table, write
 from dynslam_bench.cli.running import event_text
+from dynslam_bench.cli.trackers import range_text
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
-    from dynslam_bench.tuning import StudyEvent, StudySummary, Tuner
 
 app = typer.Typer(help="Studies: tune a tracker's settings through its environment.", no_args_is_help=True)
 Study = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The study.")]
@@ -28,6 +29,7 @@ def silence_optuna() -> None:
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    logging.getLogger("optuna.visualization").setLevel(logging.ERROR)  # it warns of trials that pruning never saw
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
 
 
@@ -35,38 +37,23 @@ def silence_optuna() -> None:
 def space(study: Study, as_json: AsJson = False) -> None:
     """Show which settings a study tunes, and within which limits."""
     from dynslam_bench.trackers import TRACKERS
-    from dynslam_bench.tuning import read_study, search_space
 
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
-    parameters = search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
+    parameters = tuning.search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
 
-    def show() -> None:
-        rows = []
-        for parameter in parameters:
-            span = ", ".join(map(str, parameter.choices)) or f"{parameter.low:g} to {parameter.high:g}"
-            span += " (log)" * (parameter.scale == "log")
-            rows.append((parameter.name, span, parameter.default, parameter.unit, parameter.meaning))
-        write_table(("setting", "range", "default", "unit", "meaning"), rows)
-
-    present([asdict(parameter) for parameter in parameters], show)
+    rows = [(p.name, range_text(p), p.default, p.unit, p.meaning) for p in parameters]
+    present(parameters, table(("setting", "range", "default", "unit", "meaning"), rows))
 
 
 @app.command()
 def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False) -> None:
     """Measure the spread of a study's instances: what it could show, and what 5, 10 and 20 % would take."""
-    from dynslam_bench.tuning import Tuner, pilot_of, read_study
+    outcome = tuning.pilot_of(tuning.Tuner(tuning.read_study(study), results), jobs=jobs)
 
-    outcome = pilot_of(Tuner(read_study(study), results), jobs=jobs)
-
-    def show() -> None:
-        write(f"{outcome.sentence}.\n")
-        rows = [(f"{100 * n.effect:.0f} %", n.scenes, n.instances, f"{n.minutes:.0f}") for n in outcome.needs]
-        write_table(("gain", "scenes", "runs of one configuration", "minutes"), rows)
-        if outcome.warning:
-            write(f"\nWarning: {outcome.warning}.")
-
-    present(outcome, show)
+    rows = [(f"{100 * n.effect:.0f} %", n.scenes, n.instances, f"{n.minutes:.0f}") for n in outcome.needs]
+    lines = [f"{outcome.sentence}.\n", table(("gain", "scenes", "runs of one configuration", "minutes"), rows)]
+    present(outcome, *lines, *([f"\nWarning: {outcome.warning}."] if outcome.warning else []))
 
 
 @app.command()
@@ -79,29 +66,26 @@ def screen(
     as_json: AsJson = False,
 ) -> None:
     """Find which settings matter, before a study: one at a time, on several instances; print the few worth tuning."""
-    from dynslam_bench.tuning import Tuner, read_study, screen_study
-
-    tuner = Tuner(read_study(study), results)
+    tuner = tuning.Tuner(tuning.read_study(study), results)
     with progress(f"screening {tuner.spec.name}") as advance:
-        outcome = screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
+        outcome = tuning.screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
 
-    def show() -> None:
-        verdicts = {name: "kept" for name in outcome.kept} | dict.fromkeys(outcome.dead, "no effect")
-        rows = [
-            (e.name, e.objective, f"{e.size:.3f}", f"[{e.low:.3f}, {e.high:.3f}]", verdicts.get(e.name, ""))
-            for e in outcome.effects
-        ]
-        write_table(("setting", "of", "effect (log ratio)", "90 % interval", ""), rows)
-        write()
-        for name, reason in outcome.failed.items():
-            write(f"{name} broke a run: {reason}")
-        if outcome.kept:
-            write(f"[space]\ninclude = [{', '.join(json.dumps(name) for name in outcome.kept)}]")
-        else:
-            extent = f"these {outcome.instances} instances ({outcome.runs} runs)"
-            write(f"No setting matters more than chance on {extent}: try more instances.")
-
-    present(outcome, show)
+    verdicts = {name: "kept" for name in outcome.kept} | dict.fromkeys(outcome.dead, "no effect")
+    rows = [
+        (e.name, e.objective, f"{e.size:.3f}", f"[{e.low:.3f}, {e.high:.3f}]", verdicts.get(e.name, ""))
+        for e in outcome.effects
+    ]
+    extent = f"these {outcome.instances} instances ({outcome.runs} runs)"
+    advice = f"No setting matters more than chance on {extent}: try more instances."
+    if outcome.kept:
+        advice = f"[space]\ninclude = [{', '.join(json.dumps(name) for name in outcome.kept)}]"
+    present(
+        outcome,
+        table(("setting", "of", "effect (log ratio)", "90 % interval", ""), rows),
+        "",
+        *(f"{name} broke a run: {reason}" for name, reason in outcome.failed.items()),
+        advice,
+    )
 
 
 @app.command()
@@ -114,9 +98,8 @@ def run(
 ) -> None:
     """Run a study or continue it; then check the best on the held-out split, and write the page."""
     from dynslam_bench.api import tune
-    from dynslam_bench.tuning import read_study
 
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
         outcome = tune(
@@ -128,36 +111,27 @@ def run(
 @app.command()
 def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> None:
     """Only run trials of a study, beside other workers on the same storage."""
-    from dynslam_bench.tuning import read_study, run_study
-
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
-        run_study(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run)
+        tuning.run_study(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run)
     write(f"study '{spec.name}' has its {spec.trials} trials")
 
 
 @app.command()
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
-    from dynslam_bench.tuning import Tuner, read_study
     from dynslam_bench.tuning.trials import best_trials, count_states
 
-    tuner = Tuner(read_study(study), results, reading=True)
+    tuner = tuning.Tuner(tuning.read_study(study), results, reading=True)
     facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.spec.trials}
     facts |= count_states(tuner.study)
-    leading, settings = best_trials(tuner.study, 1), {}
-    if leading:
-        facts |= {"best_trial": leading[0].number, "best_values": list(leading[0].values)}
-        settings = {"best_settings": leading[0].params}
-
-    def show() -> None:
-        write_fields(facts)
-        if leading:
-            write()
-            write_table(("setting", "value"), list(leading[0].params.items()))
-
-    present(facts | settings, show)
+    settings: dict[str, Any] = {}
+    for trial in best_trials(tuner.study, 1):
+        facts |= {"best_trial": trial.number, "best_values": trial.values}
+        settings = trial.params
+    lines = ["", table(("setting", "value"), list(settings.items()))] if settings else []
+    present(facts | {"best_settings": settings}, fields(facts), *lines)
 
 
 @app.command()
@@ -171,9 +145,8 @@ def best(
 ) -> None:
     """Write a study's settings as a preset that `run --settings` takes."""
     from dynslam_bench.core.records import write_atomic
-    from dynslam_bench.tuning import read_preset_text, read_study
 
-    text = read_preset_text(read_study(study), results, pick)
+    text = tuning.read_preset_text(tuning.read_study(study), results, pick)
     if output is not None:
         write_atomic(output, text)
     write(text.rstrip() if output is None else str(output))
@@ -182,21 +155,20 @@ def best(
 @app.command()
 def report(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Write a study's page; the best trials are checked first if they are not yet."""
-    from dynslam_bench.tuning import StudySummary, Tuner, finish, read_study, write_page
     from dynslam_bench.tuning.storage import study_folder
 
-    spec = read_study(study)
+    spec = tuning.read_study(study)
     stored = study_folder(results, spec) / "summary.json"
-    tuner = Tuner(spec, results, reading=stored.is_file())
+    tuner = tuning.Tuner(spec, results, reading=stored.is_file())
     if stored.is_file():
-        summary = StudySummary.read(stored)
+        summary = tuning.StudySummary.read(stored)
     else:
         tuner.reference()
         with progress(f"checking the best of {spec.name}") as advance:
             bar = StudyBar(advance)
             tuner.on_run = bar.run
-            summary = finish(tuner, bar.note)
-    show_summary(tuner, summary, write_page(tuner, summary))
+            summary = tuning.finish(tuner, bar.note)
+    show_summary(tuner, summary, tuning.write_page(tuner, summary))
 
 
 class StudyBar:
@@ -210,7 +182,7 @@ class StudyBar:
         self._advance, self._runs = advance, 0
         self._part, self._at = "pilot", (0.0, None)
 
-    def event(self, event: StudyEvent) -> None:
+    def event(self, event: tuning.StudyEvent) -> None:
         """A trial has started or finished, or the study has begun another part."""
         if event.kind in ("pilot", "finished"):
             note(event.text)
@@ -234,20 +206,13 @@ class StudyBar:
         self._advance(done, total, part)
 
 
-def show_summary(tuner: Tuner, summary: StudySummary, page: Path) -> None:
+def show_summary(tuner: tuning.Tuner, summary: tuning.StudySummary, page: Path) -> None:
     """The conclusion, the chosen settings and the paths of page and preset."""
     from dynslam_bench.tuning.splits import seen_note
 
     preset = tuner.folder / "best.toml"
-
-    def show() -> None:
-        write(summary.conclusion)
-        if caution := seen_note(summary.seen):
-            write(caution)
-        write()
-        if summary.chosen is not None:
-            write_table(("setting", "value"), list(summary.candidates[0].params.items()))
-            write()
-        write(f"preset: {preset}\npage:   {page}")
-
-    present({"summary": summary, "page": page, "preset": preset}, show)
+    lines = [summary.conclusion, *filter(None, [seen_note(summary.seen)]), ""]
+    if summary.chosen is not None:
+        lines += [table(("setting", "value"), list(summary.candidates[0].params.items())), ""]
+    lines.append(f"preset: {preset}\npage:   {page}")
+    present({"summary": summary, "page": page, "preset": preset}, *lines)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,18 +18,10 @@ from dynslam_bench.cli.options import (
     complete_trackers,
     gather_settings,
 )
-from dynslam_bench.cli.output import (
-    VERIFICATION_FAILED,
-    heartbeat,
-    json_mode,
-    present,
-    write,
-    write_fields,
-    write_table,
-)
+from dynslam_bench.cli.output import VERIFICATION_FAILED, fields, json_mode, present, progress, table, wrapped, write
 
 if TYPE_CHECKING:
-    from dynslam_bench.core.settings import Settings
+    from dynslam_bench.core.settings import Parameter, Settings
     from dynslam_bench.testing import Check
     from dynslam_bench.trackers import TrackerSpec
 
@@ -41,74 +35,84 @@ def list_(as_json: AsJson = False) -> None:
     """List all trackers by kind, those included that lack a package; variants stand below their tracker."""
     from dynslam_bench.trackers.registry import TRACKERS, tracker_groups
 
-    sources = {tracker.spec.id: tracker.source for tracker in TRACKERS.all()}
-
-    def show() -> None:
-        for kind, families in tracker_groups().items():
-            if families:
-                write(f"{kind}:")
-            for spec, *variants in families:
-                write(f"  {spec.id:18} {spec.label}{'' if spec.missing() == [] else ' (not installed)'}")
-                if variants:
-                    write(f"  {'':18} {'  '.join(variant.id.removeprefix(spec.id) for variant in variants)}")
-
     rows = [
         {
-            "id": spec.id,
-            "label": spec.label,
-            "sensors": spec.sensors,
-            "provenance": spec.provenance,
-            "ranked": spec.ranked,
-            "available": not spec.missing(),
-            "install": spec.missing(),
-            "source": sources[spec.id],
-            "summary": spec.summary,
+            "id": tracker.spec.id,
+            "label": tracker.spec.label,
+            "sensors": tracker.spec.sensors,
+            "provenance": tracker.spec.provenance,
+            "ranked": tracker.spec.ranked,
+            "available": not tracker.spec.missing(),
+            "install": tracker.spec.missing(),
+            "source": tracker.source,
+            "summary": tracker.spec.summary,
         }
-        for spec in (tracker.spec for tracker in TRACKERS.all())
+        for tracker in TRACKERS.all()
     ]
-    present(rows, show)
+    lines = []
+    for kind, families in tracker_groups().items():
+        lines += [f"{kind}:"] if families else []
+        for spec, *variants in families:
+            lines.append(f"  {spec.id:18} {spec.label}{'' if spec.missing() == [] else ' (not installed)'}")
+            if variants:
+                lines.append(f"  {'':18} {'  '.join(variant.id.removeprefix(spec.id) for variant in variants)}")
+    present(rows, *lines)
 
 
 @app.command()
 def info(tracker: Tracker, as_json: AsJson = False) -> None:
-    """Show a tracker's description, its settings and its published numbers."""
-    from dynslam_bench.core.settings import flatten, settings_table
+    """Show a tracker's description and its tunable settings; --json has all settings and the published numbers."""
+    from dynslam_bench.core.settings import flatten, parameters
     from dynslam_bench.core.toml import assignments
     from dynslam_bench.trackers.registry import TRACKERS, epipolar_skipped
 
     spec = TRACKERS.get(tracker)
-    numbers, skipped = _published(spec), epipolar_skipped(spec.id)
+    reported, skipped = _published(spec), epipolar_skipped(spec.id)
     facts: dict[str, Any] = {
         "id": spec.id,
         "label": spec.label,
         "summary": spec.summary,
         "provenance": spec.provenance,
-        "ranked": spec.ranked,
         "sensors": spec.sensors,
+        "citation": spec.citation,
+        "install": spec.missing(),
+    }
+    details = {
+        "ranked": spec.ranked,
         "deterministic": spec.deterministic,
         "version": spec.version,
         "license": spec.license,
-        "citation": spec.citation,
         "entry_point": spec.entry_point,
-        "install": spec.missing(),
-        "presets": {name: dict(values) for name, values in spec.presets.items()},
-        "assumptions": list(spec.assumptions),
+        "presets": spec.presets,
+        "assumptions": spec.assumptions,
         "remarks": spec.remarks,
         "epipolar_skipped": skipped,
+        "settings": flatten(spec.settings()),
+        "parameters": parameter_facts(spec.settings),
+        "reported": reported,
     }
+    tunable = parameters(spec.settings)
+    fixed = len(flatten(spec.settings())) - len(tunable)
+    sources = [f"{source} ({count})" for source, count in Counter(row["source"] for row in reported).items()]
+    rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in tunable]
+    present(
+        facts | details,
+        fields(
+            facts
+            | {f"preset {name}": ", ".join(assignments(values)) for name, values in spec.presets.items()}
+            | {"epipolar skipped": [f"{100 * share:.0f} % of {sequence}" for sequence, share in skipped.items()]}
+        ),
+        *([table(("setting", "default", "range", "unit", "online", "meaning"), rows)] if rows else []),
+        *([f"and {fixed} settings that no study tunes: see --json"] if fixed else []),
+        *([wrapped(f"numbers reported in: {', '.join(sources)}; --json lists them")] if sources else []),
+    )
 
-    def show() -> None:
-        presets = [f"{name} ({', '.join(assignments(values))})" for name, values in spec.presets.items()]
-        shares = [f"{100 * share:.0f} % of {sequence}" for sequence, share in skipped.items()]
-        write_fields(facts | {"presets": presets, "epipolar_skipped": shares})
-        write(f"\n{settings_table(spec.settings).rstrip()}")
-        if numbers:
-            write()
-            columns = ("sequence", "reported metric", "value", "source", "remarks")
-            write_table(columns, [tuple(row.values()) for row in numbers])
 
-    details = {"settings": flatten(spec.settings()), "parameters": parameter_facts(spec.settings), "reported": numbers}
-    present(facts | details, show)
+def range_text(parameter: Parameter) -> str:
+    """The values that a study may give a setting."""
+    if parameter.choices:
+        return shorten(", ".join(map(str, parameter.choices)), 50, placeholder=" ...")
+    return f"{parameter.low:g} to {parameter.high:g}{' (log)' if parameter.scale == 'log' else ''}"
 
 
 def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
@@ -149,8 +153,8 @@ def doctor(as_json: AsJson = False) -> None:
     from dynslam_bench.testing.installation import unavailable_plugins
 
     plugins = unavailable_plugins()
-    lines = [f"{plugin.kind}: {plugin.name}: {plugin.reason}" for plugin in plugins]
-    present([asdict(plugin) for plugin in plugins], lambda: write("\n".join(lines or ["all plug-ins are available"])))
+    lines = [f"{plugin.name}: {plugin.hint}" for plugin in plugins]
+    present(plugins, *(lines or ["all plug-ins are available"]))
 
 
 @app.command()
@@ -170,9 +174,9 @@ def test(
 
     def on_check(check: Check) -> None:
         if not json_mode():
-            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""), now=True)
+            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""))
 
-    with heartbeat() as beat:
+    with progress("checking") as advance:
         report = isolated_tracker_report(
             tracker,
             settings=gather_settings(assignments, settings),
@@ -181,11 +185,10 @@ def test(
             start_s=5 * time_limit,
             memory_mb=memory_limit,
             on_check=on_check,
-            on_wait=lambda check: beat(f"checking: {check}"),
+            on_wait=lambda check: advance(0, None, check),
         )
-    facts = {"subject": report.subject, "ok": report.ok, "checks": [asdict(check) for check in report.checks]}
     total = f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed"
-    present(facts, lambda: write(total))
+    present({"subject": report.subject, "ok": report.ok, "checks": report.checks}, total)
     if not report.ok:
         raise typer.Exit(VERIFICATION_FAILED)
 

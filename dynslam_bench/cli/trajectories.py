@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal, Optional
 
 import typer
 
+from dynslam_bench import runs
 from dynslam_bench.cli.options import (
-    MEASURE,
-    TRAJECTORY_FORMATS,
     AsJson,
     Camera,
     DataRoot,
@@ -19,9 +17,9 @@ from dynslam_bench.cli.options import (
     Results,
     Stride,
     Timestamps,
-    complete_formats,
+    names_of,
 )
-from dynslam_bench.cli.output import SOME_RUNS_FAILED, present, warn, write, write_table
+from dynslam_bench.cli.output import SOME_RUNS_FAILED, announce, present, table
 from dynslam_bench.cli.runs import show_runs
 
 protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
@@ -30,14 +28,6 @@ Estimate = Annotated[
     typer.Argument(help="A trajectory: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps."),
 ]
 GroundTruth = Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.")]
-
-
-def add(app: typer.Typer) -> None:
-    """Add the verbs."""
-    app.command("eval", rich_help_panel=MEASURE)(evaluate)
-    app.add_typer(protocols, name="protocols", rich_help_panel=MEASURE)
-    app.command("import", rich_help_panel=MEASURE)(import_)
-    app.command("export", rich_help_panel=MEASURE)(export)
 
 
 def evaluate(
@@ -51,21 +41,19 @@ def evaluate(
     from dynslam_bench.evaluation import get_protocol, hints
     from dynslam_bench.evaluation.evaluate import evaluate_loaded
     from dynslam_bench.evaluation.prepare import truth_of_file
-    from dynslam_bench.runs import read_trajectory
 
-    loaded, truth = (read_trajectory(path, timestamps) for path in (estimate, ground_truth))
+    loaded, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
     result = evaluate_loaded(loaded, truth, protocol)
     prepared = truth_of_file(truth.trajectory, get_protocol(protocol))
     likely = hints(loaded.trajectory, prepared, protocol, notes=loaded.notes)
-
-    def show() -> None:
-        write(result.summary())
-        write(result.protocol)
-        write_table(("metric", "value"), list(result.metrics.items()))
-        for line in (*result.diagnostics, *(f"hint: {hint}" for hint in likely)):
-            write(line)
-
-    present(result.model_dump(mode="json") | {"hints": [asdict(hint) for hint in likely]}, show)
+    present(
+        {**result.model_dump(), "hints": likely},
+        result.summary(),
+        result.protocol,
+        table(("metric", "value"), list(result.metrics.items())),
+        *result.diagnostics,
+        *(f"hint: {hint}" for hint in likely),
+    )
 
 
 @protocols.command("list")
@@ -73,9 +61,9 @@ def list_(as_json: AsJson = False) -> None:
     """List the protocols."""
     from dynslam_bench.evaluation import PROTOCOLS
 
-    entries = [{"digest": protocol.digest(), **protocol.model_dump(mode="json")} for protocol in PROTOCOLS.values()]
+    entries = [{"digest": protocol.digest(), **protocol.model_dump()} for protocol in PROTOCOLS.values()]
     rows = [(protocol.id, protocol.digest(), protocol.describe()) for protocol in PROTOCOLS.values()]
-    present(entries, lambda: write_table(("id", "digest", "meaning"), rows))
+    present(entries, table(("id", "digest", "meaning"), rows))
 
 
 @protocols.command()
@@ -84,17 +72,18 @@ def compare(
 ) -> None:
     """Show how one trajectory scores under every protocol of the field."""
     from dynslam_bench.evaluation import compare_protocols
-    from dynslam_bench.runs import read_trajectory
 
-    loaded = [read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth)]
-    scores = compare_protocols(loaded[0], loaded[1], of_file=True)
+    estimated, truth = (runs.read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth))
+    scores = compare_protocols(estimated, truth, of_file=True)
     rows = [(score.metric, score.label, score.rmse_m, score.pairs, score.note) for score in scores]
-    columns = ("metric", "protocol", "rmse (m)", "pairs", "note")
-    present([asdict(score) for score in scores], lambda: write_table(columns, rows))
+    present(scores, table(("metric", "protocol", "rmse (m)", "pairs", "note"), rows))
 
 
 def import_(
-    trajectory: Annotated[Path, typer.Argument(help=f"A trajectory: {TRAJECTORY_FORMATS}.")],
+    trajectory: Annotated[
+        Path,
+        typer.Argument(help="TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP."),
+    ],
     tracker: Annotated[str, typer.Option(help="Name of the system that made it.")],
     sequence: Annotated[str, typer.Option(help="Id or folder of the sequence that it was made on.")],
     label: Annotated[str, typer.Option(help="Name for tables.")] = "",
@@ -115,10 +104,8 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Put a trajectory from elsewhere beside our own runs."""
-    from dynslam_bench.runs import RunStore, import_trajectory
-
-    store = RunStore(results)
-    record = import_trajectory(
+    store = runs.RunStore(results)
+    record = runs.import_trajectory(
         trajectory,
         tracker,
         sequence,
@@ -144,7 +131,7 @@ def export(
         typer.Argument(
             metavar="FORMAT",
             help="tum, kitti, euroc, vslam-lab, colmap, mcap or rrd (rerun).",
-            autocompletion=complete_formats,
+            autocompletion=names_of("runs.exchange.export:FORMATS"),
         ),
     ],
     run: Annotated[str, typer.Argument(help="The run's id, its first digits, or latest.")] = "latest",
@@ -162,15 +149,8 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a stored run in a format of other tools, with its provenance beside it."""
-    from dynslam_bench.runs import export_run
-
     which: Literal["online", "final"] | None = None if online is None else ("online" if online else "final")
-    done = export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
-
-    def show() -> None:
-        for name in done.files:
-            write(str(done.folder / name))
-        for line in done.notes:
-            warn(line)
-
-    present({"folder": done.folder, "files": done.files, "which": done.which, "notes": done.notes}, show)
+    exported = runs.export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
+    present(exported, *(str(exported.folder / name) for name in exported.files))
+    for line in exported.notes:
+        announce(line)

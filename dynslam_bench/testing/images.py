@@ -8,10 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
-from dynslam_bench.contracts.flow import FlowEstimator, FlowResult, stats_names_of
-from dynslam_bench.contracts.segmenter import Instances, Segmenter
-from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts import (
+    FeatureExtractor,
+    FlowEstimator,
+    FlowResult,
+    Frame,
+    Instances,
+    Keypoints,
+    Segmenter,
+    Sequence,
+)
+from dynslam_bench.contracts.features import MaskedExtractor
+from dynslam_bench.contracts.flow import stats_names_of
 from dynslam_bench.geometry.camera import inside
 from dynslam_bench.testing.report import (
     ConformanceReport,
@@ -48,24 +56,36 @@ def features_report(
     scene = CornerSequence(2)
     image, other = grey(scene[0]), grey(scene[1])
 
-    def results(image: Image, least: int = 0) -> None:
-        keypoints = construct().extract(image.copy())
+    def results(frame: Frame, least: int = 0) -> None:
+        keypoints = construct().extract(grey(frame))
         check_keypoints(keypoints, image.shape, descriptor_bytes)
         require(len(keypoints) >= least, f"only {len(keypoints)} keypoints in a textured image")
+
+    def left_alone() -> None:
+        require_unchanged(lambda: construct().extract(image), image, what="the image")
 
     report = ConformanceReport.of("extractor", construct)
     if not report.run("construction", lambda: require_methods(construct(), "extract")):
         return report
-    if not report.run("results", lambda: results(image, least=20)):
+    if not report.run("results", lambda: results(scene[0], least=20)):
         return report
-    report.run(
-        "images are left alone", lambda: require_unchanged(lambda: construct().extract(image), image, what="the image")
-    )
-    report.run("determinism", lambda: _extractor_determinism(construct, image, other))
     report.run("beside a mask", lambda: _masked_extraction(construct(), image))
-    for name, frame in hard_frames(scene[0]).items():
-        report.run(f"{name} image", lambda frame=frame: results(grey(frame)))  # type: ignore[misc]
+    _run_common(report, scene[0], left_alone, lambda: _extractor_determinism(construct, image, other), results)
     return report
+
+
+def _run_common(
+    report: ConformanceReport,
+    frame: Frame,
+    left_alone: Callable[[], None],
+    determinism: Callable[[], None],
+    results: Callable[[Frame], None],
+) -> None:
+    """The checks that all kinds of plug-ins on images share."""
+    report.run("images are left alone", left_alone)
+    report.run("determinism", determinism)
+    for name, hard in hard_frames(frame).items():
+        report.run(f"{name} image", lambda hard=hard: results(hard))  # type: ignore[misc]
 
 
 def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_bytes: int | None = None) -> None:
@@ -147,7 +167,8 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
     """Run all checks of `check_flow` and report each."""
     scene = CornerSequence(2)
     first, second = grey(scene[0]), grey(scene[1])
-    grid = _grid(first.shape, points)
+    grid, guess = _grid(first.shape, points), _grid(first.shape, points)
+    guess[::2] = np.nan
 
     def results(target: Image, points: NDArray[np.float32], guess: NDArray[np.float32] | None = None) -> FlowResult:
         flow = construct()
@@ -168,21 +189,22 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         result = results(second, np.concatenate([grid, strange]))
         require(not result.valid[-3:].any(), "a point outside the reference image is valid in the target")
 
-    guess = grid.copy()
-    guess[::2] = np.nan
     report = ConformanceReport.of("flow", construct)
     if not report.run("construction", lambda: require_methods(construct(), "prepare", "track")):
         return report
     if not report.run("results", lambda: results(second, grid)):
         return report
-    report.run("images are left alone", left_alone)
     report.run("no points", lambda: results(second, grid[:0]))
     report.run("points outside", outside)
     report.run("guesses", lambda: results(second, grid, guess))
-    report.run("determinism", lambda: _flow_determinism(construct, first, second, grid))
     report.run("a small shift is found", lambda: _flow_finds_shift(results, first, grid))
-    for name, frame in hard_frames(scene[0]).items():
-        report.run(f"{name} image", lambda frame=frame: results(grey(frame), grid))  # type: ignore[misc]
+    _run_common(
+        report,
+        scene[0],
+        left_alone,
+        lambda: _flow_determinism(construct, first, second, grid),
+        lambda frame: results(grey(frame), grid),
+    )
     return report
 
 
@@ -216,10 +238,9 @@ def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
 def _flow_determinism(
     construct: Callable[[], FlowEstimator], first: Image, second: Image, points: NDArray[np.float32]
 ) -> None:
-    results = []
-    for flow in (construct(), construct()):
-        results.append(flow.track(flow.prepare(first), flow.prepare(second), points, seed=7))
-    a, b = results
+    one, other = construct(), construct()
+    a = one.track(one.prepare(first), one.prepare(second), points, seed=7)
+    b = other.track(other.prepare(first), other.prepare(second), points, seed=7)
     same = np.array_equal(a.valid, b.valid) and np.array_equal(a.xy[a.valid], b.xy[b.valid])
     require(same, "the same images and seed give another flow", "unseeded randomness, or state that outlives an image")
 
@@ -260,7 +281,7 @@ def segmenter_report(
     scene = sequence if sequence is not None else CornerSequence(frames)
     inputs = [scene[index] for index in range(min(frames, len(scene)))]
 
-    def results(frames: list[Frame]) -> None:
+    def results(*frames: Frame) -> None:
         segmenter = construct()
         for frame in frames:
             check_instances(segmenter.segment(frame), frame)
@@ -272,12 +293,8 @@ def segmenter_report(
     report = ConformanceReport.of("segmenter", construct)
     if not report.run("construction", lambda: require_methods(construct(), "segment")):
         return report
-    if not report.run("results", lambda: results(inputs)):
-        return report
-    report.run("frames are left alone", left_alone)
-    report.run("determinism", lambda: _segmenter_determinism(construct, inputs))
-    for name, frame in hard_frames(inputs[0]).items():
-        report.run(f"{name} frame", lambda frame=frame: results([frame]))  # type: ignore[misc]
+    if report.run("results", lambda: results(*inputs)):
+        _run_common(report, inputs[0], left_alone, lambda: _segmenter_determinism(construct, inputs), results)
     return report
 
 

@@ -36,23 +36,8 @@ class Finding:
     hint: str = ""
 
 
-@dataclass(frozen=True)
-class UnavailablePlugin:
-    """A plug-in that cannot be used.
-
-    Attributes:
-        kind: ``trackers``, ``segmenters``, ``features``, ``flow`` or ``sequences``.
-        name: Its id, or where it should have come from.
-        reason: What went wrong, or what to install.
-    """
-
-    kind: str
-    name: str
-    reason: str
-
-
 def examine() -> list[Finding]:
-    """Everything that decides what can be run on this machine; nothing is downloaded or loaded for it."""
+    """Everything that decides what can be run on this machine; nothing is downloaded for it."""
     system = f"{platform.system()} {platform.machine()}"
     findings = [Finding("program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}")]
     findings += [*_packages(), *_weights()]
@@ -63,8 +48,7 @@ def examine() -> list[Finding]:
         good = is_writable(folder)
         state = f"{folder}, {'' if good else 'not '}writable"
         findings.append(Finding("folder", name, state, not good, "" if good else "another one: see core/folders.py"))
-    plugins = unavailable_plugins()
-    return findings + [Finding("plug-in", f"{p.kind}: {p.name}", "missing", True, p.reason) for p in plugins]
+    return [*findings, *unavailable_plugins(), _torch_device()]
 
 
 def _packages() -> list[Finding]:
@@ -106,7 +90,7 @@ def _weights() -> list[Finding]:
     return [Finding("weights", "embedded", "missing", True, "reinstall"), fetched]
 
 
-def torch_device() -> Finding:
+def _torch_device() -> Finding:
     """Which device ``--device auto`` takes; loads torch, which takes a second or two."""
     import torch
 
@@ -115,7 +99,7 @@ def torch_device() -> Finding:
     return Finding("device", "auto", f"{'cuda:0' if cuda else 'cpu'}, {name}, torch {torch.__version__}")
 
 
-def unavailable_plugins() -> list[UnavailablePlugin]:
+def unavailable_plugins() -> list[Finding]:
     """All plug-ins of all kinds that failed to load, and trackers that lack a package."""
     from dynslam_bench.features.registry import FEATURES
     from dynslam_bench.flow.registry import FLOWS
@@ -124,11 +108,10 @@ def unavailable_plugins() -> list[UnavailablePlugin]:
     from dynslam_bench.trackers.registry import TRACKERS
 
     failed = [
-        UnavailablePlugin(registry.kind, failure.source, failure.reason)
+        (f"{registry.kind}: {failure.source}", failure.reason)
         for registry in (TRACKERS, SEGMENTERS, FEATURES, FLOWS, DATASETS)
         for failure in registry.failures()
     ]
     specs = [tracker.spec for tracker in TRACKERS.all()]
-    return failed + [
-        UnavailablePlugin("trackers", spec.id, f"needs {hint}") for spec in specs for hint in spec.missing()
-    ]
+    failed += [(f"trackers: {spec.id}", f"needs {hint}") for spec in specs for hint in spec.missing()]
+    return [Finding("plug-in", name, "missing", True, reason) for name, reason in failed]

@@ -19,10 +19,8 @@ from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_YET, Verdict, bound_log, supervise
 from dynslam_bench.runs.spec import Limits
-from dynslam_bench.testing.report import OBSERVER, Check, ConformanceReport, Observer
+from dynslam_bench.testing.report import Check, ConformanceReport
 
-FRAME_S = 60.0
-START_S = 300.0
 _WORK = "dynslam_bench.testing.isolated:work"
 _CAUSES = {
     "crashed": "os._exit, exit() or a fault in a library that the tracker calls",
@@ -37,8 +35,8 @@ def isolated_tracker_report(
     settings: Mapping[str, Any] | None = None,
     frames: int = 6,
     seed: int = 0,
-    frame_s: float = FRAME_S,
-    start_s: float = START_S,
+    frame_s: float = 60.0,
+    start_s: float = 300.0,
     memory_mb: float | None = None,
     on_check: Callable[[Check], None] = lambda _: None,
     on_wait: Callable[[str], None] = lambda _: None,
@@ -67,20 +65,21 @@ def isolated_tracker_report(
     checks: list[Check] = []
     limits = Limits(start_s=start_s, frame_s=frame_s, memory_mb=memory_mb)
     job_options = {"tracker": tracker, "settings": dict(settings or {}), "frames": frames, "seed": seed}
+    running = ""
+
+    def add(check: Check) -> None:
+        checks.append(check)
+        on_check(check)
+
+    def receive(message: dict[str, Any]) -> bool:
+        nonlocal running
+        running = message.get("running", "")
+        if not running:
+            add(Check(**message["check"]))
+        return True
+
     while True:
         running = ""
-
-        def add(check: Check) -> None:
-            checks.append(check)
-            on_check(check)
-
-        def receive(message: dict[str, Any]) -> bool:
-            nonlocal running
-            running = message.get("running", "")
-            if not running:
-                add(Check(**message["check"]))
-            return True
-
         with contextlib.closing(TemporaryFolder()) as folder:
 
             def tick(log: Path = folder.path / LOG_FILE) -> None:
@@ -111,36 +110,36 @@ def _failure(verdict: Verdict, running: str, checks: list[Check]) -> Check:
     return Check(name, "failed", f"{verdict.reason} (likely cause: {cause})" if cause else verdict.reason)
 
 
-class _Sender(Observer):
-    """In the child: sends the progress of the report to the parent."""
+class _SentReport(ConformanceReport):
+    """In the child: sends its progress to the parent, and skips the checks whose outcome is known."""
 
-    def __init__(self, checks: list[Check], send: Callable[[dict[str, Any]], None]) -> None:
-        self._known = {check.name: check for check in checks}
+    def __init__(self, known: list[Check], send: Callable[[dict[str, Any]], None]) -> None:
+        super().__init__("")
+        self._known = {check.name: check for check in known}
         self._send = send
         self._tracked = -1
 
-    def outcome(self, name: str) -> Check | None:
-        if name not in self._known:
-            self._send({"type": "progress", "running": name})
-        return self._known.get(name)
+    def run(self, name: str, check: Callable[[], object]) -> bool:
+        if name in self._known:
+            self.checks.append(self._known[name])
+            return self.checks[-1].status != "failed"
+        self._send({"type": "progress", "running": name})
+        passed = super().run(name, check)
+        self._send({"type": "progress", "check": asdict(self.checks[-1])})
+        return passed
 
     def alive(self) -> None:
         self._tracked += 1
         self._send({"type": "frame", "index": self._tracked})
 
-    def ended(self, check: Check) -> None:
-        self._send({"type": "progress", "check": asdict(check)})
-
 
 def work(job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]) -> dict[str, Any]:
     """The child's work: the checks whose outcome is not known yet."""
-    from dynslam_bench.testing.tracker import tracker_report
+    from dynslam_bench.testing.tracker import run_tracker_checks
 
-    token = OBSERVER.set(_Sender([Check(**check) for check in job["known"]], send))
+    report = _SentReport([Check(**check) for check in job["known"]], send)
     try:
-        report = tracker_report(job["tracker"], settings=job["settings"], frames=job["frames"], seed=job["seed"])
+        run_tracker_checks(report, job["tracker"], job["settings"], frames=job["frames"], seed=job["seed"])
     except DynslamError as error:
         return {"type": "failed", "status": "crashed", "reason": str(error), "error": type(error).__name__}
-    finally:
-        OBSERVER.reset(token)
     return {"type": "done", "subject": report.subject}

@@ -7,7 +7,6 @@ so it imports nothing heavy before one of its options is used.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -35,30 +34,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Add the checks of every subject that was asked for."""
+    """Run the checks of every subject that was asked for, and add an item for each."""
+    from dynslam_bench.core.errors import DynslamError
+
     for kind in OPTIONS:
-        for name in config.getoption(f"--dynslam-{kind}"):
-            suite = ConformanceSuite.from_parent(session, name=f"{kind} {name}", kind=kind, subject=name)
-            items.extend(suite.collect())
-
-
-class ConformanceSuite(pytest.Collector):
-    """The checks of one subject; they are known by name once they have run."""
-
-    def __init__(self, *, kind: str, subject: str, **rest: Any) -> None:
-        super().__init__(**rest)
-        self.kind, self.subject = kind, subject
-
-    def collect(self) -> Iterator[pytest.Item]:
-        """Run the checks, one item each."""
-        from dynslam_bench.core.errors import DynslamError
-
-        try:
-            checks = report_on(self.kind, self.subject).checks
-        except DynslamError as error:
-            raise pytest.UsageError(f"--dynslam-{self.kind}: {error}") from error
-        for check in checks:
-            yield ConformanceItem.from_parent(self, name=check.name, check=check)
+        for subject in config.getoption(f"--dynslam-{kind}"):
+            try:
+                checks = report_on(kind, subject).checks
+            except DynslamError as error:
+                raise pytest.UsageError(f"--dynslam-{kind}: {error}") from error
+            for check in checks:
+                name = f"{kind} {subject}::{check.name}"
+                items.append(ConformanceItem.from_parent(session, name=name, check=check))
 
 
 class ConformanceItem(pytest.Item):
@@ -77,8 +64,7 @@ class ConformanceItem(pytest.Item):
 
     def reportinfo(self) -> tuple[str, None, str]:
         """Where the item stands, for pytest's output."""
-        parent = self.parent.name if self.parent is not None else ""
-        return "dynslam-bench", None, f"{parent}: {self.name}"
+        return "dynslam-bench", None, f"check of {self.name}"
 
 
 def report_on(kind: str, subject: str) -> ConformanceReport:

@@ -1,4 +1,4 @@
-"""Small exact scenes for conformance checks: a corner with a moving panel, and a static room."""
+"""Small exact scenes for conformance checks: a corner with a moving panel, and the corner from a turning camera."""
 
 from __future__ import annotations
 
@@ -9,13 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource
+from dynslam_bench.contracts import Camera, Frame, FrameMasks, MaskSource, Trajectory
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
-
-CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
-TURNING_CAMERA = Camera(320, 240, 267.7, 269.6, 159.8, 123.6)
 
 
 class CornerSequence:
@@ -25,20 +20,22 @@ class CornerSequence:
 
     Args:
         frames: Number of frames at 30 Hz.
-        camera: Intrinsics; distortion is ignored.
-        id: Id of the sequence; under ``synthetic/`` exact masks count as available.
     """
 
+    id = "synthetic/conformance"
+    """Under ``synthetic/`` exact masks count as available."""
     license = "CC0-1.0"
     citation = "dynslam-bench"
     fps = 30.0
+    camera = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+    has_panel = True
+    detail = 1.0
+    """Detail of the texture: small images hold less."""
 
-    def __init__(self, frames: int = 8, camera: Camera = CAMERA, id: str = "synthetic/conformance") -> None:
-        self.id = id
-        self.camera = camera.undistorted()
+    def __init__(self, frames: int = 8) -> None:
         self._count = frames
         self.timestamps: NDArray[np.float64] = np.round(100.0 + np.arange(frames) / 30, 6)
-        poses = np.stack([self._pose(index) for index in range(frames)])
+        poses = np.stack([self.pose(index) for index in range(frames)])
         self.ground_truth: Trajectory | None = Trajectory(self.timestamps, poses)
 
     @property
@@ -48,25 +45,26 @@ class CornerSequence:
 
     def digest(self) -> str:
         """A function of the parameters."""
-        return f"corner-{self._count}-{self.camera!r}"
+        return f"{self.id}-{self._count}"
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, index: int) -> Frame:
         index = range(self._count)[index]
-        rgb, depth, _ = self._draw(index)
+        rgb, depth, _ = draw(type(self), index)  # type: ignore[arg-type]  # mypy: a class is no Hashable
         return Frame(index, float(self.timestamps[index]), rgb.copy(), depth.copy())
 
-    def _pose(self, index: int) -> NDArray[np.float64]:
-        return _pose(index)
-
-    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-        return _draw(self.camera, index)
+    @staticmethod
+    def pose(index: int) -> NDArray[np.float64]:
+        """The camera's pose ``[4, 4]``, camera to world, at a frame."""
+        pose = np.eye(4)
+        pose[:3, 3] = 0.012 * index, 0.004 * np.sin(index), 0.006 * index
+        return pose
 
 
 class TurningSequence(CornerSequence):
-    """A room, filmed in small images by a camera that moves along all axes and turns about them.
+    """The walls, filmed in small images by a camera that moves along all axes and turns about them.
 
     World-to-camera poses, other axes and other units are told apart from right ones by its path.
 
@@ -74,23 +72,21 @@ class TurningSequence(CornerSequence):
         frames: Number of frames at 30 Hz.
     """
 
+    id = "synthetic/conformance_turning"
+    camera = Camera(320, 240, 267.7, 269.6, 159.8, 123.6)
+    has_panel = False
+    detail = 1 / 3
+
     def __init__(self, frames: int = 24) -> None:
-        super().__init__(frames, TURNING_CAMERA, "synthetic/conformance_turning")
+        super().__init__(frames)
 
-    def digest(self) -> str:
-        """A function of the parameters."""
-        return f"turning-{self._count}"
-
-    def _pose(self, index: int) -> NDArray[np.float64]:
+    @staticmethod
+    def pose(index: int) -> NDArray[np.float64]:
+        """The camera's pose ``[4, 4]``, camera to world, at a frame."""
         a = 2 * np.pi * index / 24
         place = 0.12 * np.sin(a), 0.06 * np.sin(2 * a), 0.08 * (1 - np.cos(a))
         turn = 0.05 * np.sin(2 * a), 0.1 * np.sin(a + 1), 0.08 * np.cos(a)
         return se3.exp(np.array([*place, *turn]))
-
-    def _draw(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-        depth, x, y = _room(self.camera, self._pose(index))
-        rgb = _sample(_texture(), x / 3, y / 3)  # no more detail than there are pixels
-        return rgb, depth.astype(np.float32), np.zeros(depth.shape, bool)
 
 
 class _Masks:
@@ -98,7 +94,7 @@ class _Masks:
         self._sequence = sequence
 
     def __getitem__(self, index: int) -> FrameMasks:
-        panel = self._sequence._draw(range(len(self._sequence))[index])[2]
+        panel = draw(type(self._sequence), range(len(self._sequence))[index])[2]  # type: ignore[arg-type]
         return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index and panel.any() else ()))
 
 
@@ -124,44 +120,24 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
     }
 
 
-def _pose(index: int) -> NDArray[np.float64]:
-    pose = np.eye(4)
-    pose[:3, 3] = 0.012 * index, 0.004 * np.sin(index), 0.006 * index
-    return pose
-
-
 @lru_cache(maxsize=12)
-def _draw(camera: Camera, index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-    """Colour, depth and the panel's mask."""
-    centre = _pose(index)[:3, 3]
-    v, u = np.mgrid[: camera.height, : camera.width]
-    ray_x, ray_y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
-    walls = [(2.6 + slope * centre[0] - centre[2]) / (1 - slope * ray_x) for slope in (0.5, -0.7)]
-    depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
-    x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
-    left = -0.35 + 0.03 * index
-    panel_depth = 1.5 - centre[2]
-    panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
-    panel = np.asarray((panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4))
-    depth = np.where(panel, panel_depth, depth)
-    rgb = _sample(_texture(), np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y))
-    return rgb, depth.astype(np.float32), panel
-
-
-def _room(camera: Camera, T_world_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Depth ``[H, W]`` of a box-shaped room, from inside, and two texture coordinates of every pixel."""
+def draw(scene: type[CornerSequence], index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+    """Colour, depth and the panel's mask of a frame."""
+    camera, pose = scene.camera, scene.pose(index)
+    centre = pose[:3, 3]
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    rays = rays @ T_world_cam[:3, :3].T
-    side = np.where(rays > 0, (1.0, 0.8, 3.5), (-1.0, -0.8, -1.0))  # x to the right, y down, z ahead
-    depths = (side - T_world_cam[:3, 3]) / np.where(rays == 0, 1e-12, rays)
-    depth = depths.min(axis=-1)
-    points = T_world_cam[:3, 3] + depth[..., None] * rays
-    facing = depths.argmin(axis=-1)
-    other = 0.9 * np.where(np.take_along_axis(side, facing[..., None], axis=-1)[..., 0] > 0, facing, facing + 3)
-    x, y = np.where(facing == 0, points[..., 2], points[..., 0]), np.where(facing == 1, points[..., 2], points[..., 1])
-    return depth, x + other, y + other  # the sides differ
+    ray_x, ray_y, ray_z = np.moveaxis(rays @ pose[:3, :3].T, -1, 0)
+    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
+    walls = [(2.6 + slope * centre[0] - centre[2]) / (ray_z - slope * ray_x) for slope in (0.5, -0.7)]
+    depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
+    x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
+    left, panel_depth = -0.35 + 0.03 * index, (1.5 - centre[2]) / ray_z
+    panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
+    panel = np.asarray(scene.has_panel & (panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4))
+    depth = np.where(panel, panel_depth, depth)
+    x, y = np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y)
+    return _sample(_texture(), scene.detail * x, scene.detail * y), depth.astype(np.float32), panel
 
 
 @lru_cache(maxsize=1)

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.contracts.sequence import Frame, Sequence
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.contracts import Camera, Frame, Sequence, Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.testing.report import ConformanceReport, NotApplicable, require, require_arrays
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,9 @@ import numpy as np
 from dynslam_bench.contracts import Frame, Sequence, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory
 from dynslam_bench.contracts.checks import Fault, blemishes, faults, trajectory_faults
 from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.settings import Parameter, Settings, apply_overrides, build, online_parameters
+from dynslam_bench.core.settings import Settings, apply_overrides, build, online_parameters
 from dynslam_bench.evaluation.hints import hints
-from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.testing.report import (
-    OBSERVER,
     ConformanceError,
     ConformanceReport,
     NotApplicable,
@@ -29,9 +26,6 @@ from dynslam_bench.testing.scenes import CornerSequence, TurningSequence, hard_f
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 Subject = TrackerSpec | str | Callable[[], Tracker]
-Results = list[TrackResult]
-ONE_BY_ONE = 6
-"""Up to so many online settings are changed one by one; more of them all at once, to alternate ends."""
 
 
 def check_tracker(
@@ -70,23 +64,40 @@ def tracker_report(
     Raises:
         PluginError: There is no such tracker.
     """
+    report = ConformanceReport("")
+    run_tracker_checks(report, subject, settings, sequence, frames=frames, seed=seed)
+    return report
+
+
+def run_tracker_checks(
+    report: ConformanceReport,
+    subject: Subject,
+    settings: Settings | Mapping[str, Any] | None = None,
+    sequence: Sequence | None = None,
+    *,
+    frames: int,
+    seed: int,
+) -> None:
+    """Run all checks of `check_tracker` in a report, which names the tracker then; the arguments are those there.
+
+    Raises:
+        PluginError: There is no such tracker.
+    """
     spec = TRACKERS.get(subject) if isinstance(subject, str) else subject if isinstance(subject, TrackerSpec) else None
-    report = ConformanceReport(f"tracker {spec.id!r}") if spec else ConformanceReport.of("tracker", subject)
+    report.subject = f"tracker {spec.id!r}" if spec else ConformanceReport.of("tracker", subject).subject
     scene, turning = sequence if sequence is not None else CornerSequence(frames), TurningSequence()
-    construct, construct_turning = (_constructor(spec or subject, settings, clip) for clip in (scene, turning))
     if spec is not None:
         report.run("spec", lambda: _spec(spec, settings))
-    if not report.run("construction", lambda: _construction(construct)):
-        return report
-    run = _Runner(construct, scene, frames, seed)
+    run = _Runner(report, spec or subject, settings, scene, frames, seed)
+    if not report.run("construction", lambda: _construction(run.construct)):
+        return
     if not report.run("results", lambda: _results(run)):
-        return report
-    monocular = spec is not None and spec.sensors == "rgb"
-    report.run("camera to world", lambda: _conventions(_Runner(construct_turning, turning, 24, seed), monocular))
+        return
+    deterministic = spec is None or spec.deterministic
+    turning_run = _Runner(report, spec or subject, settings, turning, len(turning), seed)
+    report.run("camera to world", lambda: _conventions(turning_run, spec is not None and spec.sensors == "rgb"))
     report.run("same stats on every frame", lambda: _same_keys(run))
     report.run("frames are left alone", lambda: _frames_left_alone(run))
-    report.run("results are kept", lambda: _results_are_kept(run))
-    deterministic = spec is None or spec.deterministic
     report.run("determinism", lambda: _determinism(run, deterministic))
     report.run("two resets", lambda: _two_resets(run, deterministic))
     for name in hard_frames(scene[0]):
@@ -95,36 +106,48 @@ def tracker_report(
     report.run("online settings", lambda: _online_settings(run, spec, settings))
     report.run("final trajectory", lambda: _final(run))
     report.run("closing", lambda: _closing(run))
-    return report
-
-
-def _constructor(
-    subject: TrackerSpec | Callable[[], Tracker] | str, settings: Any, clip: Sequence
-) -> Callable[[], Tracker]:
-    """What constructs the tracker for a sequence."""
-    if isinstance(subject, TrackerSpec):
-        return partial(build_tracker, subject, settings, TrackerContext(clip.id, clip.masks, fps=clip.fps))
-    assert callable(subject)
-    return subject
 
 
 class _Runner:
-    """Tracks the scene, or variants of it, with fresh or given trackers."""
+    """Tracks a scene, or variants of it, with fresh or given trackers."""
 
-    def __init__(self, construct: Callable[[], Tracker], scene: Sequence, frames: int, seed: int) -> None:
-        self.construct, self.scene, self.seed = construct, scene, seed
+    def __init__(
+        self, report: ConformanceReport, subject: Any, settings: Any, scene: Sequence, frames: int, seed: int
+    ) -> None:
+        self.report, self.subject, self.settings, self.scene, self.seed = report, subject, settings, scene, seed
         self.frames = [scene[index] for index in range(min(frames, len(scene)))]
 
-    def track(self, frames: list[Frame], tracker: Tracker | None = None, *, global_seed: int = 0) -> Results:
-        """Reset a tracker and feed it frames, after seeding the generators that it must not use."""
-        random.seed(global_seed)
-        np.random.seed(global_seed)  # noqa: NPY002 - the legacy generator is what a tracker might use by mistake
+    def construct(self, settings: Settings | None = None) -> Any:
+        """A tracker; with other settings than the subject's where they are given."""
+        if not isinstance(self.subject, TrackerSpec):
+            return self.subject()
+        context = TrackerContext(self.scene.id, self.scene.masks, fps=self.scene.fps)
+        return build_tracker(self.subject, self.settings if settings is None else settings, context)
+
+    def track(
+        self, frames: list[Frame], tracker: Any = None, changed: Settings | None = None, at: int = 0
+    ) -> list[TrackResult]:
+        """Reset a tracker and track frames; a tracker that is not given is constructed, and closed at the end.
+
+        Args:
+            frames: What to track.
+            tracker: Which tracker.
+            changed: Settings to configure it to before one of the frames.
+            at: Which.
+        """
         used = self.construct() if tracker is None else tracker
         used.reset(self.scene.camera, rng=np.random.default_rng(self.seed))
-        results = []
-        for frame in frames:
+        results, poses = [], []
+        for number, frame in enumerate(frames):
+            if changed is not None and number == at:
+                used.configure(changed)
             results.append(used.track(frame))
+            self.report.alive()
             check_result(results[-1], frame)
+            poses.append(np.array(results[-1].T_world_cam))
+        for frame, result, pose in zip(frames, results, poses, strict=True):
+            same = result.T_world_cam is None or np.array_equal(result.T_world_cam, pose)
+            require(same, f"the pose of frame {frame.index} changed later", "return a copy of the state, not the state")
         if tracker is None:
             _close(used)
         return results
@@ -136,7 +159,6 @@ def check_result(result: object, frame: Frame) -> None:
     Raises:
         ConformanceError: It has a fault or a blemish, see `contracts.checks`.
     """
-    OBSERVER.get().alive()
     where = f"frame {frame.index}: track() gave"
     _none_of(faults(result, frame), where)
     assert isinstance(result, TrackResult)
@@ -203,24 +225,15 @@ def _frames_left_alone(run: _Runner) -> None:
     require_unchanged(lambda: run.track(frames), *images, what="a frame")
 
 
-def _results_are_kept(run: _Runner) -> None:
-    tracker = run.construct()
-    tracker.reset(run.scene.camera, rng=np.random.default_rng(run.seed))
-    poses, copies = [], []
-    for frame in run.frames:
-        poses.append(tracker.track(frame).T_world_cam)
-        copies.append(np.array(poses[-1]))
-    _close(tracker)
-    for index, (pose, copy) in enumerate(zip(poses, copies, strict=True)):
-        same = pose is None or np.array_equal(pose, copy)
-        require(same, f"the pose of frame {index} changed later", "return a copy of the state, not the state")
-
-
 def _determinism(run: _Runner, deterministic: bool) -> None:
     if not deterministic:
         raise NotApplicable("the spec says that it is not deterministic")
-    first, second = run.track(run.frames, global_seed=1), run.track(run.frames, global_seed=2)
-    at = first_difference(first, second)
+    episodes = []
+    for seed in (1, 2):  # of the global generators, which a tracker must not use
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        episodes.append(run.track(run.frames))
+    at = first_difference(*episodes)
     cause = "randomness that does not come from rng (numpy.random, random, cv2.theRNG), threads, or hashing order"
     require(not at, f"two runs with one seed differ: {at}", cause)
 
@@ -288,93 +301,54 @@ def _close(tracker: Tracker) -> None:
 
 
 def _online_settings(run: _Runner, spec: TrackerSpec | None, settings: Settings | Mapping[str, Any] | None) -> None:
-    if spec is None or not spec.deterministic:
-        raise NotApplicable("no spec names online settings" if spec is None else "it is not deterministic")
-    scene = run.scene
-    context = TrackerContext(scene.id, scene.masks, fps=scene.fps)
-    start = settings if isinstance(settings, Settings) else resolve_settings(spec, settings)
-    check_online_settings(
-        lambda changed: build_tracker(spec, changed, context), start, scene.camera, run.frames, run.seed
-    )
-
-
-def check_online_settings(
-    build: Callable[[Settings], Tracker], settings: Settings, camera: Camera, frames: list[Frame], seed: int
-) -> None:
     """Check the contract of `core.settings.Reconfigurable` on a tracker.
 
     An episode that is reconfigured before its first frame has to equal that of a tracker built with the same settings;
     the next episode, without reconfiguration, that of a fresh tracker. Where settings have an effect in the second half
-    of an episode, changing them in its middle has to have one there, with one of them at least.
-
-    Args:
-        build: Constructs the tracker with settings.
-        settings: The settings to start from.
-        camera: Of the frames.
-        frames: What to track.
-        seed: Seed of the randomness.
-
-    Raises:
-        ConformanceError: It has no ``configure``, ignores it, or keeps its effect after ``reset``.
-        NotApplicable: It has no online settings, or they change nothing on these frames.
+    of an episode, changing them in its middle has to have one there. All online settings are moved to alternate ends.
     """
-    online = online_parameters(settings)
+    if spec is None or not spec.deterministic:
+        raise NotApplicable("no spec names online settings" if spec is None else "it is not deterministic")
+    start = settings if isinstance(settings, Settings) else resolve_settings(spec, settings)
+    online = online_parameters(start)
     if not online:
         raise NotApplicable("the tracker has no online settings")
-    tracker = build(settings)
+    tracker = run.construct(start)
     names = ", ".join(parameter.name for parameter in online[:4]) + (", ..." if len(online) > 4 else "")
     fault = f"the tracker class {type(tracker).__name__} has no method configure(settings), but {names} is online"
     cause = "implement configure (see core.settings.Reconfigurable), or declare the setting without online=True"
     require(callable(getattr(tracker, "configure", None)), fault, cause)
-    fresh = _episode(tracker, camera, frames, seed)
-    half = len(frames) // 2
-    has_effect, late = False, list[Settings]()
-    for ends in _ends(online):
-        changed = apply_overrides(settings, ends)
+    fresh, half = run.track(run.frames, tracker), len(run.frames) // 2
+    has_effect, late_effects = False, []
+    for first in (0, 1):
+        ends = {}
+        for number, parameter in enumerate(online, first):
+            pair = (
+                (parameter.choices[0], parameter.choices[-1]) if parameter.choices else (parameter.low, parameter.high)
+            )
+            ends[parameter.name] = pair[number % 2]
         try:
-            built = _episode(build(changed), camera, frames, seed)
+            changed = apply_overrides(start, ends)
+            built = run.track(run.frames, run.construct(changed))
         except DynslamError:
             continue  # the ends do not go together
-        configured = _episode(tracker, camera, frames, seed, changed)
-        again = _episode(tracker, camera, frames, seed)
         what = ", ".join(f"{name}={value}" for name, value in list(ends.items())[:4])
-        at = first_difference(built, configured)
+        at = first_difference(built, run.track(run.frames, tracker, changed))
         fault = f"configure() with {what} gives another result than building with it: {at}"
         require(not at, fault, "configure() does not reach the part that uses the setting, or only later")
-        at = first_difference(fresh, again)
+        at = first_difference(fresh, run.track(run.frames, tracker))
         fault = f"after an episode configured to {what}, reset() does not bring back the settings: {at}"
         require(not at, fault, "remember the settings that it was built with, and put them into force in reset()")
         has_effect = has_effect or bool(first_difference(fresh, built))
-        late += [changed] if first_difference(fresh[half:], built[half:]) else []
-    obeyed = any(first_difference(fresh, _episode(tracker, camera, frames, seed, changed, at=half)) for changed in late)
+        if first_difference(fresh[half:], built[half:]):
+            late_effects.append(first_difference(fresh, run.track(run.frames, tracker, changed, half)))
     fault = f"configure() in mid-episode changes nothing, although building with {names} does"
-    require(obeyed or not late, fault, "the settings are read once, at the start; read them on every frame")
+    require(any(late_effects) or not late_effects, fault, "the settings are read once; read them on every frame")
     if not has_effect:
         raise NotApplicable(f"{names} change nothing on this scene, at either end of their ranges")
 
 
-def _ends(online: list[Parameter]) -> Iterator[dict[str, Any]]:
-    pairs = [(p.name, (p.choices[0], p.choices[-1]) if p.choices else (p.low, p.high)) for p in online]
-    if len(pairs) <= ONE_BY_ONE:
-        yield from ({name: end} for name, ends in pairs for end in ends)
-    else:
-        for first in (0, 1):
-            yield {name: ends[(number + first) % 2] for number, (name, ends) in enumerate(pairs)}
-
-
-def _episode(
-    tracker: Any, camera: Camera, frames: list[Frame], seed: int, settings: Settings | None = None, at: int = 0
-) -> Results:
-    tracker.reset(camera, rng=np.random.default_rng(seed))
-    results = []
-    for number, frame in enumerate(frames):
-        if settings is not None and number == at:
-            tracker.configure(settings)
-        results.append(tracker.track(frame))
-    return results
-
-
-def first_difference(first: Results, second: Results) -> str:
+def first_difference(first: list[TrackResult], second: list[TrackResult]) -> str:
     """The first difference of two episodes, bit for bit, for a message; empty if they are equal."""
     for index, (a, b) in enumerate(zip(first, second, strict=True)):
         if a.state != b.state:

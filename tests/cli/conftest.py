@@ -1,8 +1,16 @@
 """The program as the tests of the command line call it, and a small sequence for it."""
 
-import pytest
-from cli_helpers import write_folder
+import json
+import sys
+from pathlib import Path
 
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "envs"))
+
+from envs_toys import write_sequence
+
+from dynslam_bench.cli import output
 from dynslam_bench.cli.app import start
 from dynslam_bench.testing import CornerSequence
 
@@ -13,6 +21,7 @@ def cli(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
+    monkeypatch.setattr(output, "HEARTBEAT_S", 1000.0)  # no lines of progress where the machine is slow
 
     def call(*arguments):
         with pytest.raises(SystemExit) as ended:
@@ -26,4 +35,16 @@ def cli(capsys, monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     """The conformance scene as a folder in TUM layout."""
-    return write_folder(tmp_path_factory.mktemp("data") / "walk", CornerSequence(4))
+    return write_sequence(tmp_path_factory.mktemp("data") / "walk", CornerSequence(4))
+
+
+@pytest.fixture
+def facts(cli):
+    """Runs the program with ``--json`` and returns what it writes; it exits with `code`, and with 0 without a word."""
+
+    def call(*arguments, code=0):
+        ended, out, err = cli(*arguments, "--json")
+        assert ended == code and (code or not err), err
+        return json.loads(out)
+
+    return call

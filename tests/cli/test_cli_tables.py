@@ -4,7 +4,7 @@ import pytest
 from cli_helpers import one_line
 
 from dynslam_bench.cli import output, runs
-from dynslam_bench.cli.output import fitted, write_table
+from dynslam_bench.cli.output import report_table, table
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
 
 ROWS = [
@@ -14,49 +14,35 @@ ROWS = [
 
 
 @pytest.mark.parametrize("width", [400, 100, 80, 60, 40, 20])
-def test_a_table_is_no_wider_than_the_terminal(width):
-    cut, left_out = fitted(ROWS, ["sequence", "run"], ["masks"], width)
-    assert all(sum(map(len, row)) + 2 * (len(row) - 1) <= width for row in cut)
-    assert len(cut[0]) + len(left_out) == 5 and set(cut[0]) | set(left_out) >= {"run", "masks"} - set(left_out)
-    if width == 400:
-        assert (cut, left_out) == (ROWS, [])
-    if width == 80:
-        assert left_out == [] and cut[1][0] == "0123456789abcdef" and cut[1][2].endswith("…")
-    if width == 40:
-        assert left_out[0] == "masks" and cut[1][0].startswith("0123456")
-
-
-def test_on_a_terminal_what_has_no_room_is_named(capsys, monkeypatch):
+def test_a_table_is_no_wider_than_the_terminal(monkeypatch, width):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    monkeypatch.setattr(output, "_terminal_width", lambda: 40)
-    write_table(ROWS[0], ROWS[1:], shrink=("sequence", "run"), spare=("masks",))
-    lines = capsys.readouterr().out.replace("\033[1m", "").replace("\033[0m", "").splitlines()
-    assert len(lines) == 3 and all(len(line) <= 40 for line in lines[:2])
-    assert lines[2].startswith("(no room for: masks")
+    monkeypatch.setattr(output, "_terminal_width", lambda: width)
+    head, row, *left_out = table(ROWS[0], ROWS[1:]).splitlines()
+    assert max(len(head), len(row)) <= width and row.startswith("0123456")
+    assert bool(left_out) == ("masks" not in head)
+    if width == 400:
+        assert [head.split("  ")[0], *row.split()] == ["run", *ROWS[1]]
+    if width == 80:
+        assert "…" in row and not left_out
+    if width == 40:
+        assert left_out == ["(no room for: masks)"]
 
 
-def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape(capsys):
-    write_table(["tum/\x1b[2J", "\u202ea"], [["x\ny", "\x9b1m"], [1.5, True]])
-    assert capsys.readouterr().out.splitlines() == [r"tum/\x1b[2J  \u202ea", r"x y          \x9b1m", "1.5          yes"]
+def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():
+    lines = table(["tum/\x1b[2J", "\u202ea"], [["x\ny", "\x9b1m"], [1.5, True]]).splitlines()
+    assert lines == [r"tum/\x1b[2J  \u202ea", r"x y          \x9b1m", "1.5          yes"]
 
 
-def test_a_reports_table_has_no_markup(capsys):
-    table = Table(
-        "t", "A_title", "One | caption * of [it]. " * 9, [Column("a_b", numeric=False)], [[TableCell("x|y_*")]]
-    )
-    output.write_report_table(table)
-    out = capsys.readouterr().out
-    assert "\\" not in out and "x|y_*" in out and out.startswith("A_title\na_b\n")
-    assert max(map(len, out.splitlines())) <= 120
+def test_a_reports_table_has_no_markup():
+    source = Table("t", "title", "caption", [Column("a_b"), Column("empty")], [[TableCell("x|y_*"), TableCell()]])
+    assert report_table(source) == "a_b\nx|y_*"
 
 
 def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
-    def shown(coverage):
-        row = dict.fromkeys((*runs.TITLES, *runs.OPTIONAL), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
+    for coverage in (0.5, 1.0):
+        row = dict.fromkeys(runs.COLUMNS.values(), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
         runs.show_rows([row | {"static_camera_ate_rmse_m": 0.2}], None, "p")
-        return capsys.readouterr().out
-
-    assert "of the tracked frames alone" in shown(0.5) and "tracked frames" not in shown(1.0)
+        assert ("of the tracked frames alone" in capsys.readouterr().out) == (coverage < 1)
 
 
 def test_report_prints_five_lines_and_its_place(cli, walk, tmp_path):

@@ -10,10 +10,9 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("dynslam_bench", "envs", "tuning", "reports")
+PACKAGES = ("dynslam_bench", "envs", "tuning", "reports")
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 SUFFIXES = r"(?:py|toml|md|jsonl|json|csv|txt|html|png|mp4|ply|yml|yaml|xz|tex)"
-IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True)
@@ -31,46 +30,31 @@ class Mention:
 
 def sources() -> list[Path]:
     """All Python files of the package."""
-    return [file for room in ROOMS for file in sorted((ROOT / room).rglob("*.py"))]
-
-
-@dataclass(frozen=True)
-class Source:
-    """What a Python file names: in its docstrings, and by its identifiers and other texts."""
-
-    docstrings: tuple[tuple[int, str], ...]
-    names: frozenset[str]
-    texts: frozenset[str]
+    return [file for package in PACKAGES for file in sorted((ROOT / package).rglob("*.py"))]
 
 
 @cache
-def read(file: Path) -> Source:
-    """A file's docstrings with their lines, its names and the words of its texts, and those texts."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    nodes = list(ast.walk(tree))
+def read(file: Path) -> tuple[list[tuple[int, str]], set[str]]:
+    """A file's docstrings with their lines; its names, and its other texts with their words."""
+    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
     docstrings = {id(node): (node.lineno, str(node.value)) for node in _docstrings(nodes)}
-    texts = {
-        node.value
-        for node in nodes
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
-    }
     names = {name for node in nodes for name in _names_of(node)}
-    words = {word for text in texts for word in (text, *re.findall(r"[A-Za-z0-9_][A-Za-z0-9_-]*", text))}
-    return Source(tuple(docstrings.values()), frozenset(names | words), frozenset(texts))
+    for node in nodes:
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            names |= {node.value, *re.findall(r"[A-Za-z0-9_][A-Za-z0-9_-]*", node.value)}
+    return list(docstrings.values()), names
 
 
 @cache
 def words() -> frozenset[str]:
     """Every identifier of the code, and every word of its string constants that are no docstrings."""
-    found: set[str] = set()
+    names: set[str] = set()
     for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]:
-        found.update(read(file).names)
-        found.add(file.stem)
-        found.update(file.parent.relative_to(ROOT).parts)
-    data = [file for room in ROOMS for kind in ("toml", "csv") for file in (ROOT / room).rglob(f"*.{kind}")]
+        names |= {*read(file)[1], file.stem, *file.parent.relative_to(ROOT).parts}
+    data = [file for package in PACKAGES for kind in ("toml", "csv") for file in (ROOT / package).rglob(f"*.{kind}")]
     for file in [*data, ROOT / "pyproject.toml"]:
-        found.update(re.findall(r"[A-Za-z_][A-Za-z0-9_-]*", file.read_text(encoding="utf-8")))
-    return frozenset(found)
+        names.update(re.findall(r"[A-Za-z_][A-Za-z0-9_-]*", file.read_text(encoding="utf-8")))
+    return frozenset(names)
 
 
 def _names_of(node: ast.AST) -> Iterator[str]:
@@ -95,17 +79,6 @@ def _docstrings(nodes: list[ast.AST]) -> Iterator[ast.Constant]:
                     yield statement.value
 
 
-@cache
-def file_names() -> frozenset[str]:
-    """Names of the repository's own files, and of those that the package reads or writes as its strings tell."""
-    tracked = [*ROOT.glob("*"), *PAGES, *sources(), *(ROOT / "tests").rglob("*"), *(ROOT / ".ci").rglob("*")]
-    found = {file.name for file in tracked}
-    for file in sources():
-        found.update(re.split(r"[/\s]", text)[-1] for text in read(file).texts if text)
-    data = [file for room in ROOMS for file in (ROOT / room).rglob("*.*") if file.suffix not in (".py", ".pyc")]
-    return frozenset(found | {file.name for file in data})
-
-
 def in_pages() -> Iterator[Mention]:
     """Inline code of all pages (fenced blocks are commands, which are tested elsewhere, or made-up files)."""
     for page in PAGES:
@@ -118,7 +91,7 @@ def in_pages() -> Iterator[Mention]:
 def in_docstrings() -> Iterator[Mention]:
     """Single and double backticks of all docstrings of the package."""
     for file in sources():
-        for line, text in read(file).docstrings:
+        for line, text in read(file)[0]:
             for found in re.finditer(r"(`+)([^`\n]+)\1", text):
                 yield Mention(f"{file.relative_to(ROOT)}:{line}", found.group(2))
 
@@ -132,5 +105,5 @@ def links() -> Iterator[Mention]:
 
 
 def exists(path: str) -> bool:
-    """Whether a path is there, from the root, from the package, or from a room (``culling/epipolar.py``)."""
+    """Whether a path is there, from the root, from the package, or from a package (``culling/epipolar.py``)."""
     return any((base / path).exists() for base in (ROOT, ROOT / "dynslam_bench", ROOT / "docs", ROOT.parent))

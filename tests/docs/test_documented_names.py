@@ -12,7 +12,6 @@ from documented_names import (
     SUFFIXES,
     Mention,
     exists,
-    file_names,
     in_docstrings,
     in_pages,
     links,
@@ -44,15 +43,6 @@ FOREIGN = {
 """First parts of names that belong to other libraries and that our code never spells."""
 FOREIGN_OPTIONS = {"--help", "--extra-index-url", "--fixed_delta"}
 """Options of the help, of pip, and of the TUM benchmark's scripts."""
-FOREIGN_FILES = {
-    "associate.py": "a script of the TUM benchmark",
-    "evaluate_rpe.py": "a script of the TUM benchmark",
-    "masks.txt": "written below the name of each kind of image",
-    "mine.toml": "the reader's",
-    "my_slam.py": "the reader's",
-    "my_tracker.py": "the reader's",
-}
-"""File names that are not ours, and those that the code puts together."""
 POSE = re.compile(r"[TR]_[a-z]+_[a-z]+")
 """Poses by their frames of reference; the notation, not a variable."""
 
@@ -66,7 +56,7 @@ def mentions() -> list[Mention]:
 @cache
 def setting_names() -> frozenset[str]:
     """Dotted names of all settings of all trackers, and of every group of them."""
-    names = {name for found in TRACKERS.all() for name in field_names(found.spec.settings)}
+    names = {name for tracker in TRACKERS.all() for name in field_names(tracker.spec.settings)}
     return frozenset(names | {name.rpartition(".")[0] for name in names})
 
 
@@ -92,13 +82,6 @@ def test_files_and_folders_exist() -> None:
     path = re.compile(r"(?:[\w.-]+/)+(?:[\w.-]+\.(?:py|toml|md|jsonl))?")
     named = [m for m in mentions() if path.fullmatch(m.text) and not m.text.startswith(OF_USERS)]
     assert not missing(named, lambda text: exists(text) or (text.endswith("/") and text.strip("/") in words()))
-
-
-def test_bare_file_names_exist() -> None:
-    name = re.compile(rf"[\w-]*[A-Za-z_][\w-]*(?:\.[\w-]+)*\.{SUFFIXES}")
-    named = [m for m in mentions() if name.fullmatch(m.text)]
-    assert len(named) > 100
-    assert not missing(named, (file_names() | set(FOREIGN_FILES)).__contains__)
 
 
 def test_links_lead_somewhere() -> None:

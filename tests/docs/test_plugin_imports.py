@@ -23,19 +23,10 @@ def imports(code: str) -> list[tuple[str, str]]:
     return [(module, name) for module, name in taken if module.startswith("dynslam_bench")]
 
 
-def blocks(page: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.S | re.M)
-
-
-def test_plug_ins_of_the_page_import_from_the_contracts_only() -> None:
-    found = [each for code in blocks(ROOT / "docs" / "plugins.md") for each in imports(code)]
-    assert len(found) > 10
-    assert {module for module, _ in found} <= OPEN | {COMPOSING, RULES}
-    composing = {name for module, name in found if module == COMPOSING}
-    assert composing == {"SystemSettings", "SemanticSystemSettings", "compose"}
-
-
-def test_the_template_imports_from_the_contracts_only(tmp_path: Path) -> None:
-    found = imports(write_tracker_template("my-slam", tmp_path).read_text())
-    assert ("dynslam_bench.contracts", "TrackerSpec") in found
-    assert {module for module, _ in found} <= OPEN
+def test_plug_ins_import_from_the_contracts_only(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    texts = re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M)
+    taken = [pair for text in texts for pair in imports(text)]
+    assert len(taken) > 10 and {module for module, _ in taken} <= OPEN | {COMPOSING, RULES}
+    template = imports(write_tracker_template("my-slam", tmp_path).read_text())
+    assert ("dynslam_bench.contracts", "TrackerSpec") in template and {module for module, _ in template} <= OPEN

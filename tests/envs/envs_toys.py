@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,12 +12,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks
+from dynslam_bench.contracts.sequence import Frame, FrameMasks, Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec, TrackResult
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.sequences.cameras import write_camera
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 STEP_M = 0.01
@@ -77,29 +82,26 @@ def images(index: int) -> tuple[np.ndarray, np.ndarray]:
 
 def write_folder(folder: Path, frames: int = 12, *, has_truth: bool = True) -> Path:
     """The toy sequence as a folder in TUM layout."""
-    (folder / "rgb").mkdir(parents=True)
-    (folder / "depth").mkdir()
+    return write_sequence(folder, ToySequence(frames, has_truth=has_truth))
+
+
+def write_sequence(folder: Path, sequence: Sequence) -> Path:
+    """A sequence as a folder in TUM layout."""
     lists: dict[str, list[str]] = {"rgb": [], "depth": []}
-    stamps = 100.0 + np.arange(frames) / 30.0
-    for index, stamp in enumerate(stamps):
-        rgb, depth = images(index)
-        name = f"{stamp:.6f}.png"
-        cv2.imwrite(str(folder / "rgb" / name), rgb[:, :, ::-1])
-        cv2.imwrite(str(folder / "depth" / name), np.round(depth * 5000).astype(np.uint16))
-        for kind in lists:
-            lists[kind].append(f"{stamp:.6f} {kind}/{name}")
+    for kind in lists:
+        (folder / kind).mkdir(parents=True)
+    for index in range(len(sequence)):
+        frame = sequence[index]
+        name = f"{frame.timestamp:.6f}.png"
+        cv2.imwrite(str(folder / "rgb" / name), frame.rgb[:, :, ::-1])
+        cv2.imwrite(str(folder / "depth" / name), np.round(frame.depth * 5000).astype(np.uint16))
+        for kind, lines in lists.items():
+            lines.append(f"{frame.timestamp:.6f} {kind}/{name}\n")
     for kind, lines in lists.items():
-        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
-    if has_truth:
-        rows = []
-        for stamp, pose in zip(stamps, truth(frames), strict=True):
-            position, quaternion = se3.to_quaternion(pose)
-            rows.append(f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in (*position, *quaternion)))
-        (folder / "groundtruth.txt").write_text("\n".join(rows) + "\n")
-    (folder / "camera.toml").write_text(
-        f"width = {CAMERA.width}\nheight = {CAMERA.height}\nfx = {CAMERA.fx}\nfy = {CAMERA.fy}\n"
-        f"cx = {CAMERA.cx}\ncy = {CAMERA.cy}\nfps = 30.0\n"
-    )
+        (folder / f"{kind}.txt").write_text("".join(lines))
+    if sequence.ground_truth is not None:
+        write_tum(folder / "groundtruth.txt", sequence.ground_truth)
+    write_camera(folder / "camera.toml", sequence.camera, fps=30)
     return folder
 
 
@@ -166,39 +168,32 @@ class ToyTracker:
 def misbehave(mode: str, result: TrackResult) -> TrackResult:
     """One of the ways in which a tracker can fail."""
     pose = np.array(result.T_world_cam)
-    if mode == "lost":
-        return replace(result, T_world_cam=None, state="lost")
-    if mode == "initialising":
-        return replace(result, T_world_cam=None, state="initialising")
-    if mode == "nan":
-        return replace(result, T_world_cam=pose * np.nan)
-    if mode == "scaled":
-        return replace(result, T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0]) @ pose)
-    if mode == "mirrored":
-        return replace(result, T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0]))
-    if mode == "none":
-        return replace(result, T_world_cam=None)
-    if mode == "string":
-        return "nonsense"  # type: ignore[return-value]
-    if mode == "raise":
-        raise ValueError("the toy tracker raised on purpose")
-    if mode == "hang":
-        import time
-
-        time.sleep(3600)
-    if mode == "segfault":
-        import ctypes
-
-        ctypes.string_at(0)
-    if mode == "exit":
-        import os
-
-        os._exit(3)
-    if mode == "memory":
-        hoard = [np.ones(2**23) for _ in range(64)]  # 4 GiB, 64 MiB at a time
-        assert hoard
-    if mode == "memoryerror":
-        raise MemoryError("the toy tracker ran out of memory on purpose")
+    match mode:
+        case "lost" | "initialising":
+            return replace(result, T_world_cam=None, state=mode)
+        case "nan":
+            return replace(result, T_world_cam=pose * np.nan)
+        case "scaled":
+            return replace(result, T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0]) @ pose)
+        case "mirrored":
+            return replace(result, T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0]))
+        case "none":
+            return replace(result, T_world_cam=None)
+        case "string":
+            return "nonsense"  # type: ignore[return-value]
+        case "raise":
+            raise ValueError("the toy tracker raised on purpose")
+        case "hang":
+            time.sleep(3600)
+        case "segfault":
+            ctypes.string_at(0)
+        case "exit":
+            os._exit(3)
+        case "memory":
+            hoard = [np.ones(2**23) for _ in range(64)]  # 4 GiB, 64 MiB at a time
+            assert hoard
+        case "memoryerror":
+            raise MemoryError("the toy tracker ran out of memory on purpose")
     raise AssertionError(f"unknown mode {mode}")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import pickle
 import warnings
 
@@ -38,10 +37,6 @@ def test_the_default_tracker_passes_the_checker() -> None:
     checked(gym.make("dynslam/synthetic-sitting_xyz-v0", render_mode="rgb_array", frames=[0, 20]))
 
 
-def test_a_real_sequence_passes_the_checker(real_data: str) -> None:
-    checked(gym.make("dynslam/tum-fr1-xyz-v0", tracker="orb-slam2", data_root=real_data, render_mode="rgb_array"))
-
-
 @pytest.mark.parametrize(
     "kwargs", [{}, {"observation": "rgbd"}, {"control": CONTROL}, {"reward": "neg_pose_error", "lost_after": 3}]
 )
@@ -60,14 +55,6 @@ def test_all_listed_sequences_are_registered_and_registering_again_changes_nothi
     assert all(gym.spec(name).max_episode_steps is None for name in ids)
 
 
-def test_spec_survives_json() -> None:
-    kwargs = {"tracker": TARGET, "control": CONTROL, "frames": [2, 9], "settings": {"noise.level_m": 0.01}}
-    spec = copy.deepcopy(gym.spec(GENERIC_ID))
-    spec.kwargs = kwargs
-    again = EnvSpec.from_json(spec.to_json())
-    assert again.kwargs == kwargs and again.id == spec.id and again.entry_point == "dynslam_bench.envs:SlamEnv"
-
-
 def test_made_environment_is_made_again_from_its_json(toy_folder: str) -> None:
     env = gym.make(GENERIC_ID, sequence=toy_folder, tracker=TARGET, frames=[3, 20], control=CONTROL)
     env = dynslam_bench.envs.DropFrames(dynslam_bench.envs.RecordTimings(env), frame_time_s=0.05)
@@ -77,17 +64,14 @@ def test_made_environment_is_made_again_from_its_json(toy_folder: str) -> None:
     first, _ = env.reset(seed=3)
     second, _ = twin.reset(seed=3)
     assert first.tobytes() == second.tobytes()
-    assert twin.unwrapped.action_names == tuple(CONTROL)
+    assert twin.action_space == env.action_space
 
 
-def test_two_environments_with_one_seed_give_identical_bytes(toy_folder: str) -> None:
-    assert rollout(SlamEnv(toy_folder, TARGET), 50, 5) == rollout(SlamEnv(toy_folder, TARGET), 50, 5)
-    assert rollout(SlamEnv(toy_folder, TARGET), 50, 5) != rollout(SlamEnv(toy_folder, TARGET), 50, 6)
-
-
-def test_an_environment_repeats_itself_after_reset(toy_folder: str) -> None:
+def test_one_seed_gives_identical_bytes(toy_folder: str) -> None:
     env = SlamEnv(toy_folder, TARGET, control=CONTROL)
-    assert rollout(env, 20, 5) == rollout(env, 20, 5)
+    first = rollout(env, 20, 5)
+    assert first == rollout(env, 20, 5) == rollout(SlamEnv(toy_folder, TARGET, control=CONTROL), 20, 5)
+    assert first != rollout(env, 20, 6)
 
 
 def test_pickle_gives_an_equal_environment(toy_folder: str) -> None:

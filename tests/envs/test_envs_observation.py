@@ -11,14 +11,14 @@ from envs_toys import CAMERA, TARGET, ToySequence, images
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.envs import STATS_LAYOUT, SlamEnv
-from dynslam_bench.envs.spaces import MAX_DEPTH_M, ObservationContext, stats_observation, stats_space
+from dynslam_bench.envs.spaces import MAX_DEPTH_M, stats_observation, stats_space
 from dynslam_bench.geometry import se3
 
 FRAME = Frame(3, 1.0, *images(3))
 
 
 def observe(result: TrackResult, frame: Frame = FRAME, motion: np.ndarray | None = None) -> dict[str, float]:
-    vector = stats_observation(frame, result, ObservationContext(3, 6, 0, motion))
+    vector = stats_observation(frame, result, progress=0.5, lost_streak=0, T_prev_cur=motion)
     assert vector in stats_space() and np.isfinite(vector).all()
     return dict(zip((name for name, _ in STATS_LAYOUT), vector.tolist(), strict=True))
 
@@ -29,16 +29,15 @@ def test_every_entry_means_what_is_documented() -> None:
         "mask_fraction": 0.25, "map_points": 5000.0, "keyframes": 100.0, "keyframe": 1.0,
     }  # fmt: skip
     motion = se3.exp(np.array([0.1, 0, -0.1, 0, 0.1, 0]))
-    seen = observe(TrackResult(np.eye(4), "ok", stats), motion=motion)
-    assert (seen["initialising"], seen["ok"], seen["lost"]) == (0, 1, 0)
-    assert seen["progress"] == 0.5 and seen["keypoints"] == 0.5 and seen["culled"] == 0.25
-    assert seen["matches"] == pytest.approx(0.4) and seen["inliers"] == 0.5 and seen["residual"] == 0.5
-    assert seen["mask_fraction"] == 0.25 and seen["map_points"] == 0.5 and seen["keyframes"] == 0.5
-    assert seen["keyframe"] == 1
-    assert seen["motion_x"] == pytest.approx(np.tanh(1)) and seen["motion_z"] == pytest.approx(-np.tanh(1))
-    assert seen["motion_ry"] == pytest.approx(np.tanh(1)) and seen["motion_rx"] == pytest.approx(0, abs=1e-9)
-    assert seen["depth_valid"] == 1 and seen["depth_median"] == pytest.approx(1.3 / 4.3)
-    assert seen["brightness"] == pytest.approx(FRAME.rgb.mean() / 255, abs=0.03)
+    entries = observe(TrackResult(np.eye(4), "ok", stats), motion=motion)
+    brightness, contrast, motion_rx = (entries.pop(name) for name in ("brightness", "contrast", "motion_rx"))
+    assert brightness == pytest.approx(FRAME.rgb.mean() / 255, abs=0.03) and contrast > 0
+    expected = dict.fromkeys(entries, 0.0) | {
+        "ok": 1, "progress": 0.5, "keypoints": 0.5, "culled": 0.25, "matches": 0.4, "inliers": 0.5, "residual": 0.5,
+        "mask_fraction": 0.25, "map_points": 0.5, "keyframes": 0.5, "keyframe": 1, "motion_x": np.tanh(1),
+        "motion_z": -np.tanh(1), "motion_ry": np.tanh(1), "depth_valid": 1, "depth_median": 1.3 / 4.3,
+    }  # fmt: skip
+    assert entries == pytest.approx(expected, abs=1e-6) and motion_rx == pytest.approx(0, abs=1e-9)
 
 
 def test_nothing_reported_and_nonsense_reported_stay_in_bounds() -> None:
@@ -46,8 +45,8 @@ def test_nothing_reported_and_nonsense_reported_stay_in_bounds() -> None:
     wild = {"keypoints": np.inf, "culled": -5.0, "matches": 1e30, "inliers": np.nan, "mask_fraction": 7.0}
     observe(TrackResult(np.eye(4), "ok", wild), motion=se3.exp(np.array([1e6, 0, 0, 3, 0, 0])))
     black = replace(FRAME, rgb=np.zeros_like(FRAME.rgb), depth=np.zeros_like(FRAME.depth))
-    seen = observe(TrackResult(None, "initialising"), black)
-    assert seen["brightness"] == seen["contrast"] == seen["depth_valid"] == seen["depth_median"] == 0
+    entries = observe(TrackResult(None, "initialising"), black)
+    assert entries["brightness"] == entries["contrast"] == entries["depth_valid"] == entries["depth_median"] == 0
 
 
 def test_rgbd_holds_copies_of_the_images() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynslam_bench.envs.spaces import reward_named
+from dynslam_bench.envs import REWARDS
 from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -33,9 +33,9 @@ def episode(seed: int) -> tuple[Trajectory, np.ndarray, np.ndarray]:
 
 
 def rewards(name: str, truth: Trajectory, poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
-    error, reward = OnlineError(truth), reward_named(name)
-    stamps = np.arange(len(poses)) / 30.0
-    return np.array([reward(error.update(*frame)) for frame in zip(stamps, poses, tracked, strict=True)])
+    stamps, online = np.arange(len(poses)) / 30.0, OnlineError(truth)
+    errors = [online.update(*frame) for frame in zip(stamps, poses, tracked, strict=True)]
+    return np.array([0.0 if error is None else REWARDS[name](error) for error in errors])
 
 
 @pytest.mark.parametrize("seed", range(EPISODES))

@@ -32,11 +32,10 @@ def test_depth_keeps_missing_apart_and_is_right_to_half_a_step() -> None:
     assert np.abs(metres - shown["depth"]).ravel()[1:].max() <= 0.5 * MAX_DEPTH_M / 254 + 1e-6
 
 
-def test_what_it_cannot_wrap_is_one_line() -> None:
-    with pytest.raises(SettingsError, match="the observation is 'stats'"):
-        SmallImages(SlamEnv(ToySequence(4), TARGET))
-    with pytest.raises(SettingsError, match="0 x 60"):
-        SmallImages(SlamEnv(ToySequence(4), TARGET, observation="rgbd"), width=0)
+@pytest.mark.parametrize(("observation", "width"), [("stats", 80), ("rgbd", 0)])
+def test_what_it_cannot_wrap_is_refused(observation: str, width: int) -> None:
+    with pytest.raises(SettingsError):
+        SmallImages(SlamEnv(ToySequence(4), TARGET, observation=observation), width=width)
 
 
 def test_stable_baselines3_takes_it_without_a_word() -> None:

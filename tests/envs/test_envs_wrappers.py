@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from envs_toys import FIXED, TARGET, FixedTracker, ToySequence, images
+from envs_toys import FIXED, TARGET, FixedTracker, ToySequence, images, write_folder
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import DynslamError, SettingsError
@@ -33,10 +33,8 @@ def play(env) -> list[tuple]:
 
 def test_record_timings() -> None:
     env = RecordTimings(SlamEnv(ToySequence(6), TARGET))
-    _, info = env.reset(seed=0)
-    assert info["timings"]["features"] == 0.001 and info["timings"]["total"] > 0
-    for _ in range(5):
-        assert env.step(0)[4]["timings"]["tracking"] == 0.002
+    for info in (env.reset(seed=0)[1], *(env.step(0)[4] for _ in range(5))):
+        assert info["timings"]["features"] == 0.001 and info["timings"]["total"] > 0
     assert env.summary()["features"] == {"median": 0.001, "p95": 0.001}
 
 
@@ -51,19 +49,20 @@ def test_record_trajectory(tmp_path) -> None:
     assert [path.name for path in env.written] == ["run_0.txt", "run_1.txt"]
 
 
-def test_a_tracker_at_half_the_frame_rate_sees_every_other_frame() -> None:
-    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=1.9 / 30)
+@pytest.mark.parametrize(
+    ("frame_time_s", "speed", "tracked"),
+    [
+        (0.9 / 30, 1.0, [*range(1, 11)]),
+        (1.9 / 30, 1.0, [1, 3, 5, 7, 9, 10]),
+        (0.9 / 30, 2.0, [1, 3, 5, 7, 9, 10]),
+        (100.0, 1.0, [10]),  # slower than the whole sequence: it still gets the last frame
+    ],
+)
+def test_a_busy_tracker_misses_frames(frame_time_s: float, speed: float, tracked: list[int]) -> None:
+    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=frame_time_s, speed=speed)
     steps = play(env)
-    assert [step[4]["frame_index"] for step in steps] == [1, 3, 5, 7, 9, 10]
-    assert env.dropped == 4
-    assert steps[-1][3] and steps[-1][4]["episode_metrics"]["coverage"] == pytest.approx(7 / 11)
-
-
-def test_a_tracker_that_keeps_up_drops_nothing() -> None:
-    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=0.9 / 30)
-    assert [step[4]["frame_index"] for step in play(env)] == list(range(1, 11)) and env.dropped == 0
-    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=0.9 / 30, speed=2.0)
-    assert [step[4]["frame_index"] for step in play(env)] == [1, 3, 5, 7, 9, 10]
+    assert [step[4]["frame_index"] for step in steps] == tracked and env.dropped == 10 - len(tracked)
+    assert steps[-1][3] and steps[-1][4]["episode_metrics"]["coverage"] == pytest.approx((1 + len(tracked)) / 11)
 
 
 def test_dropped_frames_cost_the_error_of_not_moving() -> None:
@@ -73,11 +72,6 @@ def test_dropped_frames_cost_the_error_of_not_moving() -> None:
     motion = np.hypot(0.01, 0.002)
     assert whole == pytest.approx(0, abs=1e-9)
     assert sum(step[1] for step in dropping) == pytest.approx(-8 * motion, abs=1e-6)  # 4 dropped, 4 ways back
-
-
-def test_a_tracker_slower_than_the_whole_sequence_still_gets_the_last_frame() -> None:
-    steps = play(DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=100.0))
-    assert [step[4]["frame_index"] for step in steps] == [10]
 
 
 def test_random_drops_are_seeded_and_near_their_share() -> None:
@@ -135,31 +129,28 @@ def test_degraded_frames_reach_the_tracker_and_the_observation() -> None:
     assert (seen["rgb"] == env.unwrapped.frame.rgb).all()
 
 
-@pytest.mark.parametrize("kwargs", [{"blur": 1.5}, {"noise": -0.1}])
-def test_strengths_outside_the_range(kwargs: dict) -> None:
-    with pytest.raises(SettingsError, match=r"expected a strength in \[0, 1\]"):
-        DegradeFrames(SlamEnv(ToySequence(5), TARGET), **kwargs)
-
-
-@pytest.mark.parametrize("kwargs", [{"speed": 0}, {"frame_time_s": -1}, {"share": 1.0}])
-def test_drop_frames_outside_the_range(kwargs: dict) -> None:
+@pytest.mark.parametrize(
+    ("wrapper", "arguments"),
+    [(DegradeFrames, {"blur": 1.5}), (DegradeFrames, {"noise": -0.1}), (SequenceSampler, {"sequences": []})]
+    + [(DropFrames, arguments) for arguments in ({"speed": 0}, {"frame_time_s": -1}, {"share": 1.0})],
+)
+def test_arguments_outside_their_range(wrapper: type, arguments: dict) -> None:
     with pytest.raises(SettingsError):
-        DropFrames(SlamEnv(ToySequence(5), TARGET), **kwargs)
+        wrapper(SlamEnv(ToySequence(5), TARGET), **arguments)
 
 
 def test_sequence_sampler(toy_folder: str, tmp_path) -> None:
-    from envs_toys import write_folder
-
     other = str(write_folder(tmp_path / "other", 8))
-    env = SequenceSampler(SlamEnv(toy_folder, TARGET), [toy_folder, other])
-    drawn = [env.reset(seed=0)[1]["sequence"]] + [env.reset()[1]["sequence"] for _ in range(3)]
-    assert drawn == [toy_folder, other, toy_folder, other]
-    env = SequenceSampler(SlamEnv(toy_folder, TARGET), [toy_folder, other], mode="random")
-    first = [env.reset(seed=5)[1]["sequence"]] + [env.reset()[1]["sequence"] for _ in range(9)]
-    second = [env.reset(seed=5)[1]["sequence"]] + [env.reset()[1]["sequence"] for _ in range(9)]
-    assert first == second and set(first) == {toy_folder, other}
-    with pytest.raises(SettingsError, match="no sequences"):
-        SequenceSampler(SlamEnv(toy_folder, TARGET), [])
+
+    def drawn(mode: str, seed: int) -> list[str]:
+        env = SequenceSampler(SlamEnv(toy_folder, TARGET), [toy_folder, other], mode=mode)
+        return [env.reset(seed=seed if first else None)[1]["sequence"] for first in (True, *[False] * 7)]
+
+    assert drawn("round_robin", 0) == [toy_folder, other] * 4
+    assert drawn("random", 5) == drawn("random", 5) != drawn("random", 6) and set(drawn("random", 5)) == {
+        toy_folder,
+        other,
+    }
 
 
 class Compiles(FixedTracker):

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dynslam_bench.cli.output import _text  # how a cell of a table is written
+from dynslam_bench.cli.output import cell_text  # how a cell of a table is written
 from dynslam_bench.core import download as address
 from dynslam_bench.core import sanitise as harmless
 from dynslam_bench.core import settings as core_settings
@@ -145,7 +145,7 @@ def _harmless(text: str) -> None:
     """Whatever a record says, the terminal gets no escape, the file no half character, the path no way out."""
     assert not set(harmless.printable(text)) & {chr(code) for code in (*range(9), *range(14, 32), 0x9B, 0x202E)}
     str(harmless.storable({text: [text]})).encode()
-    assert "\n" not in _text(text)
+    assert "\n" not in cell_text(text)
     if harmless.is_inside(text):
         assert (Path("/root/x") / text).resolve().is_relative_to("/root/x")
 

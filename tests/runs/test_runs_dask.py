@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from envs_toys import TARGET
 
-from dynslam_bench.cli.running import dask_executor
+from dynslam_bench.api import dask_executor
 from dynslam_bench.core.errors import InfrastructureError
 from dynslam_bench.runs import RunEvent, RunSpec, RunStore, run_many
 
