@@ -37,6 +37,7 @@ def test_points_and_keyframes_agree_on_their_observations(room):
     assert by_feature == by_point and len(by_point) > 1000
     begin, end = world.obs_at[points], world.obs_at[points] + world.obs_capacity[points]
     order = np.argsort(begin)
+    assert begin.min() >= 0 and end.max() <= world.obs_kf.size
     assert (end[order][:-1] <= begin[order][1:]).all() and (world.n_obs[points] <= world.obs_capacity[points]).all()
 
 

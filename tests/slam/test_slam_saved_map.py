@@ -125,8 +125,16 @@ def twice(arrays):
     arrays["obs_ft"][other] = arrays["obs_ft"][one]
 
 
+def with_two_features(arrays):
+    """The keyframe that observes the first point observes it with a further feature, too."""
+    keyframe = arrays["obs_kf"][0]
+    used = arrays["obs_ft"][arrays["obs_kf"] == keyframe]
+    arrays["obs_kf"][1], arrays["obs_ft"][1] = keyframe, np.setdiff1d(np.arange(arrays["kf_count"][keyframe]), used)[0]
+
+
 FAULTS = [
     (twice, "two points"),
+    (with_two_features, "with two features"),
     (put("obs_ft", 0, 30000), "features that the keyframe does not have"),
     (put("obs_kf", 0, 99), "values above"),
     (put("n_obs", 0, 30000), "does not add up"),
