@@ -186,7 +186,10 @@ class Program:
         self.kill()
         line = self._last_line()
         shown = f"its last line: '{line}'" if line else "it wrote no message"
-        return TrackerError(f"{self.name} {doing}: the program {_describe(code)}; {shown}")
+        ended = (
+            f"was killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+        )
+        return TrackerError(f"{self.name} {doing}: the program {ended}; {shown}")
 
 
 def _read(
@@ -226,15 +229,6 @@ def end_with_parent() -> Callable[[], object] | None:
         return None
     prctl = ctypes.CDLL(None).prctl  # loaded here: between fork and exec as little as possible is done
     return lambda: prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
-
-
-def _describe(code: int) -> str:
-    if code >= 0:
-        return f"ended with exit code {code}"
-    try:
-        return f"was killed by {signal.Signals(-code).name}"
-    except ValueError:
-        return f"was killed by signal {-code}"
 
 
 def _kill_group(process: subprocess.Popen[bytes]) -> None:

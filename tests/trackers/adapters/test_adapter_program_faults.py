@@ -23,7 +23,7 @@ FAULTS = {
         "exit code 3; its last line: 'config.yaml'",
     ),
     "silent exit": ("os._exit(0)", "exit code 0; it wrote no message"),
-    "segfault": ("os.kill(os.getpid(), 11)", "killed by SIGSEGV"),
+    "segfault": ("os.kill(os.getpid(), 11)", "killed by signal 11 "),
     "no json": ("print('{pose: 1}', flush=True)", "is no valid JSON"),
     "error": ("say({'error': 'out of\\nmemory'})", "at frame 7: out of memory"),
     "no pose": ("say({'state': 'ok'})", "'ok' without T_world_cam"),
