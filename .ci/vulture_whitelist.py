@@ -7,6 +7,8 @@ relative_to_first  # on a Trajectory, for users who compare with systems that st
 of_classes  # on Instances, for authors of filters and segmenters
 action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
+mean_ap  # on SegmenterScore, the record of `segmenter evaluate`
+mean_iou  # the same
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
 
 compile_kernels  # cli.demo: .ci/run calls it, before the tests
@@ -18,7 +20,7 @@ _restore_optimizer  # tuning.samplers: Optuna calls it, in place of its own
 OrbExtractor  # features.registry
 build_daisy  # flow.registry
 build_recorded  # segmentation.registry
-build_onnx  # segmentation.registry
+build_oracle  # segmentation.registry
 build_embedded  # segmentation.registry
 build_coco  # segmentation.registry
 build_weights  # segmentation.registry
@@ -31,8 +33,6 @@ OpenCvOdometry  # trackers.adapters.specs
 OrbSlam3  # trackers.adapters.specs
 OrbSlam3Monocular  # trackers.adapters.specs
 Replay  # trackers.adapters.specs
-build_masks_only  # trackers.systems.dynaslam: a variant's spec
-build_geometry_only  # trackers.systems.dynaslam: a variant's spec
 build_vote  # trackers.systems.emfoa_oft: a variant's spec
 BoxDepthFilter  # trackers.systems: a system names its rules
 BoxEpipolarFilter  # trackers.systems: a system names its rules
