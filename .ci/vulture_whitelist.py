@@ -7,8 +7,6 @@ relative_to_first  # on a Trajectory, for users who compare with systems that st
 of_classes  # on Instances, for authors of filters and segmenters
 action_names  # on SlamEnv, for agents: which coordinate of an action is which setting
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/environments.md)
-mean_ap  # on SegmenterScore, the record of `segmenter evaluate`
-mean_iou  # the same
 rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
 
 compile_kernels  # cli.demo: .ci/run calls it, before the tests
@@ -85,10 +83,8 @@ finalize_s  # run.json
 peak_gpu_memory_mb  # run.json
 trained_on  # a checkpoint's record
 median_ms  # segmenter evaluate
-ap  # segmenter evaluate
-ap50  # segmenter evaluate
-frame_iou  # segmenter evaluate
-instance_iou  # segmenter evaluate
+mean_ap  # segmenter evaluate
+mean_iou  # segmenter evaluate
 tracker_provenance  # provenance.json of an export
 checked  # record of a fetched sequence
 improves  # a study's summary
