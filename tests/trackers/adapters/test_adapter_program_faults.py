@@ -78,7 +78,7 @@ def test_a_second_answer_is_never_taken_for_the_next_frame(program):
                     {pause} say({{"state": "ok", "T_world_cam": STILL}})
             """)
         )
-        with pytest.raises(TrackerError, match=r"not asked for|answered index 0"):
+        with pytest.raises(TrackerError, match="answered index 0"):
             for index in range(3):
                 tracker.track(frame(index))
         tracker.close()
