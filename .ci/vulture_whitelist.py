@@ -17,7 +17,7 @@ _restore_optimizer  # tuning.samplers: Optuna calls it, in place of its own
 OrbExtractor  # features.registry
 build_daisy  # flow.registry
 build_recorded  # segmentation.registry
-build_onnx  # segmentation.registry
+build_oracle  # segmentation.registry
 build_embedded  # segmentation.registry
 build_coco  # segmentation.registry
 build_weights  # segmentation.registry
@@ -30,8 +30,6 @@ OpenCvOdometry  # trackers.adapters.specs
 OrbSlam3  # trackers.adapters.specs
 OrbSlam3Monocular  # trackers.adapters.specs
 Replay  # trackers.adapters.specs
-build_masks_only  # trackers.systems.dynaslam: a variant's spec
-build_geometry_only  # trackers.systems.dynaslam: a variant's spec
 build_vote  # trackers.systems.emfoa_oft: a variant's spec
 BoxDepthFilter  # trackers.systems: a system names its rules
 BoxEpipolarFilter  # trackers.systems: a system names its rules
@@ -84,10 +82,8 @@ finalize_s  # run.json
 peak_gpu_memory_mb  # run.json
 trained_on  # a checkpoint's record
 median_ms  # segmenter evaluate
-ap  # segmenter evaluate
-ap50  # segmenter evaluate
-frame_iou  # segmenter evaluate
-instance_iou  # segmenter evaluate
+mean_ap  # segmenter evaluate
+mean_iou  # segmenter evaluate
 tracker_provenance  # provenance.json of an export
 checked  # record of a fetched sequence
 improves  # a study's summary

@@ -1,10 +1,10 @@
 """ONNX networks: layouts found from shapes, decoding checked by hand-made outputs, clear errors."""
 
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
+import onnx_writer
 import pytest
 
 from dynslam_bench.contracts.sequence import Frame
@@ -20,9 +20,6 @@ from dynslam_bench.segmentation.networks.onnx_segmenter import (
     fit,
 )
 from dynslam_bench.segmentation.settings import SegmentationSettings
-
-sys.path.insert(0, str(Path(__file__).parent))
-import onnx_writer
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 WEIGHTS = SHARED / "weights"

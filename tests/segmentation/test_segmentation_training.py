@@ -1,11 +1,10 @@
 """Labelled data from files and sequences, training with resume, evaluation."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
 import torch
+from coco_file import coco
 
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.boxes import IGNORED, NEGATIVE, match, sample
@@ -62,33 +61,18 @@ def test_yolo_polygons(tmp_path):
         YoloImages(tmp_path / "none")
 
 
-def coco_file(folder, segmentation, **extra):
-    cv2.imwrite(str(folder / "a.png"), np.zeros((6, 8, 3), np.uint8))
-    content = {
-        "images": [{"id": 5, "file_name": "a.png", "width": 8, "height": 6}],
-        "annotations": [{"id": 1, "image_id": 5, "category_id": 1, "segmentation": segmentation, **extra}],
-        "categories": [{"id": 1, "name": "person"}],
-    }
-    path = folder / "instances.json"
-    path.write_text(json.dumps(content))
-    return path
-
-
 def test_coco_polygons_and_run_lengths(tmp_path):
     expected = np.zeros((6, 8), bool)
     expected[1:4, 2:6] = True
     polygon = [[2, 1, 6, 1, 6, 4, 2, 4]]
     counts = [13, 3, 3, 3, 3, 3, 3, 3, 14]
     for segmentation in (polygon, {"size": [6, 8], "counts": counts}):
-        image = CocoImages(coco_file(tmp_path, segmentation))[0]
+        image = CocoImages(coco(tmp_path, segmentation))[0]
         assert image.class_names == ("person",)
         assert np.count_nonzero(image.masks[0] != expected) == 0
-    assert len(CocoImages(coco_file(tmp_path, polygon, iscrowd=1))[0].masks) == 0
+    assert len(CocoImages(coco(tmp_path, polygon, iscrowd=1))[0].masks) == 0
     with pytest.raises(SegmentationError, match="a mask of 9x6"):
-        CocoImages(coco_file(tmp_path, {"size": [6, 9], "counts": [54]}))[0]
-    (tmp_path / "instances.json").write_text('{"images": []}')
-    with pytest.raises(SegmentationError, match="not in COCO's annotation format"):
-        CocoImages(tmp_path / "instances.json")
+        CocoImages(coco(tmp_path, {"size": [6, 9], "counts": [54]}))[0]
 
 
 def test_rendered_frames_are_a_function_of_their_name():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -46,24 +46,6 @@ class LabelledImage:
     rgb: NDArray[np.uint8]
     masks: NDArray[np.bool_]
     class_names: tuple[str, ...]
-
-
-class LabelledImages(Protocol):
-    """A set of labelled images, decoded or rendered on access."""
-
-    @property
-    def name(self) -> str:
-        """Name of the set, for records."""
-        ...
-
-    @property
-    def version(self) -> str:
-        """Changes when the content of the images changes under the same name."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: int) -> LabelledImage: ...
 
 
 class CocoImages:
@@ -353,6 +335,11 @@ def labelled_frame(sequence: Sequence, index: int) -> LabelledImage:
     return LabelledImage(np.ascontiguousarray(sequence[index].rgb), instances.masks, instances.class_names)
 
 
+LabelledImages: TypeAlias = CocoImages | YoloImages | SequenceFrames | RenderedFrames
+"""Sets of labelled images, decoded or rendered on access.
+
+``name`` stands in records; ``version`` changes when the content changes under the same name.
+"""
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
 
 

@@ -112,7 +112,6 @@ class Program:
         Raises:
             TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
         """
-        self._refuse_surplus(doing)
         self._old_lines.update(self._new_lines)
         self._new_lines.clear()
         try:
@@ -133,7 +132,6 @@ class Program:
             raise TrackerError(f"{self.name} {doing}: {error.args[0]}", "one JSON object a line") from None
         if answer.get("error"):
             raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
-        self._refuse_surplus(doing)
         return answer
 
     def close(self, timeout_s: float) -> None:
@@ -155,19 +153,6 @@ class Program:
         self._process.stdin.write(json.dumps(message, allow_nan=False).encode() + b"\n")
         self._process.stdin.flush()
 
-    def _refuse_surplus(self, doing: str) -> None:
-        """Raise on an unrequested answer: it would be taken for the next one, a pose of the wrong frame."""
-        if self._answers.empty():
-            return
-        surplus = self._answers.get()
-        if surplus is None:
-            raise self._death(doing)
-        self.kill()
-        raise TrackerError(
-            f"{self.name} {doing}: wrote an answer that was not asked for: '{surplus[:80]}'",
-            "one line that begins with { for each request",
-        )
-
     def _last_line(self) -> str:
         """The last line of its log.
 
@@ -186,7 +171,10 @@ class Program:
         self.kill()
         line = self._last_line()
         shown = f"its last line: '{line}'" if line else "it wrote no message"
-        return TrackerError(f"{self.name} {doing}: the program {_describe(code)}; {shown}")
+        ended = (
+            f"was killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+        )
+        return TrackerError(f"{self.name} {doing}: the program {ended}; {shown}")
 
 
 def _read(
@@ -226,15 +214,6 @@ def end_with_parent() -> Callable[[], object] | None:
         return None
     prctl = ctypes.CDLL(None).prctl  # loaded here: between fork and exec as little as possible is done
     return lambda: prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
-
-
-def _describe(code: int) -> str:
-    if code >= 0:
-        return f"ended with exit code {code}"
-    try:
-        return f"was killed by {signal.Signals(-code).name}"
-    except ValueError:
-        return f"was killed by signal {-code}"
 
 
 def _kill_group(process: subprocess.Popen[bytes]) -> None:

@@ -45,11 +45,15 @@ GEOMETRY = (
     "the low-cost tracking matches the last frame alone",
     "parallax is taken between camera centres (the code's translation is in another frame)",
 )
-START = "the geometric test acts from the first keyframe on (the paper is silent, the code waits for five)"
-NO_BORDER = "features at the border of the geometric mask stay (the code drops those within 15 px, the paper does not)"
-PEOPLE = "nineteen classes where masks are exact or from a COCO network; the embedded network finds people alone"
-GROWN = "masks are grown by 15 px, as in the code"
-BORDER = "the further 15 px at the border of the semantic masks, whose features the code drops, stay"
+AS_IN_THE_PAPER = (
+    "the geometric test acts from the first keyframe on (the paper is silent, the code waits for five)",
+    "features at the border of the geometric mask stay (the code drops those within 15 px, the paper does not)",
+)
+MASKS = (
+    "nineteen classes where masks are exact or from a COCO network; the embedded network finds people alone",
+    "masks are grown by 15 px, as in the code",
+    "the further 15 px at the border of the semantic masks, whose features the code drops, stay",
+)
 UNION = "the masks of N and G are united, as in the code (the paper keeps G's where both find an object)"
 
 
@@ -63,9 +67,9 @@ def _spec(
 ) -> TrackerSpec:
     defaults, assumptions = settings(), []
     if isinstance(defaults, SemanticSystemSettings):
-        assumptions += [describe_masks(defaults.segmentation), CFPN, PEOPLE, GROWN, BORDER]
+        assumptions += [describe_masks(defaults.segmentation), CFPN, *MASKS]
     if "multiview" in settings.model_fields:
-        assumptions += GEOMETRY if provenance == "faithful-code" else [*GEOMETRY, START, NO_BORDER]
+        assumptions += GEOMETRY if provenance == "faithful-code" else [*GEOMETRY, *AS_IN_THE_PAPER]
     if isinstance(defaults, DynaSlamSettings):
         assumptions.append(UNION)
     return TrackerSpec(

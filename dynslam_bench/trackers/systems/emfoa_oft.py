@@ -133,7 +133,7 @@ DEPTH = "rigid motion in depth and free space seen before are tested as well (ou
 
 def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
     monocular = isinstance(settings, EmfoaOftMonoSettings)
-    sentences: list[str] = []
+    flow, sentences = getattr(settings, "flow", None), []
     if isinstance(settings, SemanticSystemSettings):
         sentences += [describe_masks(settings.segmentation), CFPN]
         if settings.segmentation.dilation_px:
@@ -143,10 +143,10 @@ def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
     if not monocular:
         sentences.append(SENSOR)
     if isinstance(settings, PaperTestSettings):
-        sentences += [SPARSE] if isinstance(settings.flow, FlowSettings) else DENSE
+        sentences += [SPARSE] if isinstance(flow, FlowSettings) else DENSE
     elif isinstance(settings, EpipolarTestSettings):
-        own_flow = [SPARSE] if settings.flow.method == "daisy" else []
-        sentences += [*own_flow, SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
+        sentences += [SPARSE] if isinstance(flow, FlowSettings) else []
+        sentences += [SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
     if isinstance(settings, DepthTestSettings):
         sentences.append(DEPTH)
     return (*sentences, BACKEND) if monocular else tuple(sentences)

@@ -23,7 +23,7 @@ FAULTS = {
         "exit code 3; its last line: 'config.yaml'",
     ),
     "silent exit": ("os._exit(0)", "exit code 0; it wrote no message"),
-    "segfault": ("os.kill(os.getpid(), 11)", "killed by SIGSEGV"),
+    "segfault": ("os.kill(os.getpid(), 11)", "killed by signal 11 "),
     "no json": ("print('{pose: 1}', flush=True)", "is no valid JSON"),
     "error": ("say({'error': 'out of\\nmemory'})", "at frame 7: out of memory"),
     "no pose": ("say({'state': 'ok'})", "'ok' without T_world_cam"),
@@ -78,7 +78,7 @@ def test_a_second_answer_is_never_taken_for_the_next_frame(program):
                     {pause} say({{"state": "ok", "T_world_cam": STILL}})
             """)
         )
-        with pytest.raises(TrackerError, match=r"not asked for|answered index 0"):
+        with pytest.raises(TrackerError, match="answered index 0"):
             for index in range(3):
                 tracker.track(frame(index))
         tracker.close()
