@@ -1,10 +1,13 @@
-"""Small sequences in TUM layout for tests, and where real data may lie."""
+"""Small sequences in TUM layout for tests, where real data may lie, and the flow of rendered frames."""
 
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.sequences.synthetic import CAMERA
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 needs_shared = pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")
@@ -40,3 +43,15 @@ def make_folder(folder, *, frames=4, width=32, height=24, rate=30, fps=30.0, sta
 def rewrite(path, change):
     """Replace a list file's lines by ``change(lines)``."""
     path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+
+
+V, U = np.mgrid[0:480, 0:640].astype(float)
+"""Rows and columns of a rendered image."""
+
+
+def reprojected(sequence, index, other):
+    """Flow from a rendered frame to another if nothing but the camera moves."""
+    points = CAMERA.unproject(np.stack([U, V], -1), sequence.exact_depth(index))
+    poses = sequence.ground_truth.T_world_cam
+    relative = se3.inverse(poses[other]) @ poses[index]
+    return CAMERA.project(points @ relative[:3, :3].T + relative[:3, 3]) - np.stack([U, V], -1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sequence_folders import U, V, reprojected
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
@@ -9,7 +10,6 @@ from dynslam_bench.sequences.synthetic import CAMERA, REPLICA_IDS, SYNTHETIC_IDS
 from dynslam_bench.sequences.synthetic.parts import BOX
 from dynslam_bench.sequences.synthetic.scene import View
 
-V, U = np.mgrid[0:480, 0:640].astype(float)
 EVENTFUL = {  # a frame in which the named instance moves and is seen
     "objects_balloon": (40, 1), "objects_box_obstructing": (150, 1), "objects_box_aside": (130, 1),
     "objects_placed": (90, 1), "objects_removed": (230, 1), "objects_kidnapped": (120, 1), "objects_trolley": (120, 1),
@@ -20,13 +20,6 @@ EVENTFUL = {  # a frame in which the named instance moves and is seen
 
 def opened(name: str):
     return open_synthetic(f"synthetic/{name}", None, threads=1)
-
-
-def reprojected(sequence, index: int) -> np.ndarray:
-    points = CAMERA.unproject(np.stack([U, V], -1), sequence.exact_depth(index))
-    poses = sequence.ground_truth.T_world_cam
-    relative = se3.inverse(poses[index + 1]) @ poses[index]
-    return CAMERA.project(points @ relative[:3, :3].T + relative[:3, 3]) - np.stack([U, V], -1)
 
 
 @pytest.mark.parametrize("name", SYNTHETIC_IDS)
@@ -52,7 +45,7 @@ def test_what_moves_is_what_the_masks_say_and_the_rest_stands_still(name: str) -
     index, instance = EVENTFUL[name]
     masks = sequence.masks[index]
     assert instance in sequence.scene.moving(index + 1)
-    error = np.abs(sequence.flow(index) - reprojected(sequence, index)).max(-1)
+    error = np.abs(sequence.flow(index) - reprojected(sequence, index, index + 1)).max(-1)
     still = ~np.isin(masks.instances, list(sequence.scene.moving(index + 1)))
     if still.any():  # the kidnapped camera sees nothing else
         chairs = [k for k, kind in masks.class_names.items() if kind == "chair"]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sequence_folders import U, V, reprojected
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
@@ -11,20 +12,11 @@ from dynslam_bench.sequences.synthetic.settings import ColorSensor, DepthSensor
 CLEAN = RenderSettings(
     depth=DepthSensor(noise=False), color=ColorSensor(noise=False, shutter=0, exposure_drift=0, flicker=0)
 )
-V, U = np.mgrid[0:480, 0:640].astype(float)
 
 
 @pytest.fixture(scope="module")
 def walking():
     return open_synthetic("synthetic/walking_xyz?scene=1", None, threads=1)
-
-
-def reprojected(sequence, index: int, other: int) -> np.ndarray:
-    depth = sequence.exact_depth(index)
-    points = CAMERA.unproject(np.stack([U, V], -1), depth)
-    poses = sequence.ground_truth.T_world_cam
-    relative = se3.inverse(poses[other]) @ poses[index]
-    return CAMERA.project(points @ relative[:3, :3].T + relative[:3, 3]) - np.stack([U, V], -1)
 
 
 @pytest.mark.parametrize("other", [101, 112])

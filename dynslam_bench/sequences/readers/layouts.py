@@ -1,4 +1,8 @@
-"""Every layout of recorded sequences that is read, and which one a folder has."""
+"""Every layout of recorded sequences that is read, and which one a folder has.
+
+A new reader is a module beside this one with ``read(folder, fps) -> Contents``, and a row of `LAYOUTS`
+(``docs/sequences.md``, "Adding a reader").
+"""
 
 from __future__ import annotations
 
@@ -19,13 +23,11 @@ class Layout:
         name: For example ``7-scenes``; the catalogue names it.
         module: Module of the reader, beside this one; its ``read(folder, fps)`` gives `Contents`.
         marks: A folder has this layout if all of these files are in it (patterns), or in its folder ``mav0``.
-        summary: What a folder of it holds.
     """
 
     name: str
     module: str
     marks: tuple[str, ...]
-    summary: str
 
     def fits(self, folder: Path) -> bool:
         """Whether a folder has this layout."""
@@ -47,17 +49,15 @@ class Layout:
         return cast("Contents", importlib.import_module(f"{__package__}.{self.module}").read(folder, fps))
 
 
-TUM = Layout("tum", "tum", ("rgb.txt",), "rgb.txt, depth.txt, groundtruth.txt")
+TUM = Layout("tum", "tum", ("rgb.txt",))
 LAYOUTS = (
-    Layout("eth3d", "eth3d", ("calibration.txt", "associated.txt"), "TUM lists, associated.txt, calibration.txt"),
-    Layout("icl-nuim", "icl_nuim", ("*.gt.freiburg",), "rgb/N.png, depth/N.png, NAME.gt.freiburg"),
-    Layout("7-scenes", "seven_scenes", ("frame-*.color.png",), "frame-N.color.png, .depth.png, .pose.txt"),
-    Layout("tartanair-shibuya", "tartanair_shibuya", ("gt_pose.txt", "times.txt"), "image_0, depth_0, gt_pose.txt"),
-    Layout(
-        "openloris", "openloris", ("color.txt", "aligned_depth.txt"), "color.txt, aligned_depth.txt, two YAML files"
-    ),
-    Layout("vslam-lab", "vslam_lab", ("rgb.csv", "calibration.yaml"), "rgb.csv, calibration.yaml, groundtruth.csv"),
-    Layout("euroc", "euroc", ("cam0/data.csv",), "mav0/cam0, mav0/depth0, mav0/state_groundtruth_estimate0"),
+    Layout("eth3d", "eth3d", ("calibration.txt", "associated.txt")),
+    Layout("icl-nuim", "icl_nuim", ("*.gt.freiburg",)),
+    Layout("7-scenes", "seven_scenes", ("frame-*.color.png",)),
+    Layout("tartanair-shibuya", "tartanair_shibuya", ("gt_pose.txt", "times.txt")),
+    Layout("openloris", "openloris", ("color.txt", "aligned_depth.txt")),
+    Layout("vslam-lab", "vslam_lab", ("rgb.csv", "calibration.yaml")),
+    Layout("euroc", "euroc", ("cam0/data.csv",)),
     TUM,
 )
 

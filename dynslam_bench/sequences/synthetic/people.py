@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -282,8 +282,8 @@ class Script:
     """Timelines of two people and of their two chairs, repeated every `period` seconds."""
 
     period: float
-    people: list[tuple[Key, ...]]
-    chairs: list[tuple[Key, ...]]
+    people: Sequence[tuple[Key, ...]]
+    chairs: Sequence[tuple[Key, ...]]
 
 
 def write_script(people: str, scene: int) -> Script:

@@ -390,7 +390,8 @@ def cartons(scene: int, number: int, id: int) -> Parts:
     for k in range(2):
         half = (0.19 + 0.08 * rng.random(), 0.16 + 0.06 * rng.random(), 0.14 + 0.05 * rng.random())
         names = (*(f"poster:{(face + k) % 4}" for face in range(4)), "plain", "plain")
-        at, style = np.array([0.0, 0.0, bottom + half[2]]), {"instance": id, "texture": names, "fit": (0, 1, 2, 3)}
+        style: Style = {"instance": id, "texture": names, "fit": (0, 1, 2, 3)}
+        at = np.array([0.0, 0.0, bottom + half[2]])
         parts.add(BOX, turn(30 * rng.random()), at, half, tint=(0.9, 0.8, 0.66), **style)
         bottom += 2 * half[2]
     return parts
