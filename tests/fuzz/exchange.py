@@ -43,7 +43,8 @@ def _read_provenance(data: bytes | None, folder: Path) -> None:
 
 def _provenances() -> list[bytes]:
     digest = provenance.digest_of(Path(__file__))
-    shared = {"format": "tum", "which": "final", "run": RunRecord.read(Path(__file__).parents[1] / "runs/data/run.json")}
+    record = RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json")
+    shared = {"format": "tum", "which": "final", "run": record}
     files = ({"trajectory.txt": digest}, {"../x": digest}, {"a\x00b": digest}, {})
     return [Provenance(files=each, **shared).to_json().encode() for each in files]
 
