@@ -316,8 +316,8 @@ def run_many(
     again = set(FAILED).union(retry) - {"failed"} if "failed" in retry else set(retry)
     outcomes = {"ok", "lost", *FAILED}
     if not again <= outcomes:
-        known = ", ".join(sorted(outcomes))
-        raise RunError(f"unknown status '{min(again - outcomes)}' to retry", f"known: failed, {known}")
+        statuses = ", ".join(sorted(outcomes))
+        raise RunError(f"unknown status '{min(again - outcomes)}' to retry", f"known: failed, {statuses}")
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
     resolved: list[ResolvedRun] = []

@@ -13,6 +13,7 @@ from dynslam_bench.runs.exchange import formats as colmap
 from dynslam_bench.runs.exchange import formats as pose_tables
 from dynslam_bench.runs.exchange import formats as reading
 from dynslam_bench.runs.exchange.export import PROVENANCE_FILE, Provenance
+from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.slam import map_files
 
 from .target import Target, at
@@ -42,7 +43,8 @@ def _read_provenance(data: bytes | None, folder: Path) -> None:
 
 def _provenances() -> list[bytes]:
     digest = provenance.digest_of(Path(__file__))
-    shared = {"format": "tum", "run_id": "0" * 16, "tracker": "slam", "sequence": "s", "which": "final"}
+    record = RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json")
+    shared = {"format": "tum", "which": "final", "run": record}
     files = ({"trajectory.txt": digest}, {"../x": digest}, {"a\x00b": digest}, {})
     return [Provenance(files=each, **shared).to_json().encode() for each in files]
 
