@@ -222,11 +222,13 @@ def preset_text(
     if judged_on:
         remarks.append(f"Judged on {_listed(judged_on)}.")
     if fixed:
-        values = ", ".join(f"{name} = {json.dumps(value)}" for name, value in sorted(fixed.items()))
-        remarks.append(f"Fixed in that study, not part of these settings: {values}.")
+        remarks.append(f"Fixed in that study, not part of these settings: {', '.join(_lines(fixed))}.")
     head = [f"settings of {tracker}", *(line for text in remarks for line in textwrap.wrap(text, 100))]
-    values = [f"{name} = {json.dumps(value)}" for name, value in sorted(tuned.items())]
-    return "\n".join([*(f"# {line}" for line in head), "", *values, ""])
+    return "\n".join([*(f"# {line}" for line in head), "", *_lines(tuned), ""])
+
+
+def _lines(settings: Mapping[str, Any]) -> list[str]:
+    return [f"{name} = {json.dumps(value)}" for name, value in sorted(settings.items())]
 
 
 def _listed(instances: Sequence[str]) -> str:

@@ -277,24 +277,24 @@ def _scaled_bounds(distribution: Any) -> tuple[float, float]:
     return (float(np.log(low)), float(np.log(high))) if distribution.log else (low, high)
 
 
-def to_unit(value: Any, distribution: BaseDistribution) -> float:
+def to_unit(value: Any, distribution: Any) -> float:
     """Where a value lies in its range, 0 to 1; of a category the middle of its share."""
     if isinstance(distribution, CategoricalDistribution):
-        return (distribution.to_internal_repr(value) + 0.5) / len(distribution.choices)
+        return float((distribution.to_internal_repr(value) + 0.5) / len(distribution.choices))
     low, high = _scaled_bounds(distribution)
-    scaled = np.log(value) if distribution.log else float(value)  # type: ignore[attr-defined]
+    scaled = np.log(value) if distribution.log else float(value)
     return float((scaled - low) / (high - low))
 
 
-def from_unit(unit: float, distribution: BaseDistribution) -> Any:
+def from_unit(unit: float, distribution: Any) -> Any:
     """The value that lies at `unit` of its range."""
     if isinstance(distribution, CategoricalDistribution):
         return distribution.choices[min(int(unit * len(distribution.choices)), len(distribution.choices) - 1)]
     low, high = _scaled_bounds(distribution)
     value = low + unit * (high - low)
-    if distribution.log:  # type: ignore[attr-defined]
+    if distribution.log:
         value = float(np.exp(value))
-    if distribution.step is not None:  # type: ignore[attr-defined]
+    if distribution.step is not None:
         value = distribution.low + distribution.step * round((value - distribution.low) / distribution.step)
     value = np.clip(value, distribution.low, distribution.high)
     return int(value) if isinstance(distribution, IntDistribution) else float(value)

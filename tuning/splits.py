@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, product, zip_longest
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import cv2
 import numpy as np
@@ -198,7 +198,7 @@ def _check_repeats(instances: PySequence[ProblemInstance], opened: Mapping[str, 
     for instance in instances:
         if instance in parts:
             raise StudyError(f"instance '{instance}' is named twice", "leave one out")
-        parts[instance] = part_of(instance.cut(opened[instance.sequence]), instance.offset)
+        parts[instance] = part_of(cast("Any", instance.cut(opened[instance.sequence])), instance.offset)
     for (one, here), (other, there) in combinations(parts.items(), 2):
         if here.scene != there.scene:
             continue

@@ -446,7 +446,7 @@ def _pairs(stamps: Array) -> NDArray[np.intp]:
     starts = np.flatnonzero(ends < len(stamps))
     pairs = np.stack([starts, ends[starts]], axis=1)
     pairs = pairs[stamps[pairs[:, 1]] - stamps[pairs[:, 0]] < 2 * longest]
-    return pairs[:: 1 + len(pairs) // 300]
+    return np.asarray(pairs[:: 1 + len(pairs) // 300])
 
 
 def _axes(motions: Array, true: Array) -> Array:

@@ -69,13 +69,9 @@ class OnlineError:
         """The true pose ``[4, 4]`` nearest in time, or None in a hole."""
         if self._truth is None:
             return None
-        stamps = self._truth.timestamps
-        right = min(int(np.searchsorted(stamps, timestamp)), len(stamps) - 1)
-        left = max(right - 1, 0)
-        nearest = left if abs(stamps[left] - timestamp) <= abs(stamps[right] - timestamp) else right
-        if not abs(stamps[nearest] - timestamp) < self._max_dt:
-            return None
-        return np.array(self._truth.T_world_cam[nearest])
+        gaps = np.abs(self._truth.timestamps - timestamp)
+        nearest = int(gaps.argmin())
+        return np.array(self._truth.T_world_cam[nearest]) if gaps[nearest] < self._max_dt else None
 
     def update(self, timestamp: float, T_world_cam: Array | None, ok: bool) -> OnlineSample | None:
         """Take in the next frame.

@@ -217,7 +217,8 @@ def _all_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
             chosen = np.flatnonzero((angle >= least) & (angle <= most))
         else:
             off = np.abs(index[i + 1 :] - index[i] - spec.delta)
-            chosen = np.array([np.argmin(off)]) if off.min() <= tolerance else np.zeros(0)
+            nearest = int(off.argmin())
+            chosen = np.array([nearest] if off[nearest] <= tolerance else [], dtype=np.intp)
         pairs += [(i, i + 1 + int(at)) for at in chosen]
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 

@@ -76,9 +76,7 @@ def _of_text(read: Callable[[str], object]) -> Callable[[bytes | None, Path], ob
 
 
 def _read_kitti(data: bytes | None, folder: Path) -> None:
-    """With the frame rate, or with stamps: a part of the inputs each."""
-    times = at(folder, "times.txt", b"0\n0.1\n") if len(data or b"") % 2 else None
-    kitti_file.read_kitti(at(folder, "poses.txt", data), times)
+    kitti_file.read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n"))
 
 
 def _read_folder(data: bytes | None, folder: Path) -> None:
