@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -12,11 +14,11 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts import Frame, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory
 from dynslam_bench.contracts import Sequence as FrameSequence
-from dynslam_bench.contracts import Tracker, TrackerContext, TrackerSpec, Trajectory
-from dynslam_bench.contracts.checks import check_sensors, check_trajectory, tracker_code
+from dynslam_bench.contracts.checks import check_frame, check_result, check_sensors, check_trajectory, tracker_code
 from dynslam_bench.contracts.sequence import exact_stamps
-from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.core.errors import DynslamError, EvaluationError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
@@ -27,7 +29,7 @@ from dynslam_bench.envs.arguments import (
     preprocessing_of,
     resolve_device,
 )
-from dynslam_bench.envs.episode import Episode, FrameOutcome, FrameTransform, episode_metrics, frame_info, track_one
+from dynslam_bench.envs.episode import Episode, FrameOutcome
 from dynslam_bench.envs.spaces import (
     REWARDS,
     ActionMap,
@@ -38,12 +40,14 @@ from dynslam_bench.envs.spaces import (
     stats_observation,
     stats_space,
 )
-from dynslam_bench.evaluation import OnlineError, OnlineSample, Protocol, get_protocol
+from dynslam_bench.evaluation import OnlineError, OnlineSample, Protocol, evaluate, get_protocol
+from dynslam_bench.evaluation.prepare import tracked_frames
 from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 RENDER_MODES = ("rgb_array",)
+FrameTransform = Callable[[Frame], Frame]
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -255,14 +259,15 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             with tracker_code():
                 tracker.configure(settings)  # type: ignore[attr-defined]
         self._track_next(tracker)
-        reward = self.episode.outcomes[-1].reward
+        outcomes = self.episode.outcomes
+        reward = outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
-        truncated = self.episode.next_index == len(self.sequence)
+        truncated = len(outcomes) == len(self.sequence)
         if terminated:
-            stamps = self.sequence.timestamps[self.episode.next_index :]
+            stamps = self.sequence.timestamps[len(outcomes) :]
             reward += sum(self._reward(self._errors.update(float(stamp), None, False)) for stamp in stamps)
         self.episode.over = terminated or truncated
-        info = frame_info(self.episode.outcomes[-1])
+        info = frame_info(outcomes[-1])
         if self.episode.over:
             info |= {"episode_metrics": self.episode_metrics(), "protocol": self.protocol.id}
         return self._observe(), float(reward), terminated, truncated, info
@@ -411,8 +416,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return self._tracker
 
     def _track_next(self, tracker: Tracker) -> None:
-        index = self.episode.next_index
-        self._final = None
+        index, self._final = len(self.episode.outcomes), None
         frame, result, timings = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
         self.frame, self.result = frame, result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
@@ -436,3 +440,113 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _reward(self, error: OnlineSample | None) -> float:
         return 0.0 if error is None else self._reward_of(error)
+
+
+def track_one(
+    tracker: Tracker, name: str, sequence: FrameSequence, index: int, transforms: Iterable[FrameTransform]
+) -> tuple[Frame, TrackResult, dict[str, float]]:
+    """Read a frame and track it.
+
+    Args:
+        tracker: The tracker.
+        name: Its id, for messages.
+        sequence: Where the frame comes from.
+        index: Which one.
+        transforms: Applied in order before the tracker gets it.
+
+    Returns:
+        The transformed frame, the checked result, and the times (see `FrameOutcome.timings`).
+
+    Raises:
+        SequenceError: The frame cannot be read, or does not fit the sequence's camera.
+        TrackerContractError: The tracker broke its contract.
+    """
+    began = time.perf_counter()
+    frame = _read_frame(sequence, index)
+    for transform in transforms:
+        frame = transform(frame)
+    read, processor_began = time.perf_counter(), time.process_time()
+    with tracker_code():
+        result = tracker.track(frame)
+    total, processor = time.perf_counter() - read, time.process_time() - processor_began
+    result = check_result(result, frame, name)
+    if result.stats.get("cached_stages"):  # the stages report their times without the cache
+        uncached = max(total, sum(result.timings.values()))
+        total, processor = uncached, processor + uncached - total
+    stages = {stage: float(seconds) for stage, seconds in result.timings.items()}
+    measured = {"read": read - began, "total": total, "processor": processor}
+    return frame, result, measured | {name: value for name, value in stages.items() if name not in measured}
+
+
+def _read_frame(sequence: FrameSequence, index: int) -> Frame:
+    """A frame that fits the sequence's camera; any error in reading it becomes a `SequenceError`."""
+    try:
+        frame = sequence[index]
+        check_frame(frame, sequence.camera)
+    except MemoryError:
+        raise
+    except Exception as error:  # a data set of the user's may raise anything
+        ours = isinstance(error, DynslamError)
+        fault = error.args[0] if ours else f"{type(error).__name__}: {error}".rstrip(": ")
+        hint = getattr(error, "hint", "") if ours else ""
+        raise SequenceError(f"frame {index} of '{sequence.id}' cannot be read: {fault}", hint) from error
+    return frame
+
+
+def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
+    """Index, stamp, state and stats of a frame, its pose if it was tracked, its errors where they are defined."""
+    info: dict[str, Any] = {
+        "frame_index": outcome.index,
+        "timestamp": float(outcome.timestamp),
+        "tracking_state": str(outcome.state),
+        "stats": dict(outcome.stats),
+    }
+    if outcome.T_world_cam is not None:
+        info["pose"] = np.concatenate(se3.to_quaternion(outcome.T_world_cam))
+    error = outcome.error
+    if error is not None:
+        errors = {
+            "pose_error_trans_m": error.trans_m,
+            "pose_error_rot_deg": error.rot_deg,
+            "frame_error_trans_m": error.frame_trans_m,
+            "frame_error_rot_deg": error.frame_rot_deg,
+        }
+        info |= {name: float(value) for name, value in errors.items() if value is not None}
+    return info
+
+
+def episode_metrics(
+    protocol: Protocol,
+    trajectory: Trajectory,
+    timestamps: NDArray[np.float64],
+    ground_truth: Trajectory | None,
+) -> dict[str, float]:
+    """The metrics of an episode under a protocol: plain floats by name, without undefined ones.
+
+    Args:
+        protocol: How to evaluate.
+        trajectory: Poses of the tracked frames, online or final; coverage is that of this trajectory.
+        timestamps: Stamps in seconds of all frames that were due, tracked or not.
+        ground_truth: True poses; None leaves only the coverage and the counts.
+
+    Returns:
+        ``coverage``, ``frames``, ``tracked_frames`` and the metrics of `evaluate` (``ate_rmse_m``, ...); these are
+        missing if there is no ground truth or the protocol finds nothing to evaluate.
+    """
+    frames = len(timestamps)
+    try:
+        tracked = int(tracked_frames(trajectory, timestamps).sum())
+    except EvaluationError:  # a final trajectory whose stamps are of no frame
+        tracked = 0
+    counts = {
+        "coverage": tracked / frames if frames else 0.0,
+        "frames": float(frames),
+        "tracked_frames": float(tracked),
+    }
+    if ground_truth is None:
+        return counts
+    try:
+        evaluation = evaluate(trajectory, ground_truth, protocol, input_timestamps=timestamps)
+    except EvaluationError:  # too little was tracked; the coverage says so
+        return counts
+    return counts | {name: float(value) for name, value in evaluation.metrics.items() if math.isfinite(value)}

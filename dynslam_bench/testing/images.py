@@ -79,7 +79,7 @@ def _run_common(
     frame: Frame,
     left_alone: Callable[[], None],
     determinism: Callable[[], None],
-    results: Callable[[Frame], None],
+    results: Callable[[Frame], object],
 ) -> None:
     """The checks that all kinds of plug-ins on images share."""
     report.run("images are left alone", left_alone)
