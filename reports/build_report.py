@@ -36,8 +36,7 @@ from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, command_lin
 from dynslam_bench.reports.model.statistics import FEWEST, power_note
 from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
-from dynslam_bench.runs.store import part_words
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.runs.store import RunStore, part_words
 
 
 @dataclass(frozen=True)

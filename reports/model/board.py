@@ -21,8 +21,7 @@ from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
-from dynslam_bench.runs.store import part_words
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.runs.store import RunStore, part_words
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,7 +16,8 @@ class NgdSlamSettings(SemanticSystemSettings):
 
 
 build = composed(
-    ("depth_regions:BoxDepthFilter", "box_depth", "segmentation"), ("reseeding:ReseedingFilter", "reseeding", "features")
+    ("depth_regions:BoxDepthFilter", "box_depth", "segmentation"),
+    ("reseeding:ReseedingFilter", "reseeding", "features"),
 )
 
 SPEC = TrackerSpec(
