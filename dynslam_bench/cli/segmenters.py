@@ -63,7 +63,7 @@ def train(
             resume=resume,
             progress=lambda state: advance(state.done, state.total),
         )
-    facts = {"weights": result.best, "step": result.step, "iou": result.iou, "ended": result.stopped}
+    facts = {"weights": result.best, "step": result.step, "iou": result.iou}
     present(facts, fields(facts))
 
 

@@ -26,7 +26,6 @@ SCALE_LOW, SCALE_HIGH = -4, 5
 ANGLE_STEP_DEG = 7.5
 ANGLE_LOW, ANGLE_HIGH = -6, 6
 """Rotation indices: 7.5 degrees each, -45 to 45."""
-SCALES = SCALE_HIGH - SCALE_LOW + 1
 ROTATIONS = ANGLE_HIGH - ANGLE_LOW + 1
 
 LEVEL_SIGMAS = (2.0, 2.0 * 2**0.5, 4.0, 4.0 * 2**0.5, 8.0, 8.0 * 2**0.5, 16.0)
@@ -57,8 +56,8 @@ def sampling_table() -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """The pattern for every scale and rotation index: ``s * R(theta) * g_k`` (Eq. 1's D_{s,theta}).
 
     Returns:
-        int32 ``[SCALES, ROTATIONS, HISTOGRAMS, 2]``, displacement (x, y) from the centre in quarter pixels, and int64
-        ``[SCALES, RINGS]``, map level of each ring at each scale: the one whose Gaussian is closest in ratio.
+        int32 ``[scales, ROTATIONS, HISTOGRAMS, 2]``, displacement (x, y) from the centre in quarter pixels, and int64
+        ``[scales, RINGS]``, map level of each ring at each scale: the one whose Gaussian is closest in ratio.
     """
     pattern = unit_pattern()
     scales = 2.0 ** (np.arange(SCALE_LOW, SCALE_HIGH + 1) * SCALE_STEP_OCTAVES)

@@ -37,10 +37,10 @@ class CostTables(NamedTuple):
     """Tables of the cost that depend on the image size and the weights only.
 
     Attributes:
-        samples: int32 ``[SCALES, ROTATIONS, 4, 17]``, byte offset of each histogram from the centre's cell, for the
+        samples: int32 ``[scales, ROTATIONS, 4, 17]``, byte offset of each histogram from the centre's cell, for the
             four half-cell positions (2 * lower half + right half) of the centre within its cell.
-        ring0: int64 ``[SCALES, 4]``, base, stride, shift, bias of the centre's and first ring's level.
-        ring1: int64 ``[SCALES, 4]``, of the second ring's level.
+        ring0: int64 ``[scales, 4]``, base, stride, shift, bias of the centre's and first ring's level.
+        ring1: int64 ``[scales, 4]``, of the second ring's level.
         truncation: Largest cost of one histogram (t of Eq. 1, times 255).
         intensity: int32 ``[256]``, cost of an absolute grey-level difference: ``alpha * min(d, t1)``.
         gradient: int32 ``[256]``, cost of an absolute difference of gradient magnitudes: ``beta * min(d, t2)``.
@@ -87,7 +87,7 @@ def cost_tables(shape: tuple[int, int], terms: int = 1, support: int = 1, spacin
     offsets, ring_level = layout.sampling_table()
     geometry = layout.map_geometry(*shape)
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
-    level = np.repeat(ring_level, (9, 8), axis=1)  # [SCALES, 17]
+    level = np.repeat(ring_level, (9, 8), axis=1)  # [scales, 17]
     steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
     half_cell = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])[None, None, :, None, :]
     cells = np.floor(half_cell + offsets[:, :, None] / (layout.SUBPIXEL * steps)).astype(np.int64)

@@ -96,8 +96,6 @@ def import_trajectory(
         **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
         **({} if topic is None else {"topic": topic}),
     }
-    if isinstance(frames, tuple):
-        frames = (frames[0] or 0, frames[1])
     record = RunRecord(
         kind="imported",
         run_id=digest(identity, 16),

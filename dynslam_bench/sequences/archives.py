@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, BinaryIO, cast
+from typing import IO, cast
 
 from dynslam_bench.core.download import CHUNK, Progress, Report
 from dynslam_bench.core.errors import SequenceError

@@ -239,8 +239,9 @@ def open_folder(
     entry = entry or entry_of(folder.resolve().name)
     layout = find_layout(folder) if entry is None else layout_of(entry.layout)
     chosen = chosen_camera(folder, camera)
-    contents = layout.read(folder, (chosen and chosen[1]) or (entry and entry.fps))
-    intrinsics, fps = chosen or find_camera(folder, stated=contents.camera, otherwise=entry and entry.camera)
+    contents = layout.read(folder, (chosen[1] if chosen else None) or (entry.fps if entry else None))
+    otherwise = entry.camera if entry else None
+    intrinsics, fps = chosen or find_camera(folder, stated=contents.camera, otherwise=otherwise)
     about: dict[str, Any] = {"id": f"folder/{folder.resolve().name}", "fps": fps or contents.fps}
     if entry is not None:
         about = {"id": entry.id, "fps": fps or entry.fps, "license": entry.license, "citation": entry.citation,
@@ -286,7 +287,7 @@ def _is_path(name: str) -> bool:
     return name.startswith((".", "/", "~", "\\"))
 
 
-def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int | None]:
+def parse_frames(frames: PySequence[int | None] | str | None) -> tuple[int, int | None]:
     """First frame and one past the last (None: to the end) of ``"A:B"``, ``"A:"``, ``":B"`` or a pair.
 
     Raises:
@@ -295,8 +296,7 @@ def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int 
     if frames is None:
         return 0, None
     if not isinstance(frames, str):
-        first, last = frames
-        frames = f"{first}:{'' if last is None else last}"
+        frames = ":".join("" if end is None else str(end) for end in frames)
     match = re.fullmatch(r"\s*([0-9]{0,12})\s*:\s*([0-9]{0,12})\s*", frames, re.ASCII)
     if match is None:
         raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B")

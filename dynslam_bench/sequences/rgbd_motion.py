@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -135,9 +136,9 @@ def follow_corners(
     A corner is found if it lies inside the image and, tracked back, ends within `tolerance_px` of where it began.
     `guess` ``[N, 2]`` is where the search begins.
     """
-    window: dict[str, int] = {"maxLevel": 4, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-    there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, guess.copy(), **window)
-    back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), **window)
+    options: Any = {"maxLevel": 4, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, guess.copy(), **options)
+    back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), **options)
     good = (status.reshape(-1) == 1) & (status_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < tolerance_px
     good &= (there >= 0).all(axis=1) & (there <= (after.shape[1] - 1, after.shape[0] - 1)).all(axis=1)

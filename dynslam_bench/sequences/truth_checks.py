@@ -408,7 +408,7 @@ def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, fre
         for name in ("pixels_first", "depth_first", "pixels_second")
     )
     number, back = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen]), se3.inverse(relative)
-    index = np.concatenate([np.arange(10)[_PARAMETERS[name]] for name in free]).astype(np.intp) if free else []
+    index = [number for name in free for number in np.arange(10)[_PARAMETERS[name]].tolist()]
 
     def filled(part: Array) -> Array:
         x = np.zeros(10)

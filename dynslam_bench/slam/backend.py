@@ -481,7 +481,6 @@ class MonocularBackend(RgbdBackend):
     """
 
     uses_depth = False
-    settings_type = MonocularBackendSettings
     settings: MonocularBackendSettings
 
     def reset(self, camera: Camera, seed: int) -> None:

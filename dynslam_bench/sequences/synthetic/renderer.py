@@ -46,7 +46,7 @@ _SLACK_M = 0.01
 _LAMPS = np.array([[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]])
 """Direction to each lamp in the world (not normalised) and its strength; row 0 is the ambient light."""
 
-Tiles = tuple[int, NDArray[np.int32], NDArray[np.int32], Array]
+Tiles = tuple[int, NDArray[np.integer[Any]], NDArray[np.integer[Any]], Array]
 """Tiles in a row, start of each tile's list, the lists, and the least depth of every primitive."""
 
 
