@@ -319,12 +319,12 @@ def source_of_masks(settings: Settings, sequences: PySequence[str]) -> str:
 
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
-    seen = []
+    names_seen = []
     for split in ("tune", "confirm", "held_out"):
         names = {instance.sequence for instance in getattr(design, split)}
         if any(seen_in_training(source_of_masks(settings, [name]), name) for name in names):
-            seen.append(split)
-    return seen
+            names_seen.append(split)
+    return names_seen
 
 
 def seen_note(splits: PySequence[str]) -> str:

@@ -88,8 +88,8 @@ def compare(
     estimate_index, truth_index, association = match(estimate, ground_truth, protocol)
     dropped = association.describe(protocol.max_dt)
     if len(estimate_index) < 2:
-        found = f"only {len(estimate_index)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s"
-        raise EvaluationError(f"{found}, at least 2 are needed", dropped)
+        fault = f"only {len(estimate_index)} of {len(estimate)} poses has ground truth within {protocol.max_dt:g} s"
+        raise EvaluationError(f"{fault}, at least 2 are needed", dropped)
     if dropped:
         diagnostics.append(dropped)
     matched, truth = estimate.T_world_cam[estimate_index], ground_truth.T_world_cam[truth_index]

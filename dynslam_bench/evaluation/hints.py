@@ -401,8 +401,10 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
     limit = min(EXPLAINED, as_read / CLEARLY)
     if shift:  # the error of the poses as they stand beside the true motions at another time
         covered = truth.covers(stamps + shift)
-        seen = pairs[covered[pairs].all(axis=1)]
-        limit = min(limit, _compare(_relative(poses, seen), _relative(truth.at(stamps + shift), seen))[0])
+        covered_pairs = pairs[covered[pairs].all(axis=1)]
+        limit = min(
+            limit, _compare(_relative(poses, covered_pairs), _relative(truth.at(stamps + shift), covered_pairs))[0]
+        )
     candidates: list[tuple[float, Convention, Array]] = []
     for convention in CONVENTIONS:
         undone = convention.undo(poses)

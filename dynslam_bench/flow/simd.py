@@ -2,7 +2,7 @@
 
 Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's instructions. The order of
 every sum is part of the program, so that results do not depend on the processor. The uint16 operations are exact but
-for one square root and division, which IEEE 754 defines to the last bit; `tests/flow/torch_reference.py` gives the same
+for one square root and division, which IEEE 754 defines to the last bit; `tests/flow/exact_reference.py` gives the same
 bytes.
 """
 

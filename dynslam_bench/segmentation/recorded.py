@@ -110,8 +110,8 @@ class RecordedSegmenter:
         names = dict.fromkeys(numbers, "person") if self._names is None else self._names
         nameless = [number for number in numbers if number not in names]
         if nameless:
-            known = ", ".join(map(str, sorted(names)))
-            raise SegmentationError(f"{path}: object {nameless[0]} has no class in {CLASSES_FILE}", f"known: {known}")
+            named = ", ".join(map(str, sorted(names)))
+            raise SegmentationError(f"{path}: object {nameless[0]} has no class in {CLASSES_FILE}", f"known: {named}")
         return _objects(labels, {number: names[number] for number in numbers})
 
     def missing(self, timestamps: NDArray[np.float64]) -> list[int]:

@@ -130,7 +130,7 @@ def _tar_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
         compressed = start.read(2) == b"\x1f\x8b"
     with gzip.open(archive) if compressed else archive.open("rb") as file:
         counted = _Counted(archive, cast("IO[bytes]", file))
-        with tarfile.open(fileobj=cast("BinaryIO", counted), mode="r|", tarinfo=_Header) as tar:
+        with tarfile.open(fileobj=cast("IO[bytes]", counted), mode="r|", tarinfo=_Header) as tar:
             for number, entry in enumerate(tar, 1):
                 _check(archive, 0, number)
                 tar.members = []  # type: ignore[attr-defined]  # it would keep the header of every file

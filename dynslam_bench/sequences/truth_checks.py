@@ -265,7 +265,7 @@ def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
 
 def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Match) -> list[Finding]:
     """Positions in other axes than the orientations, or mirrored, of translations in the camera's axes ``[N, 3]``."""
-    in_world = [np.einsum("nij,nj->ni", R_world_first, each) for each in (steps, true_steps)]
+    in_world = [np.einsum("nij,nj->ni", R_world_first, motion) for motion in (steps, true_steps)]
     for measured, true, where in ((*in_world, "world"), (steps, true_steps, "camera")):
         W = rotation_between(measured, true, proper=False)
         alike = agreement(measured @ W.T, true)

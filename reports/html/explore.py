@@ -200,10 +200,10 @@ def _write_pages(
         pictured = row.run_id in shown and pictures.add(row, record, frames)
         finite = np.isfinite(frames.errors_m)
         quantiles = 1000 * np.percentile(frames.errors_m[finite], [5, 25, 50, 75, 95]) if finite.any() else np.zeros(0)
-        told = finite & np.isfinite(frames.share) & (frames.share_source == EXACT) & (not row.failed)
+        exact = finite & np.isfinite(frames.share) & (frames.share_source == EXACT) & (not row.failed)
         quantiles_mm = [significant(value, 4) for value in quantiles.tolist()]
         pages.append(
-            RunPage(row.run_id, row.variant_key, pictured, quantiles_mm, frames.share[told], frames.errors_m[told])
+            RunPage(row.run_id, row.variant_key, pictured, quantiles_mm, frames.share[exact], frames.errors_m[exact])
         )
     return pages, pictures.missing
 

@@ -185,7 +185,9 @@ def add(cell: Cell, run: RunRow) -> None:
     cell.broken += run.status in FAILED
     if run.static_camera_ate_rmse_m is not None:
         cell.standstills.append(run.static_camera_ate_rmse_m)
-    stages = [time.median_s for name, time in run.whole_record().timings.items() if name.startswith("culling_")]
+    stages = [
+        time.median_s for name, time in run.store.read_whole(run.run_id).timings.items() if name.startswith("culling_")
+    ]
     cell.filter_ms.append(1e3 * sum(stages))
     cell.culled += culled(run.folder / "frames.csv")
 

@@ -321,7 +321,7 @@ def folder(tmp_path: Path) -> Path:
     """A toy sequence with the stamps of a bag."""
     folder = write_folder(tmp_path / "toy", FRAMES)
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
-        lines = [line.partition(" ")[2] for line in (folder / name).read_text().splitlines()]
+        lines = [line.partition(" ")[2] for line in (folder / name).read_text().splitlines() if line[0] != "#"]
         stamped = [f"{text} {rest}\n" for text, rest in zip(stamps(), lines, strict=True)]
         (folder / name).write_text("".join(stamped))
     return folder
@@ -364,7 +364,7 @@ def test_stamps_a_fifth_of_a_microsecond_apart_are_refused_before_tracking(
     lines = (folder / name).read_text().splitlines()
     lines.insert(3, f"{format_ns(START + 2 * STEP + 200)} {lines[2].partition(' ')[2]}")
     (folder / name).write_text("\n".join(lines) + "\n")
-    with pytest.raises(DynslamError, match=rf"{name} lines 3 and 4: .*200 ns apart") as caught:
+    with pytest.raises(DynslamError, match=rf"{name}.*200 ns apart") as caught:
         resolve(RunSpec(tracker=TARGET, sequence=str(folder)))
     assert "\n" not in str(caught.value)
     told: list[str] = []

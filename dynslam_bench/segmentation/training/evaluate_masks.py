@@ -230,8 +230,8 @@ def evaluate_segmenter(
         detections = segmenter.segment(frame)
         times.append(time.perf_counter() - start)
         for name, tally in tallies.items():
-            found = detections.of_classes([name])
-            tally.add(image.masks[[kind == name for kind in image.class_names]], found.masks, found.scores)
+            predicted = detections.of_classes([name])
+            tally.add(image.masks[[kind == name for kind in image.class_names]], predicted.masks, predicted.scores)
         if progress is not None:
             progress(done, len(chosen))
     qualities = {name: tally.quality() for name, tally in tallies.items()}

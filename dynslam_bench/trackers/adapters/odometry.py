@@ -146,10 +146,10 @@ class OpenCvOdometry(FrameToFrame):
 
     def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
         """OpenCV 5's frame, or the arguments of OpenCV 4: intensities, depth (missing is NaN) and its mask."""
-        grey, known = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.where(depth > 0, depth, np.float32(np.nan))
+        grey, measured = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.where(depth > 0, depth, np.float32(np.nan))
         if hasattr(cv2, "Odometry"):
-            return cv2.OdometryFrame(known, grey)
-        return grey, known, (depth > 0).astype(np.uint8) * 255
+            return cv2.OdometryFrame(measured, grey)
+        return grey, measured, (depth > 0).astype(np.uint8) * 255
 
     def align(self, reference: Any, current: Any) -> NDArray[np.float64] | None:
         """The motion that OpenCV finds."""
