@@ -10,16 +10,17 @@ from documented_names import ROOT
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 CONTENT = {
     "dynslam_bench/flow/moth_flame.py": r"Eq\. 13",
+    "dynslam_bench/flow/label_search.py": r"def move_moths\(",
     "dynslam_bench/culling/epipolar.py": r"Eq\. 25|Eq\. 23",
-    "dynslam_bench/runs/store.py": r"run\.json",
+    "dynslam_bench/runs/store.py": r"def publish\(",
     "reports/tables/": r"Table\(",
     "dynslam_bench/slam/pipeline.py": r"def track\(",
-    "dynslam_bench/slam/keyframes.py": r"def ",
-    "dynslam_bench/slam/atlas.py": r"merge",
+    "dynslam_bench/slam/keyframes.py": r"def needed\(",
+    "dynslam_bench/slam/loop_closing.py": r"def _merge\(",
     "dynslam_bench/contracts/tracker.py": r"class Tracker\(Protocol\)",
     "dynslam_bench/trackers/systems/dynaslam.py": r"compose",
     "dynslam_bench/evaluation/protocol.py": r"class Protocol",
-    "dynslam_bench/evaluation/evaluate.py": r"metrics",
+    "dynslam_bench/evaluation/evaluate.py": r"(?m)^METRICS",
     "dynslam_bench/sequences/catalogue.py": r"DatasetSpec",
     "dynslam_bench/sequences/synthetic/people.py": r"skeleton",
 }
