@@ -113,7 +113,7 @@ def label_costs(
     labels = np.where(inside[:, None], labels, 0)
     scale = np.floor(labels[:, 2] * 4 + np.float32(0.5)).astype(int) - layout.SCALE_LOW
     rotation = np.floor(labels[:, 3] * np.float32(7.639437268410976) + np.float32(0.5)).astype(int) - layout.ANGLE_LOW
-    scale, rotation = scale.clip(0, layout.SCALES - 1), rotation.clip(0, layout.ROTATIONS - 1)
+    scale, rotation = scale.clip(0, layout.SCALE_HIGH - layout.SCALE_LOW), rotation.clip(0, layout.ROTATIONS - 1)
     c, s = np.exp2(labels[:, 2]) * (np.cos(labels[:, 3]), np.sin(labels[:, 3]))
     total = np.zeros(len(points), np.int64)
     for q, (dx, dy) in enumerate(tables.support.astype(np.float32)):
