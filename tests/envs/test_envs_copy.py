@@ -45,8 +45,8 @@ def started(env: gym.Env[Any, Any], steps: int) -> gym.Env[Any, Any]:
     return env
 
 
-def check_alike(env: gym.Env[Any, Any], twin: gym.Env[Any, Any]) -> None:
-    first, second = go_on(env), go_on(twin)
+def check_alike(env: gym.Env[Any, Any], duplicate: gym.Env[Any, Any]) -> None:
+    first, second = go_on(env), go_on(duplicate)
     assert first[0] == second[0] and len(first[0]) > 1
     np.testing.assert_array_equal(first[1], second[1])
     np.testing.assert_array_equal(first[2], second[2])
@@ -54,10 +54,10 @@ def check_alike(env: gym.Env[Any, Any], twin: gym.Env[Any, Any]) -> None:
 
 def test_a_copy_goes_on_from_the_same_frame_to_the_bit() -> None:
     env = started(SlamEnv(ToySequence(12), TARGET, control=["noise.level_m"]), 4)
-    twin = copy.deepcopy(env)
-    assert isinstance(twin, SlamEnv) and twin.sequence is env.sequence and twin.episode.next_index == 5  # type: ignore[attr-defined]
-    check_alike(env, twin)
-    assert env.reset()[0] == pytest.approx(twin.reset()[0]), "the seeds that follow are the same, too"
+    duplicate = copy.deepcopy(env)
+    assert isinstance(duplicate, SlamEnv) and duplicate.sequence is env.sequence and duplicate.episode.next_index == 5  # type: ignore[attr-defined]
+    check_alike(env, duplicate)
+    assert env.reset()[0] == pytest.approx(duplicate.reset()[0]), "the seeds that follow are the same, too"
 
 
 def test_copies_go_their_own_ways() -> None:
@@ -73,10 +73,10 @@ def test_copies_go_their_own_ways() -> None:
 
 def test_wrappers_are_copied_with_it() -> None:
     env = started(DegradeFrames(SlamEnv(ToySequence(10), TARGET, observation="rgbd"), noise=0.2), 2)
-    twin = copy.deepcopy(env)
-    transforms = twin.unwrapped.frame_transforms  # type: ignore[attr-defined]
-    assert len(transforms) == 1 and twin.unwrapped is not env.unwrapped
-    first, second = (each.step(0)[0]["rgb"] for each in (env, twin))
+    duplicate = copy.deepcopy(env)
+    transforms = duplicate.unwrapped.frame_transforms  # type: ignore[attr-defined]
+    assert len(transforms) == 1 and duplicate.unwrapped is not env.unwrapped
+    first, second = (each.step(0)[0]["rgb"] for each in (env, duplicate))
     np.testing.assert_array_equal(first, second)
 
 
@@ -93,9 +93,9 @@ def test_built_in_trackers_go_on_to_the_bit(tracker: str) -> None:
     if TRACKERS.get(tracker).missing():
         pytest.skip(f"{tracker} is not installed")
     env = started(SlamEnv(CornerSequence(6), tracker, threads=2), 3)
-    twin = copy.deepcopy(env)
-    check_alike(env, twin)
-    finals = [each.unwrapped.final_trajectory() for each in (env, twin)]  # type: ignore[attr-defined]
+    duplicate = copy.deepcopy(env)
+    check_alike(env, duplicate)
+    finals = [each.unwrapped.final_trajectory() for each in (env, duplicate)]  # type: ignore[attr-defined]
     assert finals == [None, None] or np.array_equal(finals[0].T_world_cam, finals[1].T_world_cam)
 
 

@@ -59,12 +59,12 @@ def test_made_environment_is_made_again_from_its_json(toy_folder: str) -> None:
     env = gym.make(GENERIC_ID, sequence=toy_folder, tracker=TARGET, frames=[3, 20], control=CONTROL)
     env = dynslam_bench.envs.DropFrames(dynslam_bench.envs.RecordTimings(env), frame_time_s=0.05)
     assert env.spec is not None
-    twin = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert isinstance(twin, dynslam_bench.envs.DropFrames)
+    duplicate = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert isinstance(duplicate, dynslam_bench.envs.DropFrames)
     first, _ = env.reset(seed=3)
-    second, _ = twin.reset(seed=3)
+    second, _ = duplicate.reset(seed=3)
     assert first.tobytes() == second.tobytes()
-    assert twin.action_space == env.action_space
+    assert duplicate.action_space == env.action_space
 
 
 def test_one_seed_gives_identical_bytes(toy_folder: str) -> None:
@@ -77,9 +77,9 @@ def test_one_seed_gives_identical_bytes(toy_folder: str) -> None:
 def test_pickle_gives_an_equal_environment(toy_folder: str) -> None:
     env = SlamEnv(toy_folder, TARGET, control=CONTROL, settings={"noise.level_m": 0.002})
     env.reset(seed=1)
-    twin = pickle.loads(pickle.dumps(env))
-    assert twin.settings == env.settings and twin.action_space == env.action_space
-    assert rollout(twin, 10, 2) == rollout(env, 10, 2)
+    duplicate = pickle.loads(pickle.dumps(env))
+    assert duplicate.settings == env.settings and duplicate.action_space == env.action_space
+    assert rollout(duplicate, 10, 2) == rollout(env, 10, 2)
 
 
 def test_record_video(toy_folder: str, tmp_path) -> None:

@@ -91,12 +91,12 @@ def disguised(whole: Path, copy: Path, how: str) -> Path:
 @pytest.mark.parametrize("how", ["renamed", "shifted", "re-encoded", "later", "elsewhere", "all"])
 def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> None:
     whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24)
-    copy, twin = (disguised(whole, tmp_path / name, how) for name in ("copy", "twin"))
+    copy, disguised_copy = (disguised(whole, tmp_path / name, how) for name in ("copy", "twin"))
     assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, "digests alone pass it"
     with pytest.raises(StudyError, match="are the same sequence"):
         faults([str(whole)], [str(copy)])
     with pytest.raises(StudyError, match="are the same sequence"):
-        faults([str(twin)], [str(whole)])
+        faults([str(disguised_copy)], [str(whole)])
     for phase in (0.9, 1.7, 2.5):
         other = toy_tracker.make_sequence(tmp_path / f"other{phase}", phase, 24)
         assert faults([str(copy)], [str(other)]) == []
