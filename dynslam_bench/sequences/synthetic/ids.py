@@ -7,9 +7,16 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from dynslam_bench.core.errors import SequenceError, did_you_mean
-from dynslam_bench.sequences.synthetic.loops import FAST, LOOPS, TRACKING
-from dynslam_bench.sequences.synthetic.objects import OBJECTS
-from dynslam_bench.sequences.synthetic.replicas import CONDITIONS, CROWDS, REPLICAS, SYNCHRONOUS
+from dynslam_bench.sequences.synthetic.families import (
+    CONDITIONS,
+    CROWDS,
+    FAST,
+    LOOPS,
+    OBJECTS,
+    REPLICAS,
+    SYNCHRONOUS,
+    TRACKING,
+)
 from dynslam_bench.sequences.synthetic.scene import Variant
 from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, HELD_OUT_SCENES, MAX_FRAMES
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from dynslam_bench.sequences.synthetic.arithmetic import cos, norm, product, sin
 
@@ -40,8 +40,8 @@ class Primitive:
 class Parts(list[Primitive]):
     """A growing list of primitives."""
 
-    def add(self, kind: int, rotation: Array, origin: Array, shape: tuple[float, float, float], *, instance: int = 0,
-            texture: str | tuple[str, ...] = "plain", repeat: tuple[float, float] = (1.0, 1.0),
+    def add(self, kind: int, rotation: Array, origin: ArrayLike, shape: tuple[float, float, float], *,
+            instance: int = 0, texture: str | tuple[str, ...] = "plain", repeat: tuple[float, float] = (1.0, 1.0),
             shift: tuple[float, float] = (0.0, 0.0), tint: tuple[float, float, float] | Array = (1.0, 1.0, 1.0),
             scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
             fit: tuple[int, ...] = ()) -> None:  # fmt: skip

@@ -108,38 +108,53 @@ _EYE = np.eye(3)
 def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> None:
     """A desk (0.8 m deep, 0.74 m high) with drawers, monitors, keyboards, books, papers, mugs and a lamp."""
     tint, side = plan.tints, 1 if plan.mirrored else -1
-    top, leg = np.array([x, y + 0.4, TOP - 0.018]), (TOP - 0.036) / 2
-    parts.add(BOX, _EYE, top, (half, 0.4, 0.018), texture="wood", repeat=(1.2, 1.6), tint=tint["desk"])
+    leg = (TOP - 0.036) / 2
+    parts.add(
+        BOX, _EYE, (x, y + 0.4, TOP - 0.018), (half, 0.4, 0.018), texture="wood", repeat=(1.2, 1.6), tint=tint["desk"]
+    )
     for end in (-1, 1):
-        at = np.array([x + end * (half - 0.04), y + 0.4, leg])
-        parts.add(BOX, _EYE, at, (0.02, 0.36, leg), texture="wood", tint=tint["desk"] * 0.9)
-    back = np.array([x, y + 0.74, 0.45])
-    parts.add(BOX, _EYE, back, (half - 0.06, 0.01, 0.25), texture="wood", tint=tint["desk"] * 0.85)
+        parts.add(
+            BOX,
+            _EYE,
+            (x + end * (half - 0.04), y + 0.4, leg),
+            (0.02, 0.36, leg),
+            texture="wood",
+            tint=tint["desk"] * 0.9,
+        )
+    parts.add(BOX, _EYE, (x, y + 0.74, 0.45), (half - 0.06, 0.01, 0.25), texture="wood", tint=tint["desk"] * 0.85)
     unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
     parts.add(BOX, _EYE, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"])
     for k in range(3):
-        front, handle = unit + np.array([0, -0.305, 0.19 - 0.19 * k]), unit + np.array([0, -0.32, 0.22 - 0.19 * k])
-        parts.add(BOX, _EYE, front, (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92)
-        parts.add(BOX, _EYE, handle, (0.05, 0.008, 0.008), tint=tint["metal"])
+        parts.add(
+            BOX, _EYE, unit + np.array([0, -0.305, 0.19 - 0.19 * k]), (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92
+        )
+        parts.add(BOX, _EYE, unit + np.array([0, -0.32, 0.22 - 0.19 * k]), (0.05, 0.008, 0.008), tint=tint["metal"])
     _add_monitors(parts, rng, plan, x, y, half)
     for k in range(5):
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
-        facing, sheet = turn(rng.random() * 50 - 25), f"poster:{k % 4}"
-        at = np.array([px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k])
-        parts.add(BOX, facing, at, (0.105, 0.148, 0.001), texture=sheet, fit=(5,), tint=(0.95,) * 3)
+        parts.add(
+            BOX, turn(rng.random() * 50 - 25), (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k),
+            (0.105, 0.148, 0.001), texture=f"poster:{k % 4}", fit=(5,), tint=(0.95,) * 3,
+        )  # fmt: skip
     for k in range(2):  # a pile of books at either end
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
-            shade, facing = 0.25 + 0.7 * rng.random(3), turn(rng.random() * 30 - 15)
-            book, faces = np.array([bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level]), ("books",) * 4 + ("plain",)
+            shade = 0.25 + 0.7 * rng.random(3)
             parts.add(
-                BOX, facing, book, (0.12, 0.085, 0.017), texture=(*faces, f"poster:{level % 4}"), fit=(5,), tint=shade,
+                BOX, turn(rng.random() * 30 - 15), (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level),
+                (0.12, 0.085, 0.017), texture=(*["books"] * 4, "plain", f"poster:{level % 4}"), fit=(5,), tint=shade,
                 repeat=(0.4, 3.0),
             )  # fmt: skip
     for k in range(2):
-        mug = np.array([x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012])
-        pattern, shade = "stripes" if k else "plain", 0.35 + 0.6 * rng.random(3)
-        parts.add(ROUND_CONE, _EYE, mug, (0.085, 0.04, 0.042), texture=pattern, repeat=(1.0, 4.0), tint=shade)
+        parts.add(
+            ROUND_CONE,
+            _EYE,
+            (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012),
+            (0.085, 0.04, 0.042),
+            texture="stripes" if k else "plain",
+            repeat=(1.0, 4.0),
+            tint=0.35 + 0.6 * rng.random(3),
+        )
     lamp = np.array([x + side * (0.55 - half), y + 0.62, TOP])
     parts.add(ROUND_CONE, _EYE, lamp, (0.02, 0.07, 0.06), tint=tint["metal"], scale=(1, 1, 0.4))
     parts.add(ROUND_CONE, _EYE, lamp, (0.42, 0.012, 0.012), tint=tint["metal"])
@@ -162,11 +177,24 @@ def _add_monitors(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, 
         for dx, dz, hx, hz in _FRAME:
             bar = middle + product(facing, np.array([dx, -0.012, dz]))
             parts.add(BOX, facing, bar, (hx, 0.024, hz), tint=plastic)
-        parts.add(BOX, facing, np.array([mx, my + 0.03, TOP + 0.09]), (0.03, 0.02, 0.09), tint=plastic)
-        parts.add(BOX, facing, np.array([mx, my + 0.01, TOP + 0.008]), (0.12, 0.09, 0.008), tint=plastic)
-        keyboard, mouse = np.array([mx - 0.03, my - 0.3, TOP + 0.012]), np.array([mx + 0.27, my - 0.3, TOP + 0.005])
-        parts.add(BOX, turn(6 * (rng.random() - 0.5)), keyboard, (0.22, 0.075, 0.012), texture="keyboard", fit=(5,))
-        parts.add(ROUND_CONE, turn(20), mouse, (0, 1, 1), scale=(0.032, 0.055, 0.025), tint=plastic)
+        parts.add(BOX, facing, (mx, my + 0.03, TOP + 0.09), (0.03, 0.02, 0.09), tint=plastic)
+        parts.add(BOX, facing, (mx, my + 0.01, TOP + 0.008), (0.12, 0.09, 0.008), tint=plastic)
+        parts.add(
+            BOX,
+            turn(6 * (rng.random() - 0.5)),
+            (mx - 0.03, my - 0.3, TOP + 0.012),
+            (0.22, 0.075, 0.012),
+            texture="keyboard",
+            fit=(5,),
+        )
+        parts.add(
+            ROUND_CONE,
+            turn(20),
+            (mx + 0.27, my - 0.3, TOP + 0.005),
+            (0, 1, 1),
+            scale=(0.032, 0.055, 0.025),
+            tint=plastic,
+        )
 
 
 def add_shelf(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> None:
@@ -175,26 +203,22 @@ def add_shelf(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> 
     x = (plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5) - side * 0.25 * rng.random()
     y, half, height = plan.back_y - 0.17, 0.42, 1.95
     for dx in (-half, half):
-        at = np.array([x + dx, y, height / 2])
-        parts.add(BOX, _EYE, at, (0.015, 0.15, height / 2), texture="wood", tint=tint)
-    back = np.array([x, y + 0.145, height / 2])
-    parts.add(BOX, _EYE, back, (half, 0.008, height / 2), texture="wood", tint=tint * 0.8)
+        parts.add(BOX, _EYE, (x + dx, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint)
+    parts.add(BOX, _EYE, (x, y + 0.145, height / 2), (half, 0.008, height / 2), texture="wood", tint=tint * 0.8)
     for k in range(6):
         z = 0.06 + k * (height - 0.08) / 5
-        parts.add(BOX, _EYE, np.array([x, y, z]), (half, 0.15, 0.014), texture="wood", tint=tint)
+        parts.add(BOX, _EYE, (x, y, z), (half, 0.15, 0.014), texture="wood", tint=tint)
         if k == 5:
             continue
         width = half * (0.45 + 0.5 * rng.random())
         tall = 0.12 + 0.03 * rng.random()
         offset = (half - width - 0.02) * (1 if rng.random() < 0.5 else -1)
-        books, shift = np.array([x + offset, y - 0.01, z + 0.014 + tall]), (float(rng.random()), 0.5)
         parts.add(
-            BOX, _EYE, books, (width, 0.1, tall), texture="books", repeat=(0.9, 0.5 / tall), shift=shift,
-            tint=(0.9,) * 3,
+            BOX, _EYE, (x + offset, y - 0.01, z + 0.014 + tall), (width, 0.1, tall), texture="books",
+            repeat=(0.9, 0.5 / tall), shift=(float(rng.random()), 0.5), tint=(0.9,) * 3,
         )  # fmt: skip
         if width < half * 0.75:
-            carton = np.array([x - offset * 1.9, y, z + 0.1])
-            parts.add(BOX, _EYE, carton, (0.1, 0.1, 0.085), tint=0.3 + 0.6 * rng.random(3))
+            parts.add(BOX, _EYE, (x - offset * 1.9, y, z + 0.1), (0.1, 0.1, 0.085), tint=0.3 + 0.6 * rng.random(3))
 
 
 def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
@@ -203,18 +227,24 @@ def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
         span = plan.right_x - plan.left_x - 1.6
         x = plan.left_x + 0.8 + span * (k + 0.3 + 0.4 * rng.random()) / plan.posters
         half_x, half_z = ((0.3, 0.42), (0.42, 0.3), (0.21, 0.3))[int(rng.integers(3))]
-        at = np.array([x, plan.back_y - 0.006, 1.55 + 0.25 * rng.random()])
-        parts.add(BOX, _EYE, at, (half_x, 0.006, half_z), texture=f"poster:{k % 4}", fit=(2,))
+        parts.add(
+            BOX,
+            _EYE,
+            (x, plan.back_y - 0.006, 1.55 + 0.25 * rng.random()),
+            (half_x, 0.006, half_z),
+            texture=f"poster:{k % 4}",
+            fit=(2,),
+        )
 
 
 def add_cabinet(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> None:
     """A low cabinet with a plant and boxes on it, at the other end of the back wall; a waste bin."""
     tint, y = plan.tints, plan.back_y - 0.25
     x = plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5
-    parts.add(BOX, _EYE, np.array([x, y, 0.42]), (0.45, 0.22, 0.42), tint=tint["cabinet"])
+    parts.add(BOX, _EYE, (x, y, 0.42), (0.45, 0.22, 0.42), tint=tint["cabinet"])
     for dx in (-0.225, 0.225):
-        parts.add(BOX, _EYE, np.array([x + dx, y - 0.226, 0.42]), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9)
-        parts.add(BOX, _EYE, np.array([x + dx * 0.3, y - 0.24, 0.6]), (0.008, 0.01, 0.06), tint=tint["metal"])
+        parts.add(BOX, _EYE, (x + dx, y - 0.226, 0.42), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9)
+        parts.add(BOX, _EYE, (x + dx * 0.3, y - 0.24, 0.6), (0.008, 0.01, 0.06), tint=tint["metal"])
     pot = np.array([x - 0.2 * side, y, 0.85])
     parts.add(ROUND_CONE, _EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25))
     for _ in range(9):
@@ -224,47 +254,53 @@ def add_cabinet(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -
         length, green = norm(tip - stem), np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random())
         z = (tip - stem) / length
         u = np.cross(z, product(a, np.array([0.0, 1.0, 0.0])))
-        axes, leaf = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1), (float(length), 0.012, 0.04)
-        parts.add(ROUND_CONE, axes, stem, leaf, scale=(0.25, 1.0, 1.0), tint=green)
+        axes = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1)
+        parts.add(ROUND_CONE, axes, stem, (float(length), 0.012, 0.04), scale=(0.25, 1.0, 1.0), tint=green)
     for k in range(2):
         s = 0.1 + 0.05 * rng.random()
-        facing, at = turn(rng.random() * 30), np.array([x + side * (0.1 + 0.2 * k), y, 0.84 + s])
         faces = ("plain", "plain", f"poster:{k}", "plain", "plain", "plain")
-        parts.add(BOX, facing, at, (s, s * 0.8, s), texture=faces, fit=(2,), tint=(0.85, 0.72, 0.55))
-    waste = np.array([plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13])
-    parts.add(ROUND_CONE, _EYE, waste, (0.16, 0.12, 0.14), tint=tint["bin"])
+        parts.add(
+            BOX, turn(rng.random() * 30), (x + side * (0.1 + 0.2 * k), y, 0.84 + s), (s, s * 0.8, s), texture=faces,
+            fit=(2,), tint=(0.85, 0.72, 0.55),
+        )  # fmt: skip
+    parts.add(
+        ROUND_CONE, _EYE, (plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13), (0.16, 0.12, 0.14), tint=tint["bin"]
+    )
 
 
 def build_room(scene: int, plan: Plan) -> Parts:
     """All fixed primitives of the office: walls, floor and ceiling, and its furniture."""
     rng = stream(scene, "synthetic", "furniture")
-    parts, tint, height, back, front = Parts(), plan.tints, 2.8, plan.back_y, -2.5
+    parts, tint, back, front = Parts(), plan.tints, plan.back_y, -2.5
     mid_y, half_y = (back + front) / 2, (back - front) / 2
     mid_x, half_x = (plan.left_x + plan.right_x) / 2, (plan.right_x - plan.left_x) / 2
-    floor, across, along = np.array([mid_x, mid_y, 0.0]), (half_x, height / 2, 0), (half_y, height / 2, 0)
-    shift = (float(rng.random()), float(rng.random()))
-    parts.add(QUAD, wall((1, 0, 0), (0, 1, 0)), floor, (half_x, half_y, 0), texture="carpet", tint=tint["floor"],
-              shift=shift)  # fmt: skip
-    parts.add(
-        QUAD, wall((1, 0, 0), (0, -1, 0)), floor + np.array([0, 0, height]), (half_x, half_y, 0), tint=(0.95,) * 3
-    )
+    across, along = (half_x, HEIGHT_M / 2, 0), (half_y, HEIGHT_M / 2, 0)
+    add_floor(parts, (plan.left_x, front), (plan.right_x, back), plan, (float(rng.random()), float(rng.random())))
     for right, x, y, half, name in (
         ((0, -1, 0), plan.left_x, mid_y, along, "side"),
         ((0, 1, 0), plan.right_x, mid_y, along, "side"),
         ((1, 0, 0), mid_x, back, across, "wall"),
         ((-1, 0, 0), mid_x, front, across, "wall"),
     ):
-        facing, at = wall(right, (0, 0, 1)), np.array([x, y, height / 2])
-        parts.add(QUAD, facing, at, half, texture="plaster", repeat=(0.5, 0.5), tint=tint[name])
+        parts.add(
+            QUAD, wall(right, (0, 0, 1)), (x, y, HEIGHT_M / 2), half, texture="plaster", repeat=(0.5, 0.5),
+            tint=tint[name],
+        )  # fmt: skip
     # Skirting board and a cable duct along the back wall.
-    parts.add(BOX, _EYE, np.array([mid_x, back - 0.01, 0.05]), (half_x, 0.01, 0.05), tint=tint["shelf"])
-    parts.add(BOX, _EYE, np.array([mid_x, back - 0.02, 0.95]), (half_x, 0.02, 0.04), tint=(0.82,) * 3)
+    parts.add(BOX, _EYE, (mid_x, back - 0.01, 0.05), (half_x, 0.01, 0.05), tint=tint["shelf"])
+    parts.add(BOX, _EYE, (mid_x, back - 0.02, 0.95), (half_x, 0.02, 0.04), tint=(0.82,) * 3)
     add_desk(parts, rng, plan, plan.desk_x, plan.desk_y, half=1.15)
     add_shelf(parts, rng, plan, plan.shelf_side)
     add_posters(parts, rng, plan)
     for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3)):
-        at = np.array([x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55])
-        parts.add(BOX, turn(90), at, (0.36, 0.006, 0.26), texture=f"poster:{k}", fit=(2, 3))
+        parts.add(
+            BOX,
+            turn(90),
+            (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55),
+            (0.36, 0.006, 0.26),
+            texture=f"poster:{k}",
+            fit=(2, 3),
+        )
     add_cabinet(parts, rng, plan, -plan.shelf_side)
     return parts
 
@@ -277,13 +313,14 @@ _LINTEL_M = 2.1
 Point = tuple[float, float]
 
 
-def add_floor(parts: Parts, low: Point, high: Point, plan: Plan) -> None:
-    """Floor and ceiling of a rectangle."""
-    middle = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2]
+def add_floor(parts: Parts, low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> None:
+    """Floor and ceiling of a rectangle; `shift` is that of the carpet's texture."""
+    middle = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
     half = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0)
-    floor, ceiling = wall((1, 0, 0), (0, 1, 0)), wall((1, 0, 0), (0, -1, 0))
-    parts.add(QUAD, floor, np.array([*middle, 0.0]), half, texture="carpet", tint=plan.tints["floor"])
-    parts.add(QUAD, ceiling, np.array([*middle, HEIGHT_M]), half, tint=(0.95,) * 3)
+    parts.add(
+        QUAD, wall((1, 0, 0), (0, 1, 0)), (*middle, 0.0), half, texture="carpet", tint=plan.tints["floor"], shift=shift
+    )
+    parts.add(QUAD, wall((1, 0, 0), (0, -1, 0)), (*middle, HEIGHT_M), half, tint=(0.95,) * 3)
 
 
 def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = ()) -> None:
@@ -333,14 +370,20 @@ def corridor_bay(scene: int, number: int) -> Parts:
     elif kind == 1:
         add_shelf(parts, rng, plan, 1)
     elif kind == 2:
-        parts.add(BOX, _EYE, np.array([0, -0.02, 1.03]), (0.5, 0.02, 1.03), tint=tint["shelf"])
-        parts.add(BOX, _EYE, np.array([0, -0.04, 1.0]), (0.44, 0.02, 1.0), texture="wood", tint=tint["door"])
-        parts.add(BOX, _EYE, np.array([0.36, -0.09, 1.02]), (0.05, 0.012, 0.012), tint=tint["metal"])
-        parts.add(BOX, _EYE, np.array([0.0, -0.062, 1.5]), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,))
+        parts.add(BOX, _EYE, (0, -0.02, 1.03), (0.5, 0.02, 1.03), tint=tint["shelf"])
+        parts.add(BOX, _EYE, (0, -0.04, 1.0), (0.44, 0.02, 1.0), texture="wood", tint=tint["door"])
+        parts.add(BOX, _EYE, (0.36, -0.09, 1.02), (0.05, 0.012, 0.012), tint=tint["metal"])
+        parts.add(BOX, _EYE, (0.0, -0.062, 1.5), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,))
     else:
         for k in range(6):
-            at = np.array([-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)])
-            parts.add(BOX, turn(8 * rng.random() - 4), at, (0.15, 0.005, 0.21), texture=f"poster:{k % 4}", fit=(2,))
+            parts.add(
+                BOX,
+                turn(8 * rng.random() - 4),
+                (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)),
+                (0.15, 0.005, 0.21),
+                texture=f"poster:{k % 4}",
+                fit=(2,),
+            )
     return parts
 
 
@@ -349,8 +392,14 @@ def notices(scene: int, number: int) -> Parts:
     rng, parts = stream(scene, "synthetic", "notices", number), Parts()
     for k in range(4):
         half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
-        at = np.array([-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random()])
-        parts.add(BOX, _EYE, at, half, texture=f"poster:{k}", fit=(2,))
+        parts.add(
+            BOX,
+            _EYE,
+            (-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random()),
+            half,
+            texture=f"poster:{k}",
+            fit=(2,),
+        )
     return parts
 
 
@@ -366,10 +415,10 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
     lean = np.array([[1.0, 0, 0], [0, 0.985, -0.17], [0, 0.17, 0.985]])
     cloth: Style = {"instance": instance, "texture": "denim", "repeat": (3, 3), "tint": tint}
     frame: Style = {"instance": instance, "tint": metal}
-    parts.add(BOX, _EYE, np.array([0, 0, 0.45]), (0.23, 0.22, 0.035), **cloth)
-    parts.add(BOX, lean, np.array([0, 0.26, 0.76]), (0.21, 0.028, 0.25), **cloth)
-    parts.add(BOX, lean, np.array([0, 0.255, 0.47]), (0.035, 0.012, 0.1), **frame)
-    parts.add(ROUND_CONE, _EYE, np.array([0, 0, 0.1]), (0.32, 0.03, 0.028), **frame)
+    parts.add(BOX, _EYE, (0, 0, 0.45), (0.23, 0.22, 0.035), **cloth)
+    parts.add(BOX, lean, (0, 0.26, 0.76), (0.21, 0.028, 0.25), **cloth)
+    parts.add(BOX, lean, (0, 0.255, 0.47), (0.035, 0.012, 0.1), **frame)
+    parts.add(ROUND_CONE, _EYE, (0, 0, 0.1), (0.32, 0.03, 0.028), **frame)
     hub = np.array([0, 0, 0.09])
     for k in range(5):
         a = turn(72 * k + 18)
@@ -379,8 +428,8 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
         parts.add(ROUND_CONE, np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame)
         parts.add(ROUND_CONE, _EYE, tip - (0, 0, 0.015), (0, 0.032, 0.032), **frame | {"tint": metal * 0.7})
     for side in (-1, 1):
-        parts.add(BOX, _EYE, np.array([side * 0.27, 0.03, 0.66]), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8})
-        parts.add(BOX, _EYE, np.array([side * 0.27, 0.05, 0.55]), (0.015, 0.02, 0.1), **frame)
+        parts.add(BOX, _EYE, (side * 0.27, 0.03, 0.66), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8})
+        parts.add(BOX, _EYE, (side * 0.27, 0.05, 0.55), (0.015, 0.02, 0.1), **frame)
     return parts
 
 
@@ -391,8 +440,7 @@ def cartons(scene: int, number: int, id: int) -> Parts:
         half = (0.19 + 0.08 * rng.random(), 0.16 + 0.06 * rng.random(), 0.14 + 0.05 * rng.random())
         names = (*(f"poster:{(face + k) % 4}" for face in range(4)), "plain", "plain")
         style: Style = {"instance": id, "texture": names, "fit": (0, 1, 2, 3)}
-        at = np.array([0.0, 0.0, bottom + half[2]])
-        parts.add(BOX, turn(30 * rng.random()), at, half, tint=(0.9, 0.8, 0.66), **style)
+        parts.add(BOX, turn(30 * rng.random()), (0.0, 0.0, bottom + half[2]), half, tint=(0.9, 0.8, 0.66), **style)
         bottom += 2 * half[2]
     return parts
 
@@ -409,8 +457,7 @@ def balloon(id: int, radius: float) -> Parts:
     parts, scale = Parts(), (1.0, 1.0, 1.15)
     parts.add(ROUND_CONE, _EYE, np.zeros(3), (0.0, radius, radius), instance=id, texture="print:balloon",
               repeat=(2.0, 2.0), scale=scale)  # fmt: skip
-    low = np.array([0.0, 0.0, -1.2 * radius])
-    parts.add(ROUND_CONE, _EYE, low, (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3))
+    parts.add(ROUND_CONE, _EYE, (0.0, 0.0, -1.2 * radius), (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3))
     return parts
 
 
@@ -418,12 +465,12 @@ def trolley(id: int, scene: int, plan: Plan) -> Parts:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
     parts, rng, bottom = Parts(), stream(scene, "synthetic", "trolley"), 0.18
     metal: Style = {"instance": id, "tint": plan.tints["metal"]}
-    parts.add(BOX, _EYE, np.array([0, 0, 0.16]), (0.45, 0.3, 0.02), **metal)
+    parts.add(BOX, _EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal)
     for x, y in ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24)):
-        parts.add(ROUND_CONE, _EYE, np.array([x, y, 0.07]), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3)
+        parts.add(ROUND_CONE, _EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3)
     for y in (-0.26, 0.26):
-        parts.add(ROUND_CONE, _EYE, np.array([-0.43, y, 0.16]), (0.85, 0.015, 0.015), **metal)
-    parts.add(BOX, _EYE, np.array([-0.43, 0, 1.01]), (0.015, 0.27, 0.015), **metal)
+        parts.add(ROUND_CONE, _EYE, (-0.43, y, 0.16), (0.85, 0.015, 0.015), **metal)
+    parts.add(BOX, _EYE, (-0.43, 0, 1.01), (0.015, 0.27, 0.015), **metal)
     for _ in range(3):
         half = (0.26 + 0.12 * rng.random(), 0.2 + 0.08 * rng.random(), 0.15 + 0.06 * rng.random())
         parts.add(BOX, _EYE, np.array([0.02, 0.0, bottom + half[2]]), half, instance=id, **_PRINT)
@@ -434,10 +481,9 @@ def trolley(id: int, scene: int, plan: Plan) -> Parts:
 def door_leaf(id: int, plan: Plan, width: float) -> Parts:
     """A door leaf whose hinge stands at the origin and which runs along +x; posters on both sides."""
     parts, half = Parts(), (width / 2, 0.02, 1.02)
-    leaf, handle = np.array([width / 2, 0.0, 1.03]), np.array([width - 0.08, 0.0, 1.03])
-    parts.add(BOX, _EYE, leaf, half, instance=id, texture="wood", tint=plan.tints["door"])
+    parts.add(BOX, _EYE, (width / 2, 0.0, 1.03), half, instance=id, texture="wood", tint=plan.tints["door"])
     for k, (x, z) in enumerate(((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))):
         names = ("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain")
-        parts.add(BOX, _EYE, np.array([x * width, 0.0, z]), (0.15, 0.024, 0.2), instance=id, texture=names, fit=(2, 3))
-    parts.add(BOX, _EYE, handle, (0.06, 0.05, 0.012), instance=id, tint=plan.tints["metal"])
+        parts.add(BOX, _EYE, (x * width, 0.0, z), (0.15, 0.024, 0.2), instance=id, texture=names, fit=(2, 3))
+    parts.add(BOX, _EYE, (width - 0.08, 0.0, 1.03), (0.06, 0.05, 0.012), instance=id, tint=plan.tints["metal"])
     return parts

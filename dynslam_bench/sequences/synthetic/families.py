@@ -1,0 +1,615 @@
+"""The rendered sequences, family by family: what stands and moves in each, and how its camera moves.
+
+Replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, conditions that sensors
+dislike, moving objects after Bonn's, long paths that return, a followed person, and the tempo of TUM's fr1.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from dynslam_bench.core.seeding import stream
+from dynslam_bench.sequences.synthetic.arithmetic import atan2, cos, norm, product, sin
+from dynslam_bench.sequences.synthetic.camera_paths import (
+    EYE_HEIGHT_M,
+    MOTIONS,
+    TILT_RAD,
+    Walk,
+    camera_axes,
+    camera_poses,
+    hand,
+    poses_of,
+    rotations,
+    walk_along,
+    walking_camera,
+)
+from dynslam_bench.sequences.synthetic.parts import BOX, At, Key, Parts, angle_between, between, ease, on_track, turn
+from dynslam_bench.sequences.synthetic.people import Draw, Posture, draw_person, posture, write_script
+from dynslam_bench.sequences.synthetic.rooms import (
+    Plan,
+    Point,
+    add_floor,
+    add_wall,
+    balloon,
+    build_room,
+    cartons,
+    corridor_bay,
+    door_leaf,
+    notices,
+    office_bay,
+    office_chair,
+    pick,
+    plan_room,
+    printed_box,
+    trolley,
+)
+from dynslam_bench.sequences.synthetic.scene import Actor, Array, Body, Optics, Placement, Variant, World
+
+# Replicas of TUM's fr3 dynamic sequences: two people who walk or sit in an office, four camera motions.
+
+
+def build_replica(people: str, motion: str, scene: int) -> World:
+    """The office with its two people and two chairs."""
+    plan, script = plan_room(scene), write_script(people, scene)
+    return World(
+        static=build_room(scene, plan),
+        camera=partial(camera_poses, motion, people, scene),
+        window=window_of(plan),
+        bodies=tuple(
+            Body(3 + k, "chair", office_chair(plan, 3 + k, (1.0, 0.8)[k]), partial(_roll, keys, script.period))
+            for k, keys in enumerate(script.chairs)
+        ),
+        actors=tuple(
+            (draw_person(scene, k), partial(posture, keys, script.period)) for k, keys in enumerate(script.people)
+        ),
+    )
+
+
+def window_of(plan: Plan) -> tuple[float, float, float]:
+    """Beside the back wall, where glare comes from."""
+    return plan.left_x * 0.55, plan.back_y, 2.15
+
+
+def _roll(keys: tuple[Key, ...], period: float, time: float) -> tuple[Array, Array]:
+    a, b, share = between(keys, time % period)
+    e = ease(share)
+    place = np.array([a.x + e * (b.x - a.x), a.y + e * (b.y - a.y), 0.0])
+    return turn(angle_between(a.facing, b.facing, e) + 180.0), place
+
+
+REPLICAS = {
+    f"{people}_{motion}": Variant(partial(build_replica, people, motion), tag, version=0)
+    for people, tag in (("walking", "high-dynamic"), ("sitting", "low-dynamic"))
+    for motion in MOTIONS
+}
+
+
+# Four people who walk past each other all the time and hide most of the view.
+
+LANES_M = (1.0, 1.27, 1.54, 1.8)
+"""Distance of each person's path from the camera's plumb line: no two people cross."""
+
+
+def build_crowd(motion: str, scene: int) -> World:
+    """The office, and people on lanes."""
+    plan = plan_room(scene)
+    actors = tuple(_walker(scene, k, lane) for k, lane in enumerate(LANES_M))
+    camera = partial(camera_poses, motion, "crowd", scene)
+    return World(build_room(scene, plan), camera, window_of(plan), actors=actors)
+
+
+def _walker(scene: int, number: int, lane: float) -> Actor:
+    """To and fro on a lane, with a stop in the middle where the person turns to the camera and talks."""
+    rng, side = stream(scene, "synthetic", "crowd", number), 1.0 if number % 2 else -1.0
+    reach, pause = pick(rng, scene, 1.0, 1.45), pick(rng, scene, 0.8, 2.0)
+    stop, cross = pick(rng, scene, -0.5, 0.5), pick(rng, scene, 2.6, 3.4)
+    stations = [(0.0, -side * reach, side, 0.0), (cross * 0.5, side * stop, side, 0.0), (pause, side * stop, 0, 1.0)]
+    stations += [(cross * 0.5, side * reach, side, 0.0), (0.7, side * reach, -side, 0.0)]
+    stations += [(cross, -side * reach, -side, 0.0), (0.6, -side * reach, side, 0.0)]
+    times = itertools.accumulate(station[0] for station in stations)
+    keys = tuple(
+        Key(t, x, lane, 180.0 - 90.0 * direction if direction else 180.0, 0, talk)
+        for t, (_, x, direction, talk) in zip(times, stations, strict=True)
+    )
+    period = keys[-1].t
+    start = pick(rng, scene, 0.0, period)
+    person = replace(draw_person(scene, number), instance=number + 1)
+    return person, lambda time: replace(posture(keys, period, time + start), clock=time)
+
+
+CROWDS = {f"crowd_{motion}": Variant(partial(build_crowd, motion), "high-dynamic") for motion in ("xyz", "static")}
+
+
+# Two people who step from side to side in time with the camera: in its image they stand still.
+
+
+@dataclass(frozen=True)
+class Step:
+    """The common motion: along x, metres, with rests at both ends."""
+
+    reach: float
+    period: float
+    phase: float
+
+    def at(self, times: Array) -> Array:
+        """Offset along x at times (seconds)."""
+        swing = sin(2 * math.pi * (times / self.period + self.phase))
+        return np.asarray(self.reach * swing * (1.5 - 0.5 * swing * swing))
+
+
+def build_synchronous(scene: int) -> World:
+    """The office, two people side by side, and a camera that moves with them."""
+    plan, rng = plan_room(scene), stream(scene, "synthetic", "synchronous")
+    step = Step(pick(rng, scene, 0.5, 0.6), pick(rng, scene, 4.4, 5.2), pick(rng, scene, 0.0, 1.0))
+    places = ((-pick(rng, scene, 0.3, 0.36), pick(rng, scene, 1.2, 1.3)), (pick(rng, scene, 0.28, 0.34), 1.35))
+    actors = tuple((draw_person(scene, k), partial(_stepping, step, place)) for k, place in enumerate(places))
+    return World(build_room(scene, plan), partial(_camera, step, scene), window_of(plan), actors=actors)
+
+
+def _stepping(step: Step, place: tuple[float, float], time: float) -> Posture:
+    x, ahead = step.at(np.array([time, time + 0.05]))
+    gait = min(abs(ahead - x) / 0.05 / 0.9, 1.0)
+    return Posture(place[0] + x, place[1], 180.0, 2 * x * 2 * math.pi / 1.35, 0.4 * gait, 0.0, 0.1, time)
+
+
+def _camera(step: Step, scene: int, times: Array) -> Array:
+    rng = stream(scene, "synthetic", "camera", "synchronous")
+    rotation = product(camera_axes(TILT_RAD), rotations(hand(rng, times, math.radians(0.5), 3)))
+    place = hand(rng, times, 0.004, 3) + np.array([0.0, 0.0, EYE_HEIGHT_M])
+    place[:, 0] += step.at(times)
+    return poses_of(rotation, place)
+
+
+SYNCHRONOUS = {"synchronous": Variant(build_synchronous, "high-dynamic")}
+
+
+# What the sensors dislike: little light, little texture, little depth, depth as in sunlight.
+
+Change = Callable[[World, int], World]
+DARK = Optics(gain=0.13, color={"read_noise": 2.4, "shot_noise": 0.12, "shutter": 0.8})
+SUNLIGHT = Optics(gain=1.25, depth={"disparity_noise_px": 0.25, "far_m": 4.0, "dark": 0.1, "edge_px": 4})
+
+
+def build_condition(change: Change, people: bool, scene: int) -> World:
+    """The replica of a walking sequence under a condition, with a camera path of its own."""
+    world = change(build_replica("walking", "xyz", scene), scene)
+    world = replace(world, camera=partial(camera_poses, "halfsphere", "conditions", scene))
+    return world if people else replace(world, actors=(), bodies=())
+
+
+def _plain(world: World, scene: int) -> World:
+    """The same things without a pattern."""
+    return replace(world, static=Parts(replace(part, texture=("plain",) * 6) for part in world.static))
+
+
+def _hall(world: World, scene: int) -> World:
+    """A hall whose walls and furniture stand beyond the depth sensor's reach."""
+    plan, hall, x, front, back = plan_room(scene, 0), Parts(), 7.0, -3.0, 8.6
+    add_floor(hall, (-x, front), (x, back), plan)
+    for start, end in (((-x, front), (x, front)), ((x, front), (x, back)), ((x, back), (-x, back)),
+                       ((-x, back), (-x, front))):  # fmt: skip
+        add_wall(hall, start, end, plan)
+    places = [(0.0, ((k - 1) * 4.3, back - 0.05, 0.0)) for k in range(3)]
+    places += [(-90.0 * side, (side * (x - 0.05), 5.0, 0.0)) for side in (-1, 1)]
+    for k, (yaw, at) in enumerate(places):
+        hall.add_copies(office_bay(scene, k), yaw, at, f"/{k}")
+    return replace(world, static=hall, window=(0.0, back, 2.15))
+
+
+_CHANGES: dict[str, Change] = {
+    "dark": lambda world, _: replace(world, optics=DARK),
+    "blank": _plain,
+    "far": _hall,
+    "outdoor": lambda world, _: replace(world, optics=SUNLIGHT),
+}
+CONDITIONS = {
+    f"{name}_{kind}": Variant(partial(build_condition, change, kind == "walking"), tag)
+    for name, change in _CHANGES.items()
+    for kind, tag in (("empty", "static"), ("walking", "high-dynamic"))
+}
+
+
+# Things without a known class that move, after Bonn's balloon, box and kidnapping sequences. Each has an id of its own in
+# the masks. What is moved with hands outside of the picture has no person; a carrier is there where Bonn has one.
+
+PERIOD_S = 20.0
+Cast = tuple[tuple[Body, ...], tuple[Key, ...]]
+"""Bodies and, where a person carries them, the carrier's timeline."""
+
+
+def build_objects(variant: str, scene: int) -> World:
+    """The office, what moves in it, and the xyz camera path of TUM's replicas."""
+    plan, rng = plan_room(scene), stream(scene, "synthetic", "objects", variant)
+    room = build_room(scene, plan)
+    if variant == "door":
+        _add_partition(room, plan)
+    bodies, keys = _SCRIPTS[variant](partial(pick, rng, scene), scene, plan)
+    person = replace(draw_person(scene, 0), instance=9)
+    actors = ((person, partial(posture, keys, PERIOD_S)),) if keys else ()
+    return World(room, partial(camera_poses, "xyz", "objects", scene), window_of(plan), bodies, actors)
+
+
+def _body(id: int, name: str, parts: Parts, keys: tuple[At, ...], period: float | None = PERIOD_S) -> Body:
+    return Body(id, name, parts, partial(on_track, keys, period))
+
+
+def _balloon(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A person walks to and fro and plays with a balloon in front of the camera."""
+    y, reach, high = j(0.95, 1.05), j(0.32, 0.42), j(1.45, 1.55)
+    keys = [At(0.0, reach, y, high - 0.3)]
+    for k in range(8):
+        side = -1 if k % 2 == 0 else 1
+        keys += [At(2.5 * k + 0.9, 0.3 * side * reach, y - 0.1, high + 0.12, 60.0 * k)]
+        keys += [At(2.5 * k + 2.5, side * reach, y, high - 0.3, 60.0 * k + 30.0)]
+    walker = [Key(k.t, 1.1 * k.x, y + 0.55, 180.0 - 15.0 * np.sign(k.x), 0, 1) for k in keys[::2]]
+    return (_body(1, "sports ball", balloon(1, j(0.17, 0.2)), tuple(keys)),), tuple(walker)
+
+
+def _box_obstructing(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A large carton is moved close across the view, held before it, and moved away again."""
+    y, z, yaw = j(1.15, 1.25), j(1.06, 1.14), j(10, 25)
+    box = printed_box(1, (j(0.34, 0.4), j(0.18, 0.24), j(0.28, 0.34)))
+    keys = [At(0, -1.7, y, z), At(2.0, -1.7, y, z), At(4.0, -0.25, y, z, yaw), At(7.0, 0.25, y, z + 0.05, -yaw)]
+    keys += [At(9.0, 1.7, y, z), At(11.5, 1.7, y, z), At(14.0, 0.1, y - 0.08, z, yaw), At(16.5, -0.2, y, z, 0.0)]
+    keys += [At(18.5, -1.7, y, z), At(20.0, -1.7, y, z)]
+    return (_body(1, "box", box, tuple(keys)),), ()
+
+
+def _box_aside(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A person carries a carton through the room; it never hides most of the view."""
+    y, z = j(1.3, 1.4), j(0.95, 1.05)
+    box = printed_box(1, (j(0.21, 0.25), j(0.15, 0.19), j(0.17, 0.21)))
+    times = ((0, -1.6), (1.5, -1.6), (5.5, 0.35), (7.5, 0.2), (10.0, 1.6), (12.0, 1.6), (16.0, -0.3), (18.5, -1.6),
+             (20, -1.6))  # fmt: skip
+    keys = tuple(At(t, x, y, z, 8.0 * k) for k, (t, x) in enumerate(times))
+    walker = tuple(Key(k.t, k.x, y + 0.38, 180) for k in keys)
+    return (_body(1, "box", box, keys),), walker
+
+
+def _placed(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A carton is brought and put down before the desk, where it stays."""
+    return _stand(j, [(1.0, -1.7, 1.1), (3.5, -0.1, 1.0), (5.0, -0.05, 0.0)], came=True)
+
+
+def _removed(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A carton stands before the desk and is taken away."""
+    return _stand(j, [(6.0, -0.05, 0.0), (7.5, -0.1, 1.0), (10.0, -1.7, 1.1)], came=False)
+
+
+def _stand(j: Draw, stations: list[tuple[float, float, float]], came: bool) -> Cast:
+    """A carton and its carrier who pass through (time, x, share of the carrying height) once."""
+    y, half = j(1.3, 1.4), (j(0.3, 0.35), j(0.22, 0.27), j(0.32, 0.38))
+    low, lift, shift = half[2] + 0.35, j(0.35, 0.42), j(-0.1, 0.1)
+    keys = tuple(At(t, x + shift, y, low + lift * min(share, 1.0), 4.0 * k) for k, (t, x, share) in enumerate(stations))
+    pedestal = printed_box(2, (half[0] * 0.9, half[1] * 0.9, 0.175))
+    floor = Body(2, "box", pedestal, partial(on_track, (At(0.0, -0.05 + shift, y, 0.175),), None))
+    walker = [Key(k.t, k.x, y + 0.45, 180) for k in keys]
+    away = -1.75
+    if came:
+        walker = [
+            *walker,
+            Key(7.0, walker[-1].x, y + 0.45, 90),
+            Key(9.5, away, y + 0.5, 90),
+            Key(20, away, y + 0.5, 90),
+        ]
+    else:
+        walker = [Key(0, away, y + 0.5, 270), Key(3.5, away, y + 0.5, 270), *walker, Key(20, away, y + 0.5, 90)]
+    first = [] if walker[0].t == 0 else [replace(walker[0], t=0.0)]
+    return (_body(1, "box", printed_box(1, half), keys, None), floor), (*first, *walker)
+
+
+def _kidnapped(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A very large carton comes before the camera, fills the image while it moves, and leaves."""
+    y, z = j(1.0, 1.1), j(1.1, 1.2)
+    box = printed_box(1, (j(1.15, 1.25), 0.12, j(0.8, 0.9)))
+    keys = [At(0, -2.6, y, z), At(3.0, -2.6, y, z), At(5.0, -0.3, y, z), At(7.5, 0.3, y - 0.06, z + 0.05)]
+    keys += [At(9.5, 2.7, y, z), At(13.0, 2.7, y, z), At(15.0, 0.25, y, z), At(17.0, -0.3, y - 0.05, z - 0.04)]
+    keys += [At(19.0, -2.6, y, z), At(20.0, -2.6, y, z)]
+    return (_body(1, "box", box, tuple(keys)),), ()
+
+
+def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A person pushes a loaded trolley to and fro before the desk."""
+    y = j(1.3, 1.4)
+    stops = ((0, -2.0, 0), (1.5, -2.0, 0), (6.0, 0.15, 0), (8.0, 0.2, 6), (11.5, 2.3, 0), (12.5, 2.3, 180),
+             (15.5, 0.1, 180), (16.5, 0.05, 174), (19.5, -2.0, 180), (20.0, -2.0, 360))  # fmt: skip
+    keys = tuple(At(t, x, y, 0.0, yaw) for t, x, yaw in stops)
+    walker = tuple(Key(k.t, k.x - 0.75 * cos(np.radians(k.yaw)), y, k.yaw - 90.0) for k in keys)
+    return (_body(1, "trolley", trolley(1, scene, plan), keys),), walker
+
+
+def _chair(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A chair with a carton on it is turned and rolled; no person is in view."""
+    x, y, turned = j(-0.2, 0.2), j(1.15, 1.25), j(150, 210)
+    parts = office_chair(plan, 1)
+    parts.add_copies(printed_box(1, (0.2, 0.17, 0.2)), 15.0, (0.0, -0.02, 0.69))
+    keys = [At(0, x, y), At(1.5, x, y), At(5, x + 0.1, y, 0, turned), At(7, x, y, 0, turned), At(9.5, x - 0.5, y + 0.2)]
+    keys += [At(11, x - 0.5, y + 0.2), At(14, x + 0.45, y + 0.1, 0, -turned), At(16, x + 0.45, y + 0.1, 0, -turned)]
+    keys += [At(19, x, y), At(20, x, y)]
+    return (_body(1, "chair", parts, tuple(keys)),), ()
+
+
+_DOOR = (-0.5, 1.55, 1.0)
+"""Hinge x and y, and the width of the door, metres."""
+
+
+def _door(j: Draw, scene: int, plan: Plan) -> Cast:
+    """A door in a partition opens towards the camera and falls shut, twice in a period."""
+    x, y, width = _DOOR
+    wide, ajar = j(72, 80), j(20, 30)
+    angles = ((0, 0), (1.5, 0), (4.0, -wide), (6.5, -wide), (9.0, -ajar), (10.5, -ajar), (13.0, -wide), (15.0, -wide),
+              (18.0, 0), (20, 0))  # fmt: skip
+    keys = tuple(At(t, x, y, 0.0, yaw) for t, yaw in angles)
+    return (_body(1, "door", door_leaf(1, plan, width), keys),), ()
+
+
+def _add_partition(room: Parts, plan: Plan) -> None:
+    """A wall before the desk, with a doorway, and posters on it."""
+    x, y, width = _DOOR
+    for start, end in ((plan.left_x, x - 0.02), (x + width + 0.02, plan.right_x)):
+        add_wall(room, (start, y + 0.05), (end, y + 0.05), plan)
+    for k, at in enumerate((x - 0.28, x - 0.75, x + width + 0.28, x + width + 0.75)):
+        for z in (1.0, 1.62):
+            room.add(
+                BOX,
+                np.eye(3),
+                (at, y - 0.006, z),
+                (0.19, 0.005, 0.26),
+                texture=f"poster:{(k + int(2 * z)) % 4}",
+                fit=(2,),
+            )
+
+
+_SCRIPTS: dict[str, Callable[[Draw, int, Plan], Cast]] = {
+    "balloon": _balloon, "box_obstructing": _box_obstructing, "box_aside": _box_aside, "placed": _placed,
+    "removed": _removed, "kidnapped": _kidnapped, "trolley": _trolley, "chair": _chair, "door": _door,
+}  # fmt: skip
+
+OBJECTS = {f"objects_{name}": Variant(partial(build_objects, name), "high-dynamic") for name in _SCRIPTS}
+
+
+# Long paths that return: a room circled (20 m), a ring of corridors (60 m), six rooms along a corridor (120 m).
+#
+# `moved`: chairs and cartons stand elsewhere whenever the camera comes by again; each is moved while the camera is half
+# a lap away. `repeated`: every stretch of wall is the same, down to its textures.
+
+_SHAPES = ("room", "corridor", "rooms")
+_ASIDE = {"room": -32.0, "corridor": -14.0, "rooms": 0.0}
+_FRAMES = {"room": 2400, "corridor": 3900, "rooms": 6600}
+
+
+@dataclass
+class _Building:
+    """What is built so far; every stretch of wall and every loose piece has its number."""
+
+    scene: int
+    repeated: bool
+    parts: Parts = field(default_factory=Parts)
+    loose: list[tuple[str, Parts, float, Point]] = field(default_factory=list)
+    bays: int = 0
+
+    def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, alike: int = 0) -> None:
+        """Furnish a stretch of wall; where walls are repeated, all that are `alike` are the same."""
+        number = alike if self.repeated else self.bays
+        self.parts.add_copies(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")
+        self.bays += 1
+
+    def piece(self, kind: str, yaw: float, at: Point) -> None:
+        """Put a piece that may be moved on the floor: a ``chair`` or a ``box``."""
+        number, id, piece = 0 if self.repeated else len(self.loose), len(self.loose) + 1, Parts()
+        chair = kind == "chair"
+        plain = office_chair(plan_room(self.scene, number), id) if chair else cartons(self.scene, number, id)
+        piece.add_copies(plain, 0.0, (0.0, 0.0, 0.0), f"/{number}")
+        self.loose.append((kind, piece, yaw, at))
+
+
+def build_loop(variant: str, scene: int) -> World:
+    """The building, its loose pieces, and a camera that is carried around in it."""
+    shape, _, change = variant.partition("_")
+    building = _Building(scene, change == "repeated")
+    walk = {"room": _room, "corridor": _corridor, "rooms": _rooms}[shape](building)
+    bodies = tuple(
+        Body(k + 1, kind, parts, _moves(building, walk, change == "moved", k))
+        for k, (kind, parts, _, _) in enumerate(building.loose)
+    )
+    return World(building.parts, partial(walking_camera, walk, scene, shape, _ASIDE[shape]), (0.0, 3.0, 2.15), bodies)
+
+
+def _moves(building: _Building, walk: Walk, moved: bool, number: int) -> Placement:
+    """The place of a loose piece, by lap."""
+    rng, (_, _, yaw, at) = stream(building.scene, "synthetic", "moved", number), building.loose[number]
+    places = [(turn(yaw), np.array([*at, 0.0]))]
+    for _ in range(2 if moved else 0):
+        angle = np.radians(pick(rng, building.scene, 0.0, 360.0))
+        away = pick(rng, building.scene, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
+        places.append((turn(yaw + pick(rng, building.scene, 40.0, 320.0)), np.array([*at, 0.0]) + away))
+    return partial(_by_lap, places, walk.time_nearest(at), walk.lap_s)
+
+
+def _by_lap(places: list[tuple[Array, Array]], near_s: float, lap_s: float, time: float) -> tuple[Array, Array]:
+    return places[int(np.floor((time - near_s) / lap_s + 0.5)) % len(places)]
+
+
+def _room(b: _Building) -> Walk:
+    """A hall with desks along its walls and a partition in the middle."""
+    rng, plan = stream(b.scene, "synthetic", "hall"), plan_room(b.scene, 0)
+    x, y = pick(rng, b.scene, 5.2, 5.5), pick(rng, b.scene, 4.2, 4.4)
+    add_floor(b.parts, (-x, -y), (x, y), plan)
+    for start, end in _around(x, y):
+        add_wall(b.parts, start, end, plan)
+    for yaw, side, along in ((0, y, 2.4), (0, y, -2.4), (180, -y, 2.4), (180, -y, -2.4)):
+        b.bay(office_bay, yaw, (along, side - np.sign(side) * 0.05))
+        b.piece("chair", yaw, (along + 0.3, side - np.sign(side) * 1.55))
+    for yaw, side in ((-90, x), (90, -x)):
+        b.bay(office_bay, yaw, (side - np.sign(side) * 0.05, 0.0))
+        b.piece("box", yaw, (side - np.sign(side) * 1.3, 0.9))
+    names, block = (*(f"poster:{face % 4}" for face in range(4)), "plain", "plain"), Parts()
+    block.add(BOX, np.eye(3), (0.0, 0.0, 1.0), (1.2, 0.35, 1.0), texture=names, fit=(0, 1, 2, 3))
+    b.parts.add_copies(block, 0.0, (0.0, 0.0, 0.0), "/partition")
+    b.piece("box", 20.0, (0.3, 0.75))
+    return walk_along([(-x + 2.2, -y + 2.1), (x - 2.2, -y + 2.1), (x - 2.2, y - 2.1), (-x + 2.2, y - 2.1)], 0.45)
+
+
+def _around(x: float, y: float) -> list[tuple[Point, Point]]:
+    corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
+    return list(zip(corners, [*corners[1:], corners[0]], strict=True))
+
+
+def _corridor(b: _Building) -> Walk:
+    """A ring of four corridors, 2.4 m wide, around a core."""
+    rng, plan = stream(b.scene, "synthetic", "ring"), plan_room(b.scene, 0)
+    x, y, width = pick(rng, b.scene, 9.6, 10.2), pick(rng, b.scene, 5.6, 6.0), 1.2
+    add_floor(b.parts, (-x - width, -y - width), (x + width, y + width), plan)
+    for sign in (1, -1):
+        for start, end in _around(x + sign * width, y + sign * width):
+            add_wall(b.parts, start, end, plan)
+            wall = np.array(end) - start
+            length = float(norm(wall))
+            yaw = float(np.degrees(atan2(wall[1], wall[0]))) + (0 if sign < 0 else 180)
+            inward = sign * np.array([-wall[1], wall[0]]) / length * 0.05
+            count = int(length / 2.3)
+            for k in range(count):
+                at = np.array(start) + wall * (k + 0.5) / count + inward
+                b.bay(corridor_bay, yaw, (float(at[0]), float(at[1])), alike=b.bays % 4)
+                if k % 3 == 1:
+                    out = at + inward / 0.05 * 0.35
+                    b.piece(("chair", "box")[k % 2], yaw, (float(out[0]), float(out[1])))
+    return walk_along([(-x, -y), (x, -y), (x, y), (-x, y)], 0.6)
+
+
+def _rooms(b: _Building) -> Walk:
+    """A corridor with three rooms on either side; the path runs once around in each and returns."""
+    rng, plan = stream(b.scene, "synthetic", "floor"), plan_room(b.scene, 0)
+    wide, deep, half = pick(rng, b.scene, 6.6, 7.0), pick(rng, b.scene, 5.8, 6.2), 1.2
+    ends = 1.5 * wide
+    add_floor(b.parts, (-ends, -half - deep), (ends, half + deep), plan)
+    for start, end in _around(ends, half + deep):
+        add_wall(b.parts, start, end, plan)
+    doors = (0.5 * wide, 1.5 * wide, 2.5 * wide)
+    corners: list[Point] = []
+    for side in (1, -1):
+        add_wall(b.parts, (-ends, side * half), (ends, side * half), plan, doors)
+        for k in range(3):
+            x = side * (k - 1) * wide
+            if k:
+                edge = x - side * wide / 2
+                add_wall(b.parts, (edge, side * half), (edge, side * (half + deep)), plan)
+            _furnish(b, x, side, wide, half, half + deep)
+            corners += [
+                (x + side * u, side * v)
+                for u, v in ((-0.2, 0.3), (-0.2, 2.2), (-1.9, 3.1), (-1.9, 5.0), (1.9, 5.0), (1.9, 3.1), (0.2, 2.2),
+                             (0.2, 0.3))
+            ]  # fmt: skip
+            if k < 2:
+                at = (x + side * wide / 2, side * (half - 0.05))
+                b.bay(corridor_bay, 180.0 if side < 0 else 0.0, at)
+        b.bay(notices, -90.0 * side, (side * (ends - 0.05), 0.0), alike=7)
+        corners += [(side * u, side * v) for u, v in ((ends - 1.7, 0.6), (ends - 0.9, 0.1), (ends - 1.7, -0.6))]
+    return walk_along(corners, 0.7)
+
+
+def _furnish(b: _Building, x: float, side: int, wide: float, front: float, back: float) -> None:
+    """One room: an office along its back wall, furniture and notices along all others, loose pieces.
+
+    The wall with the door, at `front`, has notices on both of its faces: those on the outer one hang in the corridor.
+    """
+    yaw = 0.0 if side > 0 else 180.0
+    b.bay(office_bay, yaw, (x, side * (back - 0.05)))
+    for end in (1, -1):
+        beside = x + end * (wide / 2 - 0.05)
+        b.bay(corridor_bay, -90.0 * end, (beside, side * (back - 2.6)), alike=1 if end > 0 else 2)
+        b.bay(notices, -90.0 * end, (beside, side * (front + 1.5)), alike=3)
+        b.bay(notices, yaw + 180.0, (x + end * 1.75, side * (front + 0.05)), alike=4)
+        b.bay(notices, yaw, (x + end * 1.55, side * (front - 0.05)), alike=5)
+    b.piece("chair", yaw, (x + 0.4, side * (back - 1.55)))
+    b.piece("box", yaw, (x - 0.1 * wide, side * 3.9))
+
+
+LOOPS = {
+    f"loop_{shape}{change}": Variant(
+        partial(build_loop, shape + change),
+        "low-dynamic" if change == "_moved" else "static",
+        _FRAMES[shape],
+        version=2 if shape == "rooms" else 1,
+    )
+    for change in ("", "_moved", "_repeated")
+    for shape in _SHAPES
+}
+
+
+# The camera follows a person around a room, as in Bonn's person tracking.
+
+
+def build_tracking(scene: int) -> World:
+    """The hall of the loops, walked by a person and, two metres behind, the camera."""
+    hall, rng = build_loop("room", scene), stream(scene, "synthetic", "tracking")
+    walk: Walk = hall.camera.args[0]  # type: ignore[attr-defined]  # a partial of `walking_camera`
+    lead_s = pick(rng, scene, 1.7, 2.0) / 0.45
+    person = replace(draw_person(scene, 0), instance=len(hall.bodies) + 1)
+    camera = partial(walking_camera, walk, scene, "tracking", 6.0)
+    return replace(hall, camera=camera, actors=((person, partial(_walking, walk, lead_s)),))
+
+
+def _walking(walk: Walk, lead_s: float, time: float) -> Posture:
+    place, ahead = walk.at(np.array([time + lead_s, time + lead_s + 0.3]))
+    direction = ahead - place
+    facing = math.degrees(atan2(direction[1], direction[0])) - 90.0
+    stride = 0.45 * (time + lead_s) * 2 * math.pi / 1.0
+    return Posture(float(place[0]), float(place[1]), facing, stride, 0.6, 0.0, 0.0, time)
+
+
+TRACKING = {"tracking": Variant(build_tracking, "high-dynamic", 1200)}
+
+
+# The tempo of TUM's fr1: turns of 1-3 rad/s, motion blur, a rolling shutter and automatic exposure.
+
+OPTICS = Optics(readout_s=0.026, auto_exposure=0.7, color={"shutter": 0.3})
+"""26 ms from the first row to the last, as in the first Kinect."""
+
+SWINGS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "desk": ((0.17, 0.12, 0.14), (0.26, 0.46, 0.26)),
+    "rpy": ((0.03, 0.03, 0.03), (0.3, 0.52, 0.38)),
+    "spin": ((0.14, 0.08, 0.14), (0.12, 0.25, 0.12)),
+    "walking": ((0.15, 0.1, 0.1), (0.24, 0.44, 0.26)),
+}
+"""Amplitudes of each variant: right, down, forward in metres; pitch, yaw, roll in radians."""
+
+
+def build_fast(variant: str, scene: int) -> World:
+    """The office, without people or with the walking ones, or the hall of the loops."""
+    if variant == "spin":
+        world = build_loop("room", scene)
+    else:
+        world = build_replica("walking", "xyz", scene)
+        world = world if variant == "walking" else replace(world, bodies=(), actors=())
+    return replace(world, camera=partial(fast_camera, variant, scene), optics=OPTICS)
+
+
+def fast_camera(variant: str, scene: int, times: Array) -> Array:
+    """Poses ``[N, 4, 4]``: sines of several frequencies along and about all axes; `spin` also turns round and round."""
+    rng, t = stream(scene, "synthetic", "camera", "fast", variant), times
+    shifts, turns = SWINGS[variant]
+    offset, angles = hand(rng, t, 0.006, 3), hand(rng, t, math.radians(0.8), 3)
+    for amplitudes, values in ((shifts, offset), (turns, angles)):
+        for axis, amplitude in enumerate(amplitudes):
+            main, second = pick(rng, scene, 0.45, 0.7), pick(rng, scene, 0.8, 1.1)
+            values[:, axis] += 0.75 * amplitude * sin(2 * math.pi * (main * t + rng.random()))
+            values[:, axis] += 0.4 * amplitude * sin(2 * math.pi * (second * t + rng.random()))
+    yaw, place = np.zeros((len(t), 3)), np.array([0.0, 0.0, EYE_HEIGHT_M])
+    if variant == "spin":
+        yaw[:, 2] = pick(rng, scene, 1.3, 1.6) * t
+        place = np.array([2.7, 0.2, EYE_HEIGHT_M])
+    base = product(rotations(yaw), camera_axes(TILT_RAD))
+    return poses_of(product(base, rotations(angles)), place + product(base, offset[..., None])[..., 0])
+
+
+FAST = {
+    f"fast_{name}": Variant(partial(build_fast, name), "high-dynamic" if name == "walking" else "static")
+    for name in SWINGS
+}
