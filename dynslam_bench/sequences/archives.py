@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import hashlib
 import struct
@@ -9,8 +10,6 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO, cast
 
@@ -25,6 +24,7 @@ MAX_MEMBERS = 200_000
 """Most files and folders of an archive; the largest public sequence has fewer than 20,000."""
 MAX_HEADER = 1 << 20
 """Most bytes of one name or one set of attributes in a tar archive."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 # What Python's readers of archives raise over damaged ones; OSError is gzip's, too.
 _DAMAGE = (tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError,
@@ -49,42 +49,27 @@ def extract(archive: Path, target: Path, progress: Report | None = None) -> dict
     """
     sums: dict[str, str] = {}
     done = 0
-    members = (_zip_members if zipfile.is_zipfile(archive) else _tar_members)(archive)
-    while True:
-        with _reading(archive):
-            member = next(members, None)
-        if member is None:
-            return sums
-        path = target / safe_name(archive, member[0])
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = path.open("xb")
-        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            raise SequenceError(f"{archive.name} holds one name twice: {error.filename}, refused") from error
-        checksum = hashlib.sha256()
-        with file:
-            for block in iter(partial(_read, archive, member[1]), b""):
-                file.write(block)
-                checksum.update(block)
-                done += len(block)
-        sums[path.relative_to(target).as_posix()] = checksum.hexdigest()
-        if progress is not None:
-            progress(Progress("extract", done, None))
-
-
-def _read(archive: Path, stream: IO[bytes]) -> bytes:
-    with _reading(archive):
-        return stream.read(CHUNK)
-
-
-@contextmanager
-def _reading(archive: Path) -> Iterator[None]:
-    """Errors of damaged archives become one line."""
     try:
-        yield
+        for name, stream in (_zip_members if zipfile.is_zipfile(archive) else _tar_members)(archive):
+            path = target / safe_name(archive, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            checksum = hashlib.sha256()
+            with path.open("xb") as file:
+                while block := stream.read(CHUNK):
+                    file.write(block)
+                    checksum.update(block)
+                    done += len(block)
+            sums[path.relative_to(target).as_posix()] = checksum.hexdigest()
+            if progress is not None:
+                progress(Progress("extract", done, None))
+    except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+        raise SequenceError(f"{archive.name} holds one name twice: {error.filename}, refused") from error
     except _DAMAGE as error:
+        if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK_FULL):
+            raise  # of the target, not of the archive
         size = archive.stat().st_size
         raise SequenceError(f"{archive.name} is damaged ({size} bytes): {error}", "fetch it again") from error
+    return sums
 
 
 def safe_name(archive: Path, name: str) -> PurePosixPath:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import shutil
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.core.reading import read_lines, read_text
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.core.sanitise import inside, is_inside, without_passwords
-from dynslam_bench.sequences.archives import extract
+from dynslam_bench.sequences.archives import DISK_FULL, extract
 from dynslam_bench.sequences.cameras import find_camera
 from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of
@@ -164,10 +163,18 @@ def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked:
     first = parts[0].archive
     try:
         with atomic_folder(place) as work:
-            sums = _unpack(parts, work, progress)
-            top = _top(work, entry, first)
-            prefix = "" if top == work else top.relative_to(work).as_posix() + "/"
-            files = {name.removeprefix(prefix): value for name, value in sums.items() if name.startswith(prefix)}
+            unpacked = work / ".unpacked"
+            unpacked.mkdir()
+            sums = _unpack(parts, unpacked, progress)
+            top = _top(unpacked, entry, first)
+            files = {
+                (unpacked / name).relative_to(top).as_posix(): value
+                for name, value in sums.items()
+                if (unpacked / name).is_relative_to(top)
+            }
+            for path in list(top.iterdir()):
+                path.rename(work / path.name)
+            shutil.rmtree(unpacked)
             receipt = Receipt(
                 id=entry.id,
                 url=parts[0].address,
@@ -176,19 +183,11 @@ def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked:
                 checked=checked,
                 files=len(files),
             )
-            write_atomic(top / RECEIPT, receipt.to_json())
-            write_atomic(top / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(files.items())))
-            open_folder(top, entry=entry)
-            inner = top.rename(work / ".top") if top != work else work
-            for path in sorted(inner.iterdir()) if inner != work else ():
-                if (work / path.name).exists():
-                    where = "both inside and beside the sequence's folder"
-                    raise SequenceError(f"the archive holds {path.name} {where}, refused")
-                path.rename(work / path.name)
-            if inner != work:
-                inner.rmdir()
+            write_atomic(work / RECEIPT, receipt.to_json())
+            write_atomic(work / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(files.items())))
+            open_folder(work, entry=entry)
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno not in DISK_FULL:
             raise SequenceError(f"cannot extract {first.name} into {place.parent}: {error.strerror}") from error
         raise SequenceError(
             f"no room to extract {first.name} ({first.stat().st_size / 1e9:.2f} GB) into {place.parent}",
