@@ -12,9 +12,8 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences import open_sequence
-from dynslam_bench.sequences.calibration import adjust, calibrate
+from dynslam_bench.sequences.calibration import Window, adjust, calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
-from dynslam_bench.sequences.continuous_time import Window
 from dynslam_bench.sequences.synthetic import open_synthetic
 
 CAMERA = Camera(320, 240, 260.0, 262.0, 160.0, 118.0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import reduce
+from operator import iadd
 from typing import Any, TypeVar
 
 import numpy as np
@@ -110,22 +111,14 @@ def product(*factors: Array) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
+    if a.ndim == 1 < b.ndim:
+        a, b = np.swapaxes(b, -1, -2), a
     if b.ndim == 1:
-        total = a[..., 0] * b[0]
-        for k in range(1, len(b)):
-            total = total + a[..., k] * b[k]
-        return np.asarray(total)
-    if a.ndim == 1:
-        return np.asarray(_product(np.swapaxes(b, -1, -2), a))
-    total = a[..., :, :1] * b[..., :1, :]
-    for k in range(1, b.shape[-2]):
-        total += a[..., :, k : k + 1] * b[..., k : k + 1, :]
-    return np.asarray(total)
+        return reduce(iadd, (a[..., k] * b[k] for k in range(len(b))))
+    return reduce(iadd, (a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(b.shape[-2])))
 
 
 def norm(vectors: Array) -> Array:
     """Euclidean lengths along the last axis."""
-    total = vectors[..., 0] * vectors[..., 0]
-    for k in range(1, vectors.shape[-1]):
-        total = total + vectors[..., k] * vectors[..., k]
-    return np.asarray(np.sqrt(total))
+    columns = np.moveaxis(vectors, -1, 0)
+    return np.asarray(np.sqrt(reduce(iadd, columns * columns)))

@@ -36,13 +36,12 @@ def camera_poses(motion: str, people: str, scene: int, times: Array) -> Array:
     angles = np.zeros((len(t), 3))  # about right (pitch), down (yaw), forward (roll)
     phase = rng.permutation(3)
     signs = np.where(rng.random(3) < 0.5, -1.0, 1.0)
-    if motion == "xyz":
-        for slot, axis in enumerate(phase):
+    for slot, axis in enumerate(phase):
+        if motion == "xyz":
             offset[:, axis] = signs[axis] * (0.25, 0.2, 0.25)[axis] * _turns(t, 4.6 / tempo, slot)
-    elif motion == "rpy":
-        for slot, axis in enumerate(phase):
+        elif motion == "rpy":
             angles[:, axis] = signs[axis] * np.radians([14.0, 19.0, 20.0])[axis] * _turns(t, 3.6 / tempo, slot)
-    elif motion == "halfsphere":
+    if motion == "halfsphere":
         around = 2 * math.pi * t / (6.1 / tempo)
         lift = 0.5 - 0.5 * cos(2 * math.pi * t / (16.9 / tempo) + 0.4)
         radius, distance = 0.36, 0.9

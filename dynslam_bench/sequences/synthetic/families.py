@@ -215,8 +215,8 @@ CONDITIONS = {
 }
 
 
-# Things without a known class that move, after Bonn's balloon, box and kidnapping sequences. Each has an id of its own in
-# the masks. What is moved with hands outside of the picture has no person; a carrier is there where Bonn has one.
+# Things without a known class that move, after Bonn's balloon, box and kidnapping sequences. Each has an id of its own
+# in the masks. What is moved with hands outside of the picture has no person; a carrier is there where Bonn has one.
 
 PERIOD_S = 20.0
 Cast = tuple[tuple[Body, ...], tuple[Key, ...]]

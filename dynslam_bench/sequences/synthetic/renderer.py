@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -269,12 +269,8 @@ class Renderer:
         self, now: View, after: View, hit: NDArray[np.int32], depth: Array, sharp: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Motion blur while the shutter is open."""
-        flow, blurred, exact = (
-            self._flow(now, after, hit, depth),
-            np.empty_like(sharp),
-            sharp.astype(np.float64).ravel(),
-        )
-        shares, shutter = kernels.tap_shares(), self.color_sensor.shutter
+        flow, blurred = self._flow(now, after, hit, depth), np.empty_like(sharp)
+        exact, shares, shutter = sharp.astype(np.float64).ravel(), kernels.tap_shares(), self.color_sensor.shutter
         self._rows(lambda a, b: kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred))
         return blurred
 
@@ -373,6 +369,4 @@ def _adapted(sensor: SensorSettings, world: Mapping[str, Any]) -> SensorSettings
 
 def default_threads() -> int:
     """Cores this process may use, at most four; ``NUMBA_NUM_THREADS`` lowers it."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    limit = os.environ.get("NUMBA_NUM_THREADS", "")
-    return max(1, min(cores, 4, int(limit) if limit.isdigit() and int(limit) > 0 else 4))
+    return min(4, numba.config.NUMBA_NUM_THREADS)
