@@ -1,12 +1,15 @@
 """Small sequences in TUM layout for tests, where real data may lie, and the flow of rendered frames."""
 
+import hashlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.synthetic import CAMERA
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
@@ -55,3 +58,42 @@ def reprojected(sequence, index, other):
     poses = sequence.ground_truth.T_world_cam
     relative = se3.inverse(poses[other]) @ poses[index]
     return CAMERA.project(points @ relative[:3, :3].T + relative[:3, 3]) - np.stack([U, V], -1)
+
+
+class Altered:
+    """A sequence with other frames, truth or camera."""
+
+    def __init__(self, base, *, frame=None, truth=None, camera=None):
+        self.base, self.frame = base, frame
+        self.frames = getattr(base, "frames", None) or [base[index] for index in range(len(base))]
+        self.ground_truth = base.ground_truth if truth is None else truth(base.ground_truth)
+        self.camera = base.camera if camera is None else camera(base.camera)
+
+    def __getattr__(self, name):
+        return getattr(self.base, name)
+
+    def __len__(self):
+        return len(self.base)
+
+    def __getitem__(self, index):
+        frame = self.frames[index]
+        if self.frame is None:
+            return frame
+        rgb, depth = self.frame(frame, self.base)
+        return Frame(frame.index, frame.timestamp, np.ascontiguousarray(rgb), np.ascontiguousarray(depth))
+
+
+def scaled(factor):
+    """Change a truth's lengths."""
+
+    def change(truth):
+        poses = truth.T_world_cam.copy()
+        poses[:, :3, 3] *= factor
+        return Trajectory(truth.timestamps, poses)
+
+    return change
+
+
+def frame_hash(frame):
+    """A hash of a frame's colours and depth."""
+    return hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()

@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sequence_folders import make_folder
+from sequence_folders import Altered, make_folder, scaled
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.calibration import Window, adjust, calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
@@ -74,27 +73,8 @@ def test_exact_points_give_back_readout_and_delay(readout_s, delay_s):
 @pytest.fixture(scope="module")
 def fast(tmp_path_factory):
     sequence = open_synthetic("synthetic/fast_desk@0?frames=26", tmp_path_factory.mktemp("rendered"))
-    return calibrate(sequence), calibrate(_Changed(sequence, scale=2.0))
-
-
-class _Changed:
-    """A sequence whose camera states another readout time and depth factor, and whose lengths are those of depth."""
-
-    def __init__(self, sequence, scale):
-        self._sequence, self.camera = sequence, replace(sequence.camera, readout_s=0.0)
-        truth = sequence.ground_truth
-        poses = truth.T_world_cam.copy()
-        poses[:, :3, 3] *= scale
-        self.ground_truth = Trajectory(truth.timestamps, poses)
-
-    def __getattr__(self, name):
-        return getattr(self._sequence, name)
-
-    def __len__(self):
-        return len(self._sequence)
-
-    def __getitem__(self, index):
-        return self._sequence[index]
+    other = Altered(sequence, truth=scaled(2.0), camera=lambda camera: replace(camera, readout_s=0.0))
+    return calibrate(sequence), calibrate(other)
 
 
 def test_a_rendered_rolling_shutter_is_measured(fast):

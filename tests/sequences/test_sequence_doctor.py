@@ -8,99 +8,27 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from sequence_folders import SHARED, make_folder, needs_shared
+from sequence_folders import SHARED, Altered, make_folder, needs_shared, scaled
 
-from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.doctor import Diagnosis, diagnose, examine, stretches
+from dynslam_bench.sequences.preprocessing import Preprocessed
 from dynslam_bench.sequences.rgbd_motion import READINGS, read_as, rgbd_pairs
 from dynslam_bench.sequences.stream_checks import Finding
+from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
 from dynslam_bench.sequences.truth_checks import truth_findings
 
-CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 FRAMES = 80
-
-
-class Rendered:
-    """A textured box seen from inside by a camera that swings: exact colour, depth and poses."""
-
-    id, camera, masks, fps, license, citation = "test/box", CAMERA, None, 30.0, "CC0-1.0", ""
-
-    def __init__(self):
-        t = np.arange(FRAMES) / 30.0
-        swing = np.stack([0.25 * np.sin(2.3 * t), 0.12 * np.sin(3.1 * t + 1), 0.2 * np.sin(1.7 * t)], axis=1)
-        turn = np.stack([0.2 * np.sin(2.9 * t + 2), 0.3 * np.sin(2.1 * t), 0.15 * np.sin(3.7 * t + 1)], axis=1)
-        self.timestamps = 100.0 + t
-        self.ground_truth = Trajectory(self.timestamps, se3.exp(np.concatenate([swing, turn], axis=1)))
-        rng = np.random.default_rng(3)
-        noise = rng.integers(0, 255, (3, 40, 40), dtype=np.uint8)
-        self.walls = [cv2.resize(each, (800, 800), interpolation=cv2.INTER_AREA) for each in noise]
-        rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
-        self.rays = np.stack(
-            [(columns - CAMERA.cx) / CAMERA.fx, (rows - CAMERA.cy) / CAMERA.fy, np.ones(rows.shape)], -1
-        )
-        self.posts = np.random.default_rng(5).uniform((-1.2, -0.7, 1.2), (1.2, 0.7, 2.0), (9, 3))
-        self.frames = [self._render(index) for index in range(FRAMES)]
-
-    def _render(self, index):
-        pose = self.ground_truth.T_world_cam[index]
-        ways, start = self.rays @ pose[:3, :3].T, pose[:3, 3]
-        half = np.array([2.0, 1.5, 2.6])
-        with np.errstate(divide="ignore"):
-            reach = (np.sign(ways) * half - start) / ways
-        side = reach.argmin(axis=2)
-        depth = np.take_along_axis(reach, side[..., None], 2)[..., 0]
-        hit = start + depth[..., None] * ways
-        u = np.where(side == 0, hit[..., 1], hit[..., 0]) * 150 + 400
-        v = np.where(side == 2, hit[..., 1], hit[..., 2]) * 120 + 400
-        gray = np.zeros(depth.shape, np.uint8)
-        for wall in range(3):
-            gray[side == wall] = self.walls[wall][v[side == wall].astype(int) % 800, u[side == wall].astype(int) % 800]
-        for number, centre in enumerate(self.posts):  # balls in front, whose outlines are contours of both images
-            offset = start - centre
-            a, b, c = (ways**2).sum(-1), (ways * offset).sum(-1), offset @ offset - 0.16**2
-            root = b * b - a * c
-            near = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
-            front = (near > 0.1) & (near < depth)
-            depth = np.where(front, near, depth)
-            gray[front] = 40 + 170 * (number % 2)
-        rgb = np.repeat(cv2.GaussianBlur(gray, (3, 3), 0.8)[..., None], 3, axis=2)
-        return Frame(index, float(self.timestamps[index]), rgb, depth.astype(np.float32))
-
-    def __len__(self):
-        return FRAMES
-
-    def __getitem__(self, index):
-        return self.frames[index]
-
-
-class Altered:
-    """A sequence with other frames, truth or camera."""
-
-    def __init__(self, base, *, frame=None, truth=None, camera=None):
-        self.base, self.frame = base, frame
-        self.ground_truth = base.ground_truth if truth is None else truth(base.ground_truth)
-        self.camera = camera or base.camera
-
-    def __getattr__(self, name):
-        return getattr(self.base, name)
-
-    def __len__(self):
-        return len(self.base)
-
-    def __getitem__(self, index):
-        frame = self.base[index]
-        if self.frame is None:
-            return frame
-        rgb, depth = self.frame(frame, self.base)
-        return Frame(frame.index, frame.timestamp, np.ascontiguousarray(rgb), np.ascontiguousarray(depth))
 
 
 @pytest.fixture(scope="module")
 def sound():
-    return Rendered()
+    """A rendered office without people, at half the size."""
+    id, settings = f"synthetic/walking_halfsphere?scene=1&frames={FRAMES}", RenderSettings(people="none")
+    small = PreprocessingSettings(width=320, height=240)
+    return Altered(Preprocessed(open_synthetic(id, None, settings=settings), small))
 
 
 @pytest.fixture(scope="module")
@@ -114,15 +42,6 @@ def of_poses(change):
 
 def of_a_body(pose):
     return of_poses(lambda poses: poses @ pose)
-
-
-def scaled(factor):
-    def change(poses):
-        poses = poses.copy()
-        poses[:, :3, 3] *= factor
-        return poses
-
-    return of_poses(change)
 
 
 def w_first(poses):
@@ -150,8 +69,8 @@ FAULTS = {
     "truth-axes": {"truth": of_a_body(BODY)},
     "truth-lever-arm": {"truth": of_a_body(LEVER)},
     "truth-sparse": {"truth": lambda truth: Trajectory(truth.timestamps[::20], truth.T_world_cam[::20])},
-    "camera-focal-length": {"camera": replace(CAMERA, fx=520.0, fy=520.0)},
-    "camera-principal-point": {"camera": replace(CAMERA, cx=90.0)},
+    "camera-focal-length": {"camera": lambda camera: replace(camera, fx=2 * camera.fx, fy=2 * camera.fy)},
+    "camera-principal-point": {"camera": lambda camera: replace(camera, cx=90.0)},
     "depth-factor": {"frame": lambda frame, _: (frame.rgb, frame.depth / 5)},
     "depth-units": {"frame": lambda frame, _: (frame.rgb, frame.depth * 1000)},
     "depth-byte-order": {
@@ -188,10 +107,10 @@ def test_a_fault_is_measured(diagnosed, name, value):
 
 
 def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound):
-    pairs = [pair for start in range(0, FRAMES, 40) for pair in rgbd_pairs(sound.frames[start : start + 40], CAMERA)]
-    found = [truth_findings(sound.timestamps, wander(k)(sound.ground_truth), CAMERA, pairs) for k in (8, 9, 10)]
-    ids = [finding.id for (finding,) in found]
-    assert set(ids) <= {"truth-other-sequence", "truth-unclear"} and "truth-other-sequence" in ids
+    pairs = [pair for start in (0, 40) for pair in rgbd_pairs(sound.frames[start : start + 40], sound.camera)]
+    truths = [wander(seed)(sound.ground_truth) for seed in (0, 1, 2)]
+    ids = [finding.id for truth in truths for finding in truth_findings(sound.timestamps, truth, sound.camera, pairs)]
+    assert ids == ["truth-unclear", "truth-other-sequence", "truth-unclear"]
 
 
 def test_readings_undo_each_convention(sound):
@@ -210,13 +129,11 @@ def test_without_truth_depth_or_motion_it_is_a_note(sound):
     def ids(sequence):
         return [(finding.severity, finding.id) for finding in examine(sequence).findings]
 
-    without = Altered(sound)
-    without.ground_truth = None
-    assert ids(without) == [("note", "no-truth")]
+    assert ids(Altered(sound, truth=lambda _: None)) == [("note", "no-truth")]
     still = Altered(sound, frame=lambda frame, base: (base[0].rgb, base[0].depth),
                     truth=of_poses(lambda poses: np.tile(poses[:1], (len(poses), 1, 1))))  # fmt: skip
     assert ids(still) == [("note", "no-motion")]
-    still.ground_truth = sound.ground_truth
+    still.ground_truth = scaled(5.0)(sound.ground_truth)
     assert ids(still) == [("fault", "truth-other-sequence")]
     colour = Altered(sound, frame=lambda frame, _: (frame.rgb, np.zeros_like(frame.depth)))
     colour.has_depth = False
@@ -240,14 +157,17 @@ def test_damaged_folders_never_raise(tmp_path):
     assert [f.id for f in diagnose(folder).findings] == ["depth-format"]
     (folder / "groundtruth.txt").write_text("1 2 3\n")
     assert [f.id for f in diagnose(folder).findings] == ["unreadable"]
+    (folder / "groundtruth.txt").unlink()
+    (folder / "depth.txt").unlink()
+    shutil.rmtree(folder / "depth")
+    assert [(f.id, f.severity) for f in diagnose(folder).findings] == [("no-depth", "fault")]
 
 
-def test_the_verdict_says_whether_the_truth_was_compared():
-    note = Finding("truth-unclear", "note", 0.2, "", "unclear", "look")
-    fault = Finding("truth-scale", "fault", 1000.0, "", "millimetres", "divide")
-    verdicts = [Diagnosis("x", 40, findings).verdict for findings in ((), (note,), (fault, note))]
-    assert verdicts[0] == "no fault found" and verdicts[2] == "1 fault"
-    assert "could not be compared" in verdicts[1]
+@pytest.mark.parametrize(("ids", "verdict"), [((), "no fault found"), (("note",), "could not be compared"),
+                                              (("fault", "note"), "1 fault")])  # fmt: skip
+def test_the_verdict_says_whether_the_truth_was_compared(ids, verdict):
+    findings = tuple(Finding("truth-unclear", severity, 0.2, "", "unclear", "look") for severity in ids)
+    assert Diagnosis("x", 40, findings).verdict.endswith(verdict)
 
 
 def test_the_cure_of_turned_axes_is_their_inverse(diagnosed):
@@ -255,14 +175,6 @@ def test_the_cure_of_turned_axes_is_their_inverse(diagnosed):
     rows = re.search(r"\[(.*)\]", finding.cure).group(1).split(";")
     cure = np.array([[float(value) for value in row.split(",")] for row in rows])
     np.testing.assert_allclose(BODY[:3, :3] @ cure, np.eye(3), atol=0.02)
-
-
-def test_a_folder_without_depth_is_named(tmp_path):
-    folder, _, _ = make_folder(tmp_path / "one")
-    (folder / "depth.txt").unlink(missing_ok=True)
-    shutil.rmtree(folder / "depth")
-    (finding,) = diagnose(folder).findings
-    assert (finding.id, finding.severity) == ("no-depth", "fault")
 
 
 def test_stretches_cover_a_short_recording_and_sample_a_long_one():

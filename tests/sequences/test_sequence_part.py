@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from pathlib import Path
 
 import numpy as np
-from sequence_folders import make_folder
+from sequence_folders import frame_hash, make_folder
 
 from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.catalogue import open_sequence
@@ -70,10 +69,6 @@ def test_recorded_folders_by_any_path_and_preprocessing(tmp_path: Path) -> None:
     assert part(folder, camera=tmp_path / "camera.toml").block != first.block
     other = make_folder(tmp_path / "b" / "a", start=200.0)[0]
     assert part(other).block != first.block, "another recording in a folder of the same name is not"
-
-
-def frame_hash(frame) -> str:
-    return hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()
 
 
 def test_a_noise_seed_changes_the_noise_and_nothing_else(tmp_path: Path) -> None:

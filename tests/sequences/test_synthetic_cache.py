@@ -1,7 +1,5 @@
 """Rendered frames are the same in every process and come back from the cache as they went in."""
 
-import hashlib
-import os
 import pickle
 import shutil
 import subprocess
@@ -11,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from sequence_folders import frame_hash
 
 from dynslam_bench.sequences import SequenceView
 from dynslam_bench.sequences.catalogue import open_sequence
@@ -19,41 +18,7 @@ from dynslam_bench.sequences.synthetic.people import draw_person, write_script
 from dynslam_bench.sequences.synthetic.rooms import plan_room
 from dynslam_bench.sequences.synthetic.sequence import encode_png
 
-HASHER = """
-import sys
-from test_synthetic_cache import pixels_hash
-print(pixels_hash(sys.argv[1], int(sys.argv[2])))
-"""
 DAMAGES = ("cut", "flip", "empty", "other", "gone")
-
-
-def pixels_hash(name: str, threads: int) -> str:
-    """Of everything that two frames of a sequence hold."""
-    sequence = open_synthetic(name, None, threads=threads)
-    total = hashlib.sha256()
-    for index in (0, 77):
-        frame = sequence[index]
-        for part in (frame.rgb, frame.depth, sequence.masks[index].instances, sequence.flow(index, max(index - 1, 0))):
-            total.update(part.tobytes())
-    return total.hexdigest()
-
-
-def frame_hash(frame) -> str:
-    return hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()
-
-
-def in_child(code: str, *arguments: object) -> str:
-    here = Path(__file__).resolve()
-    paths = (str(here.parents[2]), str(here.parent), os.environ.get("PYTHONPATH", ""))
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout.strip()
-
-
-def test_pixels_are_the_same_across_processes_and_threads() -> None:
-    here = pixels_hash("synthetic/walking_halfsphere?scene=3", 1)
-    assert in_child(HASHER, "synthetic/walking_halfsphere?scene=3", 3) == here
-    assert pixels_hash("synthetic/walking_halfsphere?scene=4", 1) != here
 
 
 def test_the_first_read_is_what_later_reads_give(tmp_path: Path) -> None:
@@ -170,9 +135,7 @@ def test_two_processes_may_render_the_same_sequence(tmp_path: Path) -> None:
         "import sys; from pathlib import Path; from dynslam_bench.sequences.synthetic import render_synthetic; "
         "render_synthetic('synthetic/walking_static?frames=5', Path(sys.argv[1]), threads=1)"
     )
-    root = str(Path(__file__).resolve().parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
-    children = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=environment) for _ in range(2)]
+    children = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(2)]
     assert [child.wait() for child in children] == [0, 0]
     sequence = open_synthetic("synthetic/walking_static?frames=5", tmp_path)
     assert sequence.render() == 0
@@ -190,7 +153,7 @@ if child == 0:
     os._exit(0 if sequence[3].rgb.tobytes() == before else 1)
 print(os.waitpid(child, 0)[1])
 """
-    assert in_child(code) == "0"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "0\n"
 
 
 def test_tuning_and_held_out_scenes_share_nothing() -> None:
