@@ -31,8 +31,8 @@ from dynslam_bench.sequences.readers import recorded as reader
 from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png
 from dynslam_bench.trackers.adapters import orbslam3 as vocabulary
 
+from .campaign import Target, at
 from .mutate import mutate, mutate_png, mutate_zip
-from .target import Target, at
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
 SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1, classes=("person",), box_hidden=1,

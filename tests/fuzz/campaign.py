@@ -1,20 +1,55 @@
-"""Attack a reader for a while, and say what escaped it."""
+"""A reader to attack, and the attack: damaged files for a while, and what escaped."""
 
 from __future__ import annotations
 
 import os
 import resource
-import shutil
 import signal
 import tempfile
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
+from dynslam_bench.core.errors import DynslamError
+
 from .mutate import mutate
-from .target import Target
+
+Mutation = Callable[[bytes, Random], bytes]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        name: Its name.
+        read: Reads what the bytes are in an empty folder of its own; None stands for a file that is missing. It ends,
+            or raises an error of `allowed`; anything else is a finding.
+        seeds: Makes sound and unsound files, once.
+        mutation: Damage that keeps checksums or syntax right, used every other time beside damage to plain bytes.
+        allowed: The errors that its documentation names.
+    """
+
+    name: str
+    read: Callable[[bytes | None, Path], object]
+    seeds: Callable[[], list[bytes]]
+    mutation: Mutation | None = None
+    allowed: tuple[type[BaseException], ...] = (DynslamError,)
+
+
+def at(folder: Path, name: str, data: bytes | None) -> Path:
+    """A file of that name with the bytes, or its path where there are none."""
+    path = folder / name
+    if data is None:
+        path.unlink(missing_ok=True)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return path
+
 
 MOST_MB = 512
 """One input may not take more memory than this, whatever it claims to be."""
@@ -23,6 +58,8 @@ MOST_S = 5.0
 HANGS_S = 30.0
 """Processor time after which an input is given up."""
 LONGEST_MESSAGE = 2100
+_MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
+"""Where folders are made."""
 WATCHED = 16
 """The memory is measured every so many inputs, which may take longer than the reading."""
 
@@ -53,29 +90,25 @@ def attack(target: Target, *, seconds: float = float("inf"), inputs: float = flo
     """
     random = Random(f"{target.name} {seed}")
     result = Result()
-    folder = Path(tempfile.mkdtemp(prefix="dynslam-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
-    try:
-        corpus = target.seeds()
-        first: list[bytes | None] = [*corpus, None, b"", b"\xff\xfe\x00", b"{}", b"[" * 100_000]
-        end = time.process_time() + seconds
-        recent: list[bytes | None] = []
-        peak = _peak_mb()
-        while result.inputs < inputs and (time.process_time() < end or result.inputs < len(first)):
-            data = first[result.inputs] if result.inputs < len(first) else _damaged(target, corpus, random)
-            fault, refused = _one(target, data, folder)
-            result.inputs += 1
-            result.refused += refused
-            recent.append(data)
-            if result.inputs < len(first) or result.inputs % WATCHED == 0:
-                before, peak = peak, _peak_mb()
-                if peak - before > MOST_MB:
-                    data = next((each for each in recent if _is_hungry(target, each, folder)), data)
-                    fault = f"takes more than {MOST_MB} MB"
-                recent.clear()
-            if fault:
-                result.findings.setdefault(fault, data)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    corpus = target.seeds()
+    first: list[bytes | None] = [*corpus, None, b"", b"\xff\xfe\x00", b"{}", b"[" * 100_000]
+    end = time.process_time() + seconds
+    recent: list[bytes | None] = []
+    peak = _peak_mb()
+    while result.inputs < inputs and (time.process_time() < end or result.inputs < len(first)):
+        data = first[result.inputs] if result.inputs < len(first) else _damaged(target, corpus, random)
+        fault, refused = _one(target, data)
+        result.inputs += 1
+        result.refused += refused
+        recent.append(data)
+        if result.inputs < len(first) or result.inputs % WATCHED == 0:
+            before, peak = peak, _peak_mb()
+            if peak - before > MOST_MB:
+                data = next((each for each in recent if _is_hungry(target, each)), data)
+                fault = f"takes more than {MOST_MB} MB"
+            recent.clear()
+        if fault:
+            result.findings.setdefault(fault, data)
     return result
 
 
@@ -86,16 +119,15 @@ def _damaged(target: Target, corpus: list[bytes], random: Random) -> bytes:
     return mutate(data, corpus, random)
 
 
-def _one(target: Target, data: bytes | None, folder: Path) -> tuple[str, bool]:
+def _one(target: Target, data: bytes | None) -> tuple[str, bool]:
     """What escaped (empty for nothing), and whether the input was refused."""
-    shutil.rmtree(folder)
-    folder.mkdir()
     began = time.process_time()
     refused, fault = False, ""
     signal.signal(signal.SIGPROF, _hangs)
     signal.setitimer(signal.ITIMER_PROF, HANGS_S)
     try:
-        target.read(data, folder)
+        with tempfile.TemporaryDirectory(prefix="dynslam-fuzz-", dir=_MEMORY, ignore_cleanup_errors=True) as folder:
+            target.read(data, Path(folder))
     except target.allowed as error:
         refused = True
         if "\n" in str(error) or len(str(error)) > LONGEST_MESSAGE:
@@ -112,12 +144,12 @@ def _one(target: Target, data: bytes | None, folder: Path) -> tuple[str, bool]:
     return fault, refused
 
 
-def _is_hungry(target: Target, data: bytes | None, folder: Path) -> bool:
+def _is_hungry(target: Target, data: bytes | None) -> bool:
     """Whether an input alone takes too much memory: read again in a process of its own, whose peak is its own."""
     pid = os.fork()
     if pid == 0:
         before = _peak_mb()
-        _one(target, data, folder)
+        _one(target, data)
         os._exit(int(_peak_mb() - before > MOST_MB))
     return os.waitpid(pid, 0)[1] != 0
 

@@ -14,7 +14,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.readers.layouts import layout_of
 from dynslam_bench.sequences.readers.recorded import RecordedSequence
 
-from .target import Target, at
+from .campaign import Target, at
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "sequences"))
 from published_folders import WRITERS, random_poses

@@ -27,8 +27,8 @@ from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.sequences.fetch import Receipt
 from dynslam_bench.tuning import Study, StudySummary, samplers
 
+from .campaign import Target, at
 from .mutate import mutate_json, mutate_lines, mutate_zip
-from .target import Target, at
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "results"
 RUN = "a7abe04996a79cc4"

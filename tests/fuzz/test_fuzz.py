@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from . import binaries, exchange, layouts, maps, records, texts
-from .campaign import attack
-from .target import Target
+from . import binaries, exchange, layouts, records, texts
+from .campaign import Target, attack
 
-TARGETS = [*records.TARGETS, *texts.TARGETS, *binaries.TARGETS, *layouts.TARGETS, *exchange.TARGETS, *maps.TARGETS]
+TARGETS = [*records.TARGETS, *texts.TARGETS, *binaries.TARGETS, *layouts.TARGETS, *exchange.TARGETS]
 INPUTS = 60
 
 

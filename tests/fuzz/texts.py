@@ -15,8 +15,7 @@ from dynslam_bench.core import sanitise as harmless
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core import toml
 from dynslam_bench.core.errors import DynslamError, TrackerError
-from dynslam_bench.geometry import trajectory_files as kitti_file
-from dynslam_bench.geometry import trajectory_files as tum_file
+from dynslam_bench.geometry import trajectory_files
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.training import labelled_images as labels
@@ -29,9 +28,9 @@ from dynslam_bench.suites import load_suite
 from dynslam_bench.trackers.adapters import subprocess_tracker as answers
 from dynslam_bench.tuning import study_file
 
+from .campaign import Target, at
 from .mutate import mutate_json
 from .records import FIXTURE
-from .target import Target, at
 
 ROOT = Path(__file__).resolve().parents[2]
 POSES = (
@@ -76,7 +75,7 @@ def _of_text(read: Callable[[str], object]) -> Callable[[bytes | None, Path], ob
 
 
 def _read_kitti(data: bytes | None, folder: Path) -> None:
-    kitti_file.read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n"))
+    trajectory_files.read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n"))
 
 
 def _read_folder(data: bytes | None, folder: Path) -> None:
@@ -167,7 +166,7 @@ def _ids(text: str) -> None:
 TARGETS = [
     Target(
         "TUM trajectory",
-        lambda data, folder: tum_file.load_tum(at(folder, "poses.txt", data)),
+        lambda data, folder: trajectory_files.load_tum(at(folder, "poses.txt", data)),
         lambda: [
             POSES,
             b"1 2 3\n",
