@@ -31,7 +31,7 @@ from dynslam_bench.sequences.readers import recorded as reader
 from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png
 from dynslam_bench.trackers.adapters import orbslam3 as vocabulary
 
-from .campaign import Target, at
+from .campaign import Target, at, written
 from .mutate import mutate, mutate_png, mutate_zip
 
 CAMERA = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
@@ -70,9 +70,7 @@ def _depths() -> list[bytes]:
 
 
 def _npy(array: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array)
-    return buffer.getvalue()
+    return written(lambda file: np.save(file, array))
 
 
 def _rendered() -> list[bytes]:
@@ -194,17 +192,12 @@ def _checkpoints() -> list[bytes]:
         ours | {"config": SMALL.model_copy(update={"stem": 4096, "channels": 4096}).model_dump_json()},
         *({"model": {**state, "roi_heads.box_predictor.cls_score.weight": torch.zeros(size, 4)}} for size in (91, 7)),
     ]
-    found = []
-    for content in contents:
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        found.append(buffer.getvalue())
-    buffer = io.BytesIO()
-    torch.save(ours, buffer, _use_new_zipfile_serialization=False)
+    stored = [written(lambda file, content=content: torch.save(content, file)) for content in contents]
+    stored.append(written(lambda file: torch.save(ours, file, _use_new_zipfile_serialization=False)))
     bomb = io.BytesIO()
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("archive/data.pkl", bytes(1 << 20))
-    return [*found, buffer.getvalue(), bomb.getvalue()]
+    return [*stored, bomb.getvalue()]
 
 
 def _onnx() -> bytes:

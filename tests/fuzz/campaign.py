@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import resource
 import signal
@@ -38,6 +39,13 @@ class Target:
     seeds: Callable[[], list[bytes]]
     mutation: Mutation | None = None
     allowed: tuple[type[BaseException], ...] = (DynslamError,)
+
+
+def written(write: Callable[[io.BytesIO], object]) -> bytes:
+    """What a function writes to a file."""
+    buffer = io.BytesIO()
+    write(buffer)
+    return buffer.getvalue()
 
 
 def at(folder: Path, name: str, data: bytes | None) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from dynslam_bench.slam import map_files
 from dynslam_bench.slam.atlas import open_atlas, packed
 from dynslam_bench.slam.map_files import HEADER, MapFeatures, MapHeader, described
 
-from .campaign import Target, at
+from .campaign import Target, at, written
 from .mutate import mutate_zip
 
 EUROC = (formats.EUROC_HEADING + "\n1000000000,0,0,0,1,0,0,0\n2000000000,1,2,3,0.5,0.5,0.5,0.5\n").encode()
@@ -103,9 +102,7 @@ def _map_seeds() -> list[bytes]:
 
 
 def _npz(arrays: dict[str, Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return buffer.getvalue()
+    return written(lambda file: np.savez(file, **arrays))
 
 
 def _read_map(data: bytes | None, folder: Path) -> None:

@@ -27,7 +27,7 @@ from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.sequences.fetch import Receipt
 from dynslam_bench.tuning import Study, StudySummary, samplers
 
-from .campaign import Target, at
+from .campaign import Target, at, written
 from .mutate import mutate_json, mutate_lines, mutate_zip
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "results"
@@ -200,12 +200,7 @@ def _snapshot_seeds() -> list[bytes]:
              "masks": np.zeros((2, 4, 2), np.uint8)}  # fmt: skip
     odd: list[dict[str, Any]] = [{}, {"count": np.array([3, 2])}, {"masks": np.zeros((2, 4, 3), np.uint8)}]
     odd += [{"kept": np.array([None] * 4)}, {"points": np.zeros(0)}, {"size": np.zeros(300 << 20, np.uint8)}]
-    found = []
-    for each in odd:
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **sound | each)
-        found.append(buffer.getvalue())
-    return found
+    return [written(lambda file, arrays=sound | each: np.savez_compressed(file, **arrays)) for each in odd]
 
 
 def _state_seeds() -> list[bytes]:

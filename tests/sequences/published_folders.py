@@ -27,16 +27,23 @@ def image(path, value, size, dtype=np.uint8):
     cv2.imwrite(str(path), np.full((size[1], size[0], 3) if dtype is np.uint8 else size[::-1], value, dtype))
 
 
-def lines(path, found):
+def images(folder, names, size, raw):
+    """Colour images of one grey and depth images of one raw value, each pair by a name."""
+    for colour, depth in names:
+        image(folder / colour, 90, size)
+        image(folder / depth, raw, size, np.uint16)
+
+
+def lines(path, rows):
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(found) + "\n")
+    path.write_text("\n".join(rows) + "\n")
 
 
-def write_tum(folder, poses, size=(640, 480)):
-    for name, kind, value in (("rgb", np.uint8, 90), ("depth", np.uint16, 10000)):
-        for i in range(len(poses)):
-            image(folder / name / f"{i}.png", value, size, kind)
-        lines(folder / f"{name}.txt", [f"{5 + i / 30:.6f} {name}/{i}.png" for i in range(len(poses))])
+def write_tum(folder, poses, size=(640, 480), names=("rgb", "depth"), raw=10000):
+    images(folder, [[f"{name}/{i}.png" for name in names] for i in range(len(poses))], size, raw)
+    for name in names:
+        listed = [f"{5 + i / 30:.6f} {name}/{i}.png" for i in range(len(poses))]
+        lines(folder / f"{name}.txt", ["#Time Filename", *listed])
     lines(folder / "groundtruth.txt", [tum_line(round(5 + i / 30, 6), pose) for i, pose in enumerate(poses)])
 
 
@@ -51,9 +58,7 @@ def write_eth3d(folder, poses, size=(739, 458)):
 
 def write_icl(folder, poses, size=(640, 480)):
     """Frame 0 has no pose; poses are written with the y axis up, depth comes first in the associations."""
-    for i in range(len(poses) + 1):
-        image(folder / "rgb" / f"{i}.png", 90, size)
-        image(folder / "depth" / f"{i}.png", 10000, size, np.uint16)
+    images(folder, [(f"rgb/{i}.png", f"depth/{i}.png") for i in range(len(poses) + 1)], size, 10000)
     lines(folder / "associations.txt", [f"{i} depth/{i}.png {i} rgb/{i}.png" for i in range(len(poses) + 1)])
     upward = MIRROR @ poses @ MIRROR
     lines(folder / "livingRoom0.gt.freiburg", [tum_line(i + 1, pose) for i, pose in enumerate(upward)])
@@ -81,13 +86,7 @@ def write_shibuya(folder, poses, size=(640, 360)):
 
 
 def write_openloris(folder, poses, size=(848, 480)):
-    for name, kind, value in (("color", np.uint8, 90), ("aligned_depth", np.uint16, 2000)):
-        for i in range(len(poses)):
-            image(folder / name / f"{i}.png", value, size, kind)
-        header = "#Time Filename"
-        lines(folder / f"{name}.txt", [header, *[f"{5 + i / 30:.6f} {name}/{i}.png" for i in range(len(poses))]])
-    base = poses @ np.linalg.inv(BASE_CAM)
-    lines(folder / "groundtruth.txt", [tum_line(round(5 + i / 30, 6), pose) for i, pose in enumerate(base)])
+    write_tum(folder, poses @ np.linalg.inv(BASE_CAM), size, ("color", "aligned_depth"), 2000)
     matrix = ", ".join(repr(float(value)) for value in BASE_CAM.ravel())
     (folder / "sensors.yaml").write_text(
         "%YAML:1.0\n---\nd400_color_optical_frame:\n   sensor_type: camera\n   fps: 30\n   width: 848\n   height: 480\n"
@@ -105,9 +104,7 @@ def write_openloris(folder, poses, size=(848, 480)):
 def write_vslam_lab(folder, poses, size=(64, 48)):
     start = 1403636579763555584
     stamps = [start + i * 33_333_333 for i in range(len(poses))]
-    for i in range(len(poses)):
-        image(folder / "rgb_0" / f"{i}.png", 90, size)
-        image(folder / "depth_0" / f"{i}.png", 2000, size, np.uint16)
+    images(folder, [(f"rgb_0/{i}.png", f"depth_0/{i}.png") for i in range(len(poses))], size, 2000)
     rows = [f"{stamp},rgb_0/{i}.png,{stamp}.0,depth_0/{i}.png" for i, stamp in enumerate(stamps)]
     lines(folder / "rgb.csv", ["ts_rgb_0 (ns),path_rgb_0,ts_depth_0 (ns),path_depth_0", *rows])
     body = poses @ np.linalg.inv(BASE_CAM)
@@ -128,9 +125,8 @@ def write_euroc(folder, poses, size=(64, 48)):
     """Nanoseconds, and a ground truth of the body with the quaternion's w first."""
     base = folder / "mav0"
     stamps = [1403636579763555584 + i * 50_000_000 for i in range(len(poses))]
-    for name, kind, value in (("cam0", np.uint8, 90), ("depth0", np.uint16, 2000)):
-        for stamp in stamps:
-            image(base / name / "data" / f"{stamp}.png", value, size, kind)
+    images(base, [(f"cam0/data/{stamp}.png", f"depth0/data/{stamp}.png") for stamp in stamps], size, 2000)
+    for name in ("cam0", "depth0"):
         lines(base / name / "data.csv", ["#timestamp [ns],filename", *[f"{s},{s}.png" for s in stamps]])
     position, q = se3.to_quaternion(poses @ np.linalg.inv(BASE_CAM))
     rows = []

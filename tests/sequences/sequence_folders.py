@@ -16,27 +16,21 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 needs_shared = pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")
 
 
-def make_folder(folder, *, frames=4, width=32, height=24, rate=30, fps=30.0, start=100.0, distortion=None):
+def make_folder(folder, *, frames=4, width=32, height=24, rate=30, fps=30.0, start=100.0):
     """A folder with random images; returns it with the colour (RGB) and raw depth images."""
     rng = np.random.default_rng(7)
     rgb = rng.integers(0, 256, (frames, height, width, 3), dtype=np.uint8)
     depth = rng.integers(2000, 20000, (frames, height, width), dtype=np.uint16)
     depth[:, :2] = 0
-    for kind in ("rgb", "depth"):
+    stamps = [start + i / rate for i in range(frames)]
+    for kind, images in (("rgb", rgb[..., ::-1]), ("depth", depth)):
         (folder / kind).mkdir(parents=True)
-    lists = {"rgb": [], "depth": [], "groundtruth": []}
-    for i in range(frames):
-        stamp = start + i / rate
-        cv2.imwrite(str(folder / "rgb" / f"{i}.png"), rgb[i, :, :, ::-1])
-        cv2.imwrite(str(folder / "depth" / f"{i}.png"), depth[i])
-        for kind in ("rgb", "depth"):
-            lists[kind].append(f"{stamp!r} {kind}/{i}.png")
-        lists["groundtruth"].append(f"{stamp!r} {i * 0.01} 0 0 0 0 0 1")
-    for name, lines in lists.items():
-        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+        for i, image in enumerate(images):
+            cv2.imwrite(str(folder / kind / f"{i}.png"), image)
+        (folder / f"{kind}.txt").write_text("".join(f"{stamp!r} {kind}/{i}.png\n" for i, stamp in enumerate(stamps)))
+    poses = (f"{stamp!r} {i * 0.01} 0 0 0 0 0 1\n" for i, stamp in enumerate(stamps))
+    (folder / "groundtruth.txt").write_text("".join(poses))
     camera = [f"width = {width}", f"height = {height}", "fx = 30.0", "fy = 30.5", "cx = 15.5", "cy = 11.5"]
-    if distortion is not None:
-        camera.append(f"distortion = {list(distortion)}")
     if fps is not None:
         camera.append(f"fps = {fps}")
     (folder / "camera.toml").write_text("\n".join(camera) + "\n")

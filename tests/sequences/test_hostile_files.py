@@ -7,6 +7,7 @@ import io
 import resource
 import struct
 import tarfile
+import tempfile
 import zipfile
 import zlib
 from pathlib import Path
@@ -82,6 +83,19 @@ def test_ten_million_lines_are_refused_early_and_cheaply(tmp_path: Path) -> None
         read_image_list(path)
 
 
+def refuses(archive: Path, words: str) -> None:
+    with tempfile.TemporaryDirectory() as target, pytest.raises(SequenceError, match=words):
+        archives.extract(archive, Path(target))
+
+
+def test_a_bomb_is_refused(tmp_path: Path) -> None:
+    archive = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file, file.open("zeros", "w", force_zip64=True) as out:
+        for _ in range(150):
+            out.write(bytes(1_000_000))
+    refuses(archive, "unpacks to more than")
+
+
 def tar_header(name: bytes, size: int, kind: bytes) -> bytes:
     """A tar header of any size, with a right checksum."""
     block = bytearray(tarfile.TarInfo(name.decode()).tobuf(tarfile.GNU_FORMAT)[:512])
@@ -94,11 +108,9 @@ def tar_header(name: bytes, size: int, kind: bytes) -> bytes:
 
 @pytest.mark.parametrize("kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK])
 def test_a_tar_header_that_claims_gigabytes_costs_nothing(tmp_path: Path, kind: bytes) -> None:
-    archive, target = tmp_path / "a.tgz", tmp_path / "out"
+    archive = tmp_path / "a.tgz"
     archive.write_bytes(gzip.compress(tar_header(b"x", 3 << 30, kind) + bytes(10 << 20), 1))
-    target.mkdir()
-    with pytest.raises(SequenceError, match="a header claims 3221225472 bytes"):
-        archives.extract(archive, target)
+    refuses(archive, "a header claims 3221225472 bytes")
 
 
 def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,14 +119,11 @@ def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.M
     with tarfile.open(archive, "w") as tar:
         for number in range(30):
             tar.addfile(tarfile.TarInfo(f"seq/{number}"))
-    (tmp_path / "out").mkdir()
-    with pytest.raises(SequenceError, match="holds more than 20 files, refused"):
-        archives.extract(archive, tmp_path / "out")
+    refuses(archive, "holds more than 20 files, refused")
     with zipfile.ZipFile(archive, "w") as made:
         for number in range(30):
             made.writestr(f"zip/{number}", "")
-    with pytest.raises(SequenceError, match="holds more than 20 files, refused"):
-        archives.extract(archive, tmp_path / "out")
+    refuses(archive, "holds more than 20 files, refused")
 
 
 def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path) -> None:
@@ -123,9 +132,7 @@ def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path) -> None:
         tar.addfile(tarfile.TarInfo("seq/rgb.txt"))
     archive = tmp_path / "a.tgz"
     archive.write_bytes(gzip.compress(buffer.getvalue(), 1) + gzip.compress(bytes(140_000_000), 9))
-    (tmp_path / "out").mkdir()
-    with pytest.raises(SequenceError, match=r"unpacks to more than 0\.1 GB"):
-        archives.extract(archive, tmp_path / "out")
+    refuses(archive, r"unpacks to more than 0\.1 GB")
 
 
 def test_other_compressions_are_refused(tmp_path: Path) -> None:
@@ -133,6 +140,4 @@ def test_other_compressions_are_refused(tmp_path: Path) -> None:
     archive = tmp_path / "a.zip"
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_LZMA) as made:
         made.writestr("seq/rgb.txt", "x")
-    (tmp_path / "out").mkdir()
-    with pytest.raises(SequenceError, match="compressed in a way that is not unpacked here"):
-        archives.extract(archive, tmp_path / "out")
+    refuses(archive, "compressed in a way that is not unpacked here")

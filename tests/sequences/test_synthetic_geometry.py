@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from sequence_folders import U, V, reprojected
 
-from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.synthetic import CAMERA, REPLICA_IDS, RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.renderer import bounds_of
@@ -111,16 +110,13 @@ def test_measured_depth_has_the_sensors_faults(walking) -> None:
 @pytest.mark.parametrize("name", REPLICA_IDS)
 def test_every_replica_moves_like_its_original(name: str) -> None:
     sequence = open_synthetic(name, None)
-    assert isinstance(sequence, Sequence)
     truth = sequence.ground_truth
-    assert len(truth) == len(sequence) == 600
+    assert len(REPLICA_IDS) == 8 and len(truth) == len(sequence) == 600
     assert np.array_equal(truth.timestamps, sequence.timestamps)
-    assert all(se3.is_pose(pose, 1e-9) for pose in truth.T_world_cam[::50])
     step = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
     speed = np.linalg.norm(step[:, :3, 3], axis=1) * 30
     turn = np.degrees(se3.rotation_angle(step)) * 30
-    assert speed.max() < 1.0
-    assert turn.max() < 90
+    assert speed.max() < 1.0 and turn.max() < 90
     extent = np.ptp(truth.positions, axis=0)
     motion = name.rpartition("_")[2]
     expected = {"xyz": (0.35, 0.6), "static": (0.0, 0.05), "rpy": (0.0, 0.05), "halfsphere": (0.2, 1.0)}[motion]

@@ -4,34 +4,26 @@ import sys
 import pytest
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.sequences.synthetic import REPLICA_IDS, SyntheticId, parse_synthetic_id
+from dynslam_bench.sequences.synthetic import SyntheticId, parse_synthetic_id
 
 
-def test_the_eight_replicas_exist() -> None:
-    assert len(REPLICA_IDS) == 8
-    for name in REPLICA_IDS:
-        parsed = parse_synthetic_id(name)
-        assert (parsed.scene, parsed.frames) == (0, 600)
-        assert parse_synthetic_id(str(parsed)) == parsed
-
-
-@pytest.mark.parametrize("form", ["?scene=107&frames=33", "?frames=33&scene=107", "@107?frames=33"])
-def test_scene_and_length_are_read(form: str) -> None:
-    parsed = parse_synthetic_id(f"synthetic/sitting_rpy{form}")
-    assert parsed == SyntheticId("sitting_rpy", 107, 33)
-    assert parsed.split == "held-out"
-    assert str(parsed) == "synthetic/sitting_rpy?scene=107&frames=33"
-
-
-@pytest.mark.parametrize("query", ["frames=33&noise=5", "noise=5&frames=33", "noise=005&frames=033"])
-def test_a_noise_seed_is_read_in_any_order(query: str) -> None:
-    parsed = parse_synthetic_id(f"synthetic/sitting_rpy?scene=107&{query}")
-    assert parsed == SyntheticId("sitting_rpy", 107, 33, noise=5)
-    assert str(parsed) == "synthetic/sitting_rpy?scene=107&frames=33&noise=5"
-    assert parse_synthetic_id(str(parsed)) == parsed
-    assert parsed.whole == "synthetic/sitting_rpy?scene=107&noise=5"
-    assert parse_synthetic_id("synthetic/sitting_rpy?noise=5") == SyntheticId("sitting_rpy", noise=5)
-    assert parse_synthetic_id("synthetic/sitting_rpy").noise is None, "the scene's own noise"
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("", SyntheticId("sitting_rpy", 0, 600, None)),
+        *((form, SyntheticId("sitting_rpy", 107, 33)) for form in ("?scene=107&frames=33", "?frames=33&scene=107")),
+        ("@107?frames=33", SyntheticId("sitting_rpy", 107, 33)),
+        ("?noise=5", SyntheticId("sitting_rpy", noise=5)),
+        ("?scene=107&frames=33&noise=5", SyntheticId("sitting_rpy", 107, 33, noise=5)),
+        ("?noise=005&scene=107&frames=033", SyntheticId("sitting_rpy", 107, 33, noise=5)),
+    ],
+)
+def test_scene_length_and_noise_are_read_in_any_order(query: str, expected: SyntheticId) -> None:
+    parsed = parse_synthetic_id(f"synthetic/sitting_rpy{query}")
+    assert parsed == expected == parse_synthetic_id(str(parsed))
+    assert parsed.split == ("held-out" if parsed.scene == 107 else "tune")
+    assert str(parsed).replace("&frames=33", "").replace("&frames=600", "") == parsed.whole
+    assert parsed.whole.endswith("&noise=5") == (parsed.noise == 5)
 
 
 @pytest.mark.parametrize(
