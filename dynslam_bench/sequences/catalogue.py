@@ -97,14 +97,9 @@ class CatalogueEntry(Settings):
 @cache
 def catalogue() -> dict[str, CatalogueEntry]:
     """All public sequences by id, in the order of the data files."""
-    entries: dict[str, CatalogueEntry] = {}
-    for name in _FILES:
-        document = read_toml(Path(__file__).parent / "published" / f"{name}.toml")
-        common: dict[str, Any] = document["common"]
-        for row in document["sequence"]:
-            entry = build(CatalogueEntry, {**common, **row})
-            entries[entry.id] = entry
-    return entries
+    documents = [read_toml(Path(__file__).parent / "published" / f"{name}.toml") for name in _FILES]
+    rows = ({**document["common"], **row} for document in documents for row in document["sequence"])
+    return {row["id"]: build(CatalogueEntry, row) for row in rows}
 
 
 def entry_of(name: str) -> CatalogueEntry | None:
@@ -276,11 +271,10 @@ def _open_whole(
         return open_folder(path, camera=camera, settings=settings)
     if _is_path(name):
         raise SequenceError(
-            f"there is no sequence folder {path.absolute()}",
-            "a path names a folder, see docs/sequences.md",
+            f"there is no sequence folder {path.absolute()}", "a path names a folder, see docs/sequences.md"
         )
-    names = [*sequence_ids(), *by_folder()]
-    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", did_you_mean(name, names))
+    near = did_you_mean(name, [*sequence_ids(), *by_folder()])
+    raise SequenceError(f"unknown sequence '{name}', and there is no such folder", near)
 
 
 def _is_path(name: str) -> bool:
@@ -441,13 +435,11 @@ def expand(names: PySequence[str]) -> list[str]:
     Raises:
         SequenceError: A pattern matches nothing.
     """
-    expanded: list[str] = []
+    expanded: dict[str, None] = {}
     for name in names:
-        if any(character in name for character in "*[") and not Path(name).exists():
-            matching = fnmatch.filter(catalogue(), name)
-            if not matching:
-                raise SequenceError(f"no public sequence matches '{name}'", "see: dynslam-bench sequences list")
-            expanded += matching
-        else:
-            expanded.append(name)
-    return list(dict.fromkeys(expanded))
+        pattern = any(character in name for character in "*[") and not Path(name).exists()
+        matching = fnmatch.filter(catalogue(), name) if pattern else [name]
+        if not matching:
+            raise SequenceError(f"no public sequence matches '{name}'", "see: dynslam-bench sequences list")
+        expanded |= dict.fromkeys(matching)
+    return list(expanded)

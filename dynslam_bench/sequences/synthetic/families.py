@@ -109,9 +109,11 @@ def _walker(scene: int, number: int, lane: float) -> Actor:
     rng, side = stream(scene, "synthetic", "crowd", number), 1.0 if number % 2 else -1.0
     reach, pause = pick(rng, scene, 1.0, 1.45), pick(rng, scene, 0.8, 2.0)
     stop, cross = pick(rng, scene, -0.5, 0.5), pick(rng, scene, 2.6, 3.4)
-    stations = [(0.0, -side * reach, side, 0.0), (cross * 0.5, side * stop, side, 0.0), (pause, side * stop, 0, 1.0)]
-    stations += [(cross * 0.5, side * reach, side, 0.0), (0.7, side * reach, -side, 0.0)]
-    stations += [(cross, -side * reach, -side, 0.0), (0.6, -side * reach, side, 0.0)]
+    stations = [
+        (0.0, -side * reach, side, 0.0), (cross * 0.5, side * stop, side, 0.0), (pause, side * stop, 0, 1.0),
+        (cross * 0.5, side * reach, side, 0.0), (0.7, side * reach, -side, 0.0),
+        (cross, -side * reach, -side, 0.0), (0.6, -side * reach, side, 0.0),
+    ]  # fmt: skip
     times = itertools.accumulate(station[0] for station in stations)
     keys = tuple(
         Key(t, x, lane, 180.0 - 90.0 * direction if direction else 180.0, 0, talk)
@@ -129,31 +131,27 @@ CROWDS = {f"crowd_{motion}": Variant(partial(build_crowd, motion), "high-dynamic
 # Two people who step from side to side in time with the camera: in its image they stand still.
 
 
-@dataclass(frozen=True)
-class Step:
-    """The common motion: along x, metres, with rests at both ends."""
+Step = Callable[[Array], Array]
+"""The common motion: times in seconds to the offset along x in metres."""
 
-    reach: float
-    period: float
-    phase: float
 
-    def at(self, times: Array) -> Array:
-        """Offset along x at times (seconds)."""
-        swing = sin(2 * math.pi * (times / self.period + self.phase))
-        return np.asarray(self.reach * swing * (1.5 - 0.5 * swing * swing))
+def _step(reach: float, period: float, phase: float, times: Array) -> Array:
+    """To and fro, with rests at both ends."""
+    swing = sin(2 * math.pi * (times / period + phase))
+    return np.asarray(reach * swing * (1.5 - 0.5 * swing * swing))
 
 
 def build_synchronous(scene: int) -> World:
     """The office, two people side by side, and a camera that moves with them."""
     plan, rng = plan_room(scene), stream(scene, "synthetic", "synchronous")
-    step = Step(pick(rng, scene, 0.5, 0.6), pick(rng, scene, 4.4, 5.2), pick(rng, scene, 0.0, 1.0))
+    step = partial(_step, pick(rng, scene, 0.5, 0.6), pick(rng, scene, 4.4, 5.2), pick(rng, scene, 0.0, 1.0))
     places = ((-pick(rng, scene, 0.3, 0.36), pick(rng, scene, 1.2, 1.3)), (pick(rng, scene, 0.28, 0.34), 1.35))
     actors = tuple((draw_person(scene, k), partial(_stepping, step, place)) for k, place in enumerate(places))
     return World(build_room(scene, plan), partial(_camera, step, scene), window_of(plan), actors=actors)
 
 
 def _stepping(step: Step, place: tuple[float, float], time: float) -> Posture:
-    x, ahead = step.at(np.array([time, time + 0.05]))
+    x, ahead = step(np.array([time, time + 0.05]))
     gait = min(abs(ahead - x) / 0.05 / 0.9, 1.0)
     return Posture(place[0] + x, place[1], 180.0, 2 * x * 2 * math.pi / 1.35, 0.4 * gait, 0.0, 0.1, time)
 
@@ -162,7 +160,7 @@ def _camera(step: Step, scene: int, times: Array) -> Array:
     rng = stream(scene, "synthetic", "camera", "synchronous")
     rotation = product(camera_axes(TILT_RAD), rotations(hand(rng, times, math.radians(0.5), 3)))
     place = hand(rng, times, 0.004, 3) + np.array([0.0, 0.0, EYE_HEIGHT_M])
-    place[:, 0] += step.at(times)
+    place[:, 0] += step(times)
     return poses_of(rotation, place)
 
 
@@ -192,11 +190,13 @@ def _hall(world: World, scene: int) -> World:
     """A hall whose walls and furniture stand beyond the depth sensor's reach."""
     plan, hall, x, front, back = plan_room(scene, 0), Parts(), 7.0, -3.0, 8.6
     add_floor(hall, (-x, front), (x, back), plan)
-    for start, end in (((-x, front), (x, front)), ((x, front), (x, back)), ((x, back), (-x, back)),
-                       ((-x, back), (-x, front))):  # fmt: skip
+    corners = [(-x, front), (x, front), (x, back), (-x, back), (-x, front)]
+    for start, end in itertools.pairwise(corners):
         add_wall(hall, start, end, plan)
-    places = [(0.0, ((k - 1) * 4.3, back - 0.05, 0.0)) for k in range(3)]
-    places += [(-90.0 * side, (side * (x - 0.05), 5.0, 0.0)) for side in (-1, 1)]
+    places = [
+        *((0.0, ((k - 1) * 4.3, back - 0.05, 0.0)) for k in range(3)),
+        *((-90.0 * side, (side * (x - 0.05), 5.0, 0.0)) for side in (-1, 1)),
+    ]
     for k, (yaw, at) in enumerate(places):
         hall.add_copies(office_bay(scene, k), yaw, at, f"/{k}")
     return replace(world, static=hall, window=(0.0, back, 2.15))
@@ -255,10 +255,12 @@ def _box_obstructing(j: Draw, scene: int, plan: Plan) -> Cast:
     """A large carton is moved close across the view, held before it, and moved away again."""
     y, z, yaw = j(1.15, 1.25), j(1.06, 1.14), j(10, 25)
     box = printed_box(1, (j(0.34, 0.4), j(0.18, 0.24), j(0.28, 0.34)))
-    keys = [At(0, -1.7, y, z), At(2.0, -1.7, y, z), At(4.0, -0.25, y, z, yaw), At(7.0, 0.25, y, z + 0.05, -yaw)]
-    keys += [At(9.0, 1.7, y, z), At(11.5, 1.7, y, z), At(14.0, 0.1, y - 0.08, z, yaw), At(16.5, -0.2, y, z, 0.0)]
-    keys += [At(18.5, -1.7, y, z), At(20.0, -1.7, y, z)]
-    return (_body(1, "box", box, tuple(keys)),), ()
+    keys = (
+        At(0, -1.7, y, z), At(2.0, -1.7, y, z), At(4.0, -0.25, y, z, yaw), At(7.0, 0.25, y, z + 0.05, -yaw),
+        At(9.0, 1.7, y, z), At(11.5, 1.7, y, z), At(14.0, 0.1, y - 0.08, z, yaw), At(16.5, -0.2, y, z, 0.0),
+        At(18.5, -1.7, y, z), At(20.0, -1.7, y, z),
+    )  # fmt: skip
+    return (_body(1, "box", box, keys),), ()
 
 
 def _box_aside(j: Draw, scene: int, plan: Plan) -> Cast:
@@ -272,18 +274,13 @@ def _box_aside(j: Draw, scene: int, plan: Plan) -> Cast:
     return (_body(1, "box", box, keys),), walker
 
 
-def _placed(j: Draw, scene: int, plan: Plan) -> Cast:
-    """A carton is brought and put down before the desk, where it stays."""
-    return _stand(j, [(1.0, -1.7, 1.1), (3.5, -0.1, 1.0), (5.0, -0.05, 0.0)], came=True)
-
-
-def _removed(j: Draw, scene: int, plan: Plan) -> Cast:
-    """A carton stands before the desk and is taken away."""
-    return _stand(j, [(6.0, -0.05, 0.0), (7.5, -0.1, 1.0), (10.0, -1.7, 1.1)], came=False)
-
-
-def _stand(j: Draw, stations: list[tuple[float, float, float]], came: bool) -> Cast:
-    """A carton and its carrier who pass through (time, x, share of the carrying height) once."""
+def _carried(came: bool, j: Draw, scene: int, plan: Plan) -> Cast:
+    """A carton is brought and put down before the desk, where it stays; or it stands there and is taken away."""
+    stations = (  # time, x, share of the carrying height
+        [(1.0, -1.7, 1.1), (3.5, -0.1, 1.0), (5.0, -0.05, 0.0)]
+        if came
+        else [(6.0, -0.05, 0.0), (7.5, -0.1, 1.0), (10.0, -1.7, 1.1)]
+    )
     y, half = j(1.3, 1.4), (j(0.3, 0.35), j(0.22, 0.27), j(0.32, 0.38))
     low, lift, shift = half[2] + 0.35, j(0.35, 0.42), j(-0.1, 0.1)
     keys = tuple(At(t, x + shift, y, low + lift * min(share, 1.0), 4.0 * k) for k, (t, x, share) in enumerate(stations))
@@ -292,12 +289,7 @@ def _stand(j: Draw, stations: list[tuple[float, float, float]], came: bool) -> C
     walker = [Key(k.t, k.x, y + 0.45, 180) for k in keys]
     away = -1.75
     if came:
-        walker = [
-            *walker,
-            Key(7.0, walker[-1].x, y + 0.45, 90),
-            Key(9.5, away, y + 0.5, 90),
-            Key(20, away, y + 0.5, 90),
-        ]
+        walker += [Key(7.0, walker[-1].x, y + 0.45, 90), Key(9.5, away, y + 0.5, 90), Key(20, away, y + 0.5, 90)]
     else:
         walker = [Key(0, away, y + 0.5, 270), Key(3.5, away, y + 0.5, 270), *walker, Key(20, away, y + 0.5, 90)]
     first = [] if walker[0].t == 0 else [replace(walker[0], t=0.0)]
@@ -308,10 +300,12 @@ def _kidnapped(j: Draw, scene: int, plan: Plan) -> Cast:
     """A very large carton comes before the camera, fills the image while it moves, and leaves."""
     y, z = j(1.0, 1.1), j(1.1, 1.2)
     box = printed_box(1, (j(1.15, 1.25), 0.12, j(0.8, 0.9)))
-    keys = [At(0, -2.6, y, z), At(3.0, -2.6, y, z), At(5.0, -0.3, y, z), At(7.5, 0.3, y - 0.06, z + 0.05)]
-    keys += [At(9.5, 2.7, y, z), At(13.0, 2.7, y, z), At(15.0, 0.25, y, z), At(17.0, -0.3, y - 0.05, z - 0.04)]
-    keys += [At(19.0, -2.6, y, z), At(20.0, -2.6, y, z)]
-    return (_body(1, "box", box, tuple(keys)),), ()
+    keys = (
+        At(0, -2.6, y, z), At(3.0, -2.6, y, z), At(5.0, -0.3, y, z), At(7.5, 0.3, y - 0.06, z + 0.05),
+        At(9.5, 2.7, y, z), At(13.0, 2.7, y, z), At(15.0, 0.25, y, z), At(17.0, -0.3, y - 0.05, z - 0.04),
+        At(19.0, -2.6, y, z), At(20.0, -2.6, y, z),
+    )  # fmt: skip
+    return (_body(1, "box", box, keys),), ()
 
 
 def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
@@ -329,10 +323,12 @@ def _chair(j: Draw, scene: int, plan: Plan) -> Cast:
     x, y, turned = j(-0.2, 0.2), j(1.15, 1.25), j(150, 210)
     parts = office_chair(plan, 1)
     parts.add_copies(printed_box(1, (0.2, 0.17, 0.2)), 15.0, (0.0, -0.02, 0.69))
-    keys = [At(0, x, y), At(1.5, x, y), At(5, x + 0.1, y, 0, turned), At(7, x, y, 0, turned), At(9.5, x - 0.5, y + 0.2)]
-    keys += [At(11, x - 0.5, y + 0.2), At(14, x + 0.45, y + 0.1, 0, -turned), At(16, x + 0.45, y + 0.1, 0, -turned)]
-    keys += [At(19, x, y), At(20, x, y)]
-    return (_body(1, "chair", parts, tuple(keys)),), ()
+    keys = (
+        At(0, x, y), At(1.5, x, y), At(5, x + 0.1, y, 0, turned), At(7, x, y, 0, turned), At(9.5, x - 0.5, y + 0.2),
+        At(11, x - 0.5, y + 0.2), At(14, x + 0.45, y + 0.1, 0, -turned), At(16, x + 0.45, y + 0.1, 0, -turned),
+        At(19, x, y), At(20, x, y),
+    )  # fmt: skip
+    return (_body(1, "chair", parts, keys),), ()
 
 
 _DOOR = (-0.5, 1.55, 1.0)
@@ -367,8 +363,8 @@ def _add_partition(room: Parts, plan: Plan) -> None:
 
 
 _SCRIPTS: dict[str, Callable[[Draw, int, Plan], Cast]] = {
-    "balloon": _balloon, "box_obstructing": _box_obstructing, "box_aside": _box_aside, "placed": _placed,
-    "removed": _removed, "kidnapped": _kidnapped, "trolley": _trolley, "chair": _chair, "door": _door,
+    "balloon": _balloon, "box_obstructing": _box_obstructing, "box_aside": _box_aside, "placed": partial(_carried, True),
+    "removed": partial(_carried, False), "kidnapped": _kidnapped, "trolley": _trolley, "chair": _chair, "door": _door,
 }  # fmt: skip
 
 OBJECTS = {f"objects_{name}": Variant(partial(build_objects, name), "high-dynamic") for name in _SCRIPTS}
@@ -457,8 +453,7 @@ def _room(b: _Building) -> Walk:
 
 
 def _around(x: float, y: float) -> list[tuple[Point, Point]]:
-    corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
-    return list(zip(corners, [*corners[1:], corners[0]], strict=True))
+    return list(itertools.pairwise([(-x, -y), (x, -y), (x, y), (-x, y), (-x, -y)]))
 
 
 def _corridor(b: _Building) -> Walk:

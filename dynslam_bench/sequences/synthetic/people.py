@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -290,11 +291,7 @@ def write_script(people: str, scene: int) -> Script:
     """The script of a scene; half of the scenes have it with left and right exchanged."""
     rng = stream(scene, "synthetic", "script", people)
     mirrored = rng.random() < 0.5
-
-    def draw(low: float, high: float) -> float:
-        return pick(rng, scene, low, high)
-
-    script = _sitting(draw) if people == "sitting" else _walking(draw)
+    script = (_sitting if people == "sitting" else _walking)(partial(pick, rng, scene))
     if not mirrored:
         return script
     walkers, chairs = (

@@ -221,14 +221,10 @@ def print_shirt(rng: np.random.Generator, size: int = 256) -> Image:
         color = 20 + 225 * rng.random(3)
         u, v, r = rng.random(), rng.random(), 0.03 + 0.06 * rng.random()
         du, dv = (xx - u + 0.5) % 1 - 0.5, (yy - v + 0.5) % 1 - 0.5
-        kind = int(rng.integers(3))
-        if kind == 0:
-            image[du * du + dv * dv < r * r] = color
-        elif kind == 1:
-            image[(np.abs(du) < r) & (np.abs(dv) < 0.35 * r)] = color
-        else:
-            ring = np.sqrt(du * du + dv * dv)
-            image[(ring < r) & (ring > 0.6 * r)] = color
+        square = du * du + dv * dv
+        disc, bar = square < r * r, (np.abs(du) < r) & (np.abs(dv) < 0.35 * r)
+        ring = (np.sqrt(square) < r) & (np.sqrt(square) > 0.6 * r)
+        image[(disc, bar, ring)[rng.integers(3)]] = color
     return image + 4 * fractal(rng, size, 32, 2)[..., None]
 
 
