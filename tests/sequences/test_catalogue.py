@@ -7,7 +7,6 @@ import pytest
 from sequence_folders import make_folder
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences import DATASETS, open_sequence, sequence_ids
 from dynslam_bench.sequences.cameras import CAMERAS, read_camera, write_camera
@@ -88,15 +87,6 @@ def test_camera_of_a_published_folder_name(vga):
     (folder / "camera.toml").unlink()
     sequence = open_sequence(folder)
     assert (sequence.id, sequence.camera) == ("bonn/crowd2", CAMERAS["bonn"])
-
-
-def test_the_data_root(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
-    assert find_data_root() == tmp_path / "cache" / "dynslam-bench" / "data"
-    monkeypatch.setenv("DYNSLAM_BENCH_DATA", str(tmp_path / "env"))
-    assert find_data_root() == tmp_path / "env"
-    assert find_data_root(tmp_path / "argument") == tmp_path / "argument"
 
 
 def test_a_missing_sequence_says_all_one_needs(tmp_path):

@@ -118,20 +118,30 @@ def test_no_server(tmp_path):
         fetch(NAME, data_root=tmp_path, url="file:///etc/passwd")
 
 
-def test_full_disk_while_downloading(get, server, monkeypatch):
+@pytest.fixture
+def fill_disk(monkeypatch):
+    """Makes the disk full when a file is opened for which a function of its path and mode is true."""
+
+    def fill(is_last):
+        def full(self, mode="r", *args, **kwargs):
+            if is_last(self, mode):
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real(self, mode, *args, **kwargs)
+
+        monkeypatch.setattr(Path, "open", full)
+
     real = Path.open
+    return fill
 
-    def full(self, mode="r", *args, **kwargs):
-        if self.name.endswith(".part") and "b" in mode:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return real(self, mode, *args, **kwargs)
 
+def test_full_disk_while_downloading(get, server, fill_disk, monkeypatch):
     server.plan = [{"cut": 40_000}, *[{"cut": 0}] * 2]
     with pytest.raises(SequenceError):
         get(attempts=2)
-    with monkeypatch.context() as patch, pytest.raises(SequenceError, match="make room and run the same command again"):
-        patch.setattr(Path, "open", full)
+    fill_disk(lambda path, mode: path.name.endswith(".part") and "b" in mode)
+    with pytest.raises(SequenceError, match="make room and run the same command again"):
         get()
+    monkeypatch.undo()
     server.requests.clear()
     get()
     assert server.requests == ["bytes=40000-"]
@@ -143,19 +153,8 @@ def test_too_little_room_is_noticed_at_once(get, monkeypatch, packed, tmp_path):
         get()
 
 
-def test_full_disk_while_extracting(get, server, monkeypatch, tmp_path):
-    real = Path.open
-    count = 0
-
-    def full(self, mode="r", *args, **kwargs):
-        nonlocal count
-        if mode == "xb":
-            count += 1
-            if count == 5:
-                raise OSError(errno.ENOSPC, "No space left on device")
-        return real(self, mode, *args, **kwargs)
-
-    monkeypatch.setattr(Path, "open", full)
+def test_full_disk_while_extracting(get, server, fill_disk, monkeypatch, tmp_path):
+    fill_disk(lambda path, mode: mode == "xb" and path.name == "2.png")
     with pytest.raises(SequenceError, match="no room to extract"):
         get()
     monkeypatch.undo()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from published_folders import WRITERS, image, lines, random_poses, tum_line, write_seven_scenes
+from published_folders import WRITERS, image, lines, random_poses, write_seven_scenes
 
 from dynslam_bench.core.errors import DynslamError, SequenceError
 from dynslam_bench.geometry.camera import Camera
@@ -91,13 +91,6 @@ def test_frame_0_of_icl_has_no_pose_and_its_view_is_mirrored_back(written):
     assert np.allclose(sequence.camera.project(seen[:3]), pixel, atol=1e-9)
 
 
-def test_stamps_of_another_sequence_are_refused(tmp_path):
-    WRITERS["openloris"](tmp_path / "s", random_poses(1))
-    lines(tmp_path / "s" / "groundtruth.txt", [tum_line(4711.0, pose) for pose in random_poses(1, 1)])
-    with pytest.raises(SequenceError, match=r"never nearer than 4705\.9.*bias of their own"):
-        open_sequence(tmp_path / "s")
-
-
 BROKEN = {
     "eth3d": [("associated.txt", None, "no depth"), ("calibration.txt", "726 726 354", "3 values, not the 4")],
     "icl-nuim": [
@@ -121,9 +114,15 @@ BROKEN = {
         ("sensors.yaml", "d400_color_optical_frame: 3", "lacks 'intrinsics'"),
         ("trans_matrix.yaml", "trans_matrix: []", "no rigid transformation from base_link"),
         ("aligned_depth.txt", None, "cannot read"),
+        ("groundtruth.txt", "4711.0 0 0 0 0 0 0 1", r"never nearer than 4705\.9.*bias of their own"),
     ],
     "vslam-lab": [
         ("rgb.csv", "ts_rgb_0 (ns),path_rgb_0\n1,a.png", "no column 'ts_depth_0"),
+        (
+            "rgb.csv",
+            "ts_rgb_0 (ns),path_rgb_0,ts_depth_0 (ns),path_depth_0\n1,../a.png,1,depth_0/0.png",
+            "does not lie in",
+        ),
         ("calibration.yaml", "cameras: []", "describes no camera 'rgb_0'"),
         ("groundtruth.csv", "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n1,2,3,4,5,6,x,8", "'x' is not a number"),
     ],
@@ -148,14 +147,6 @@ def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, at):
         sequence = open_sequence(tmp_path / "s")
         [sequence[i] for i in range(len(sequence))]
     assert "\n" not in str(caught.value) and str(tmp_path / "s") in str(caught.value)
-
-
-def test_files_outside_the_folder_are_refused(tmp_path):
-    WRITERS["vslam-lab"](tmp_path / "s", random_poses(2))
-    table = tmp_path / "s" / "rgb.csv"
-    table.write_text(table.read_text().replace("rgb_0/1.png", "../rgb_0/1.png"))
-    with pytest.raises(SequenceError, match="outside"):
-        open_sequence(tmp_path / "s")
 
 
 def test_every_catalogued_sequence_opens_once_it_lies_where_it_belongs(tmp_path):

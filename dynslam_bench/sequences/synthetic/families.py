@@ -363,8 +363,9 @@ def _add_partition(room: Parts, plan: Plan) -> None:
 
 
 _SCRIPTS: dict[str, Callable[[Draw, int, Plan], Cast]] = {
-    "balloon": _balloon, "box_obstructing": _box_obstructing, "box_aside": _box_aside, "placed": partial(_carried, True),
-    "removed": partial(_carried, False), "kidnapped": _kidnapped, "trolley": _trolley, "chair": _chair, "door": _door,
+    "balloon": _balloon, "box_obstructing": _box_obstructing, "box_aside": _box_aside,
+    "placed": partial(_carried, True), "removed": partial(_carried, False), "kidnapped": _kidnapped,
+    "trolley": _trolley, "chair": _chair, "door": _door,
 }  # fmt: skip
 
 OBJECTS = {f"objects_{name}": Variant(partial(build_objects, name), "high-dynamic") for name in _SCRIPTS}
