@@ -194,26 +194,18 @@ def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> tu
 
 
 def find_camera(
-    folder: Path,
-    choice: str | Path | Camera | None = None,
-    *,
-    stated: Camera | None = None,
-    otherwise: str | None = None,
+    folder: Path, *, stated: Camera | None = None, otherwise: str | None = None
 ) -> tuple[Camera, float | None]:
-    """The camera of a folder, and its nominal frame rate where a file states it.
+    """The camera of a folder for which none was chosen (`chosen_camera`), and its nominal frame rate where it is known.
 
     Args:
         folder: A sequence's folder.
-        choice: See `chosen_camera`; it wins over everything else.
         stated: What the folder's own calibration says; it wins over what its published name implies.
         otherwise: Name of the camera if nothing else states it, from the catalogue.
 
     Raises:
-        SequenceError: The choice is not understood, or nothing states the camera.
+        SequenceError: Nothing states the camera.
     """
-    chosen = chosen_camera(folder, choice)
-    if chosen is not None:
-        return chosen
     if stated is not None:
         return stated, None
     name = folder.resolve().name

@@ -17,7 +17,7 @@ from dynslam_bench.core.reading import read_lines, read_text
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.core.sanitise import inside, is_inside, without_passwords
 from dynslam_bench.sequences.archives import DISK_FULL, extract
-from dynslam_bench.sequences.cameras import find_camera
+from dynslam_bench.sequences.cameras import chosen_camera, find_camera
 from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of
 from dynslam_bench.sequences.readers.lists import Dropped
@@ -239,8 +239,8 @@ def verify(
     if folder is None or not folder.is_dir():
         open_sequence(name, data_root=data_root)  # says what is missing
         raise SequenceError(f"'{name}' is not a recorded sequence", "rendered sequences need no verification")
-    if (find_layout(folder) if entry is None else layout_of(entry.layout)) is TUM:
-        find_camera(folder, camera, otherwise=None if entry is None else entry.camera)
+    if (find_layout(folder) if entry is None else layout_of(entry.layout)) is TUM and not chosen_camera(folder, camera):
+        find_camera(folder, otherwise=None if entry is None else entry.camera)
     try:
         sequence = open_folder(folder, entry=entry, camera=camera)
     except DynslamError as error:

@@ -17,6 +17,7 @@ from dynslam_bench.sequences.readers.tables import (
     camera_on_body,
     camera_truth,
     floats,
+    frame_rate,
     nanoseconds,
     numbers,
     read_rows,
@@ -52,10 +53,8 @@ def read(folder: Path, fps: float | None = None) -> Contents:
     if min(width, height, fx, fy, factor) <= 0:
         raise SequenceError(f"{file}: size, focal lengths and depth_factor have to be above 0")
     camera = Camera(int(width), int(height), fx, fy, cx, cy, (k[0], k[1], k[2], k[3], 0.0), factor)
-    rate = sensor.get("rate_hz")
-    nominal = fps or (float(rate) if isinstance(rate, (int, float)) and 0 < rate < 1e6 else None)
     truth = _truth(folder / base / "state_groundtruth_estimate0" / "data.csv", sensor.get("T_BS"), where)
-    return Contents(colour, depth, truth=truth, camera=camera, fps=nominal)
+    return Contents(colour, depth, truth=truth, camera=camera, fps=fps or frame_rate(sensor.get("rate_hz")))
 
 
 def _images(folder: Path, name: str) -> ImageList:

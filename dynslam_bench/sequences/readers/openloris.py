@@ -66,7 +66,6 @@ def T_base_cam(path: Path) -> NDArray[np.float64]:
             CAMERA_FRAME,
         ):
             pose = np.array(numbers(entry.get("matrix"), 16, str(path))).reshape(4, 4)
-            if not se3.is_pose(pose, tolerance=1e-3):
-                break
-            return pose
+            if se3.is_pose(pose, tolerance=1e-3):
+                return pose
     raise SequenceError(f"{path} holds no rigid transformation from {BASE_FRAME} to {CAMERA_FRAME}")

@@ -47,11 +47,8 @@ def read(folder: Path, fps: float | None = None) -> Contents:
     tracked_frames = [i for i, pose in enumerate(poses) if pose is not None]
     tracked = np.array([poses[i] for i in tracked_frames])
     truth = Trajectory(to_seconds(stamps[tracked_frames]), tracked, stamps[tracked_frames]) if tracked_frames else None
-    dropped = (
-        f"ground truth: {len(poses) - len(tracked_frames)} of {len(poses)} poses lost"
-        if len(tracked_frames) < len(poses)
-        else ""
-    )
+    lost = len(poses) - len(tracked_frames)
+    dropped = f"ground truth: {lost} of {len(poses)} poses lost" if lost else ""
     paired = stamped(depth, stamps, str(folder))
     return Contents(colour, paired, True, truth, dropped, CAMERA, rate, missing_depth=MISSING)
 

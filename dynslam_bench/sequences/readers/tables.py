@@ -75,6 +75,11 @@ def numbers(value: object, count: int, where: str) -> list[float]:
     return values
 
 
+def frame_rate(value: object) -> float | None:
+    """A frame rate in Hz that a file states; None where the value is none."""
+    return float(value) if isinstance(value, (int, float)) and 0 < value < 1e6 else None
+
+
 def section(value: object, key: str, where: str) -> Any:
     """A mapping's value.
 

@@ -19,6 +19,7 @@ from dynslam_bench.sequences.readers.tables import (
     camera_truth,
     column,
     floats,
+    frame_rate,
     nanoseconds,
     numbers,
     read_rows,
@@ -56,8 +57,7 @@ def read(folder: Path, fps: float | None = None) -> Contents:
         T_body_cam = camera_on_body(stated.get("T_BS"), str(calibration))
         stamps_ns = nanoseconds([row[0] for row in picked], poses)
         truth = camera_truth(stamps_ns, floats([r[1:] for r in picked], poses), T_body_cam, str(poses))
-    rate = stated.get("fps")
-    nominal = fps or (float(rate) if isinstance(rate, (int, float)) and 0 < rate < 1e6 else None)
+    nominal = fps or frame_rate(stated.get("fps"))
     return Contents(colour, depth, True, truth, camera=_intrinsics(stated, calibration), fps=nominal)
 
 

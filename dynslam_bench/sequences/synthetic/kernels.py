@@ -49,6 +49,19 @@ def hit_box(
 
 
 @dividing_kernel
+def hit_sphere(
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, dd: float, r: float, best: float
+) -> float:
+    """Nearest hit with a sphere about the origin if it is before `best`, else that; dd is the direction's square."""
+    b = ox * dx + oy * dy + oz * dz
+    disc = b * b - dd * (ox * ox + oy * oy + oz * oz - r * r)
+    if disc < 0.0:
+        return best
+    t = (-b - math.sqrt(disc)) / dd
+    return t if NEAR_M < t < best else best
+
+
+@dividing_kernel
 def hit_round_cone(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, h: float, r1: float, r2: float, t_max: float
 ) -> float:
@@ -76,23 +89,10 @@ def hit_round_cone(
             # The side counts between the two circles of tangency.
             if NEAR_M < t and r1 * s <= z <= h + r2 * s and r1 - s * z > 0.0:
                 best = t
-    b = ox * dx + oy * dy + oz * dz
-    disc = b * b - dd * (ox * ox + oy * oy + oz * oz - r1 * r1)
-    if disc >= 0.0:
-        t = (-b - math.sqrt(disc)) / dd
-        if NEAR_M < t < best:
-            best = t
+    best = hit_sphere(ox, oy, oz, dx, dy, dz, dd, r1, best)
     if h > 0.0:
-        cz = oz - h
-        b = ox * dx + oy * dy + cz * dz
-        disc = b * b - dd * (ox * ox + oy * oy + cz * cz - r2 * r2)
-        if disc >= 0.0:
-            t = (-b - math.sqrt(disc)) / dd
-            if NEAR_M < t < best:
-                best = t
-    if best >= t_max:
-        return 1e30
-    return best
+        best = hit_sphere(ox, oy, oz - h, dx, dy, dz, dd, r2, best)
+    return 1e30 if best >= t_max else best
 
 
 # Ray casting over tiles, and antialiasing of edges.
@@ -372,21 +372,15 @@ def flow_field(
     width = hit.shape[1]
     for row in range(row0, row1):
         for column in range(width):
-            key = hit[row, column]
-            if key < 0:
-                flow[row, column, 0] = flow[row, column, 1] = np.nan
-                continue
-            p = key >> 3
+            flow[row, column, 0] = flow[row, column, 1] = np.nan
+            p = hit[row, column] >> 3
             z = depth[row, column]
             x, y = (column - cx) / fx * z, (row - cy) / fy * z
             w = motion[p, 8] * x + motion[p, 9] * y + motion[p, 10] * z + motion[p, 11]
-            if w <= NEAR_M:
-                flow[row, column, 0] = flow[row, column, 1] = np.nan
-                continue
-            u = motion[p, 0] * x + motion[p, 1] * y + motion[p, 2] * z + motion[p, 3]
-            v = motion[p, 4] * x + motion[p, 5] * y + motion[p, 6] * z + motion[p, 7]
-            flow[row, column, 0] = u / w * fx + cx - column
-            flow[row, column, 1] = v / w * fy + cy - row
+            if p >= 0 and w > NEAR_M:
+                u = motion[p, 0] * x + motion[p, 1] * y + motion[p, 2] * z + motion[p, 3]
+                v = motion[p, 4] * x + motion[p, 5] * y + motion[p, 6] * z + motion[p, 7]
+                flow[row, column, 0], flow[row, column, 1] = u / w * fx + cx - column, v / w * fy + cy - row
 
 
 @dividing_kernel
