@@ -23,7 +23,7 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.calibration import Quantity, calibrate
-from dynslam_bench.sequences.synthetic import loops as fast
+from dynslam_bench.sequences.synthetic import families
 from dynslam_bench.sequences.synthetic import open_synthetic
 
 SHARED = Path(__file__).resolve().parents[3] / "shared/data"
@@ -35,16 +35,16 @@ GLOBAL = ("walking_xyz", "walking_rpy", "walking_halfsphere", "walking_static", 
 def recordings(options: argparse.Namespace) -> Iterator[tuple[str, float | None, Sequence]]:
     """Name, true readout in ms where it is known, and the recording."""
     root = find_data_root(options.data_root)
-    optics = fast.OPTICS
+    optics = families.OPTICS
     for ms in options.readouts if "fast" in options.part else ():
         for kind in FAST:
             for scene in options.scenes:
-                fast.OPTICS = replace(optics, readout_s=1e-3 * ms)
+                families.OPTICS = replace(optics, readout_s=1e-3 * ms)
                 name = f"synthetic/fast_{kind}@{scene}?frames={options.frames}"
                 sequence = open_synthetic(name, root / f"readout_{ms:g}ms")
                 assert sequence.camera.readout_s == 1e-3 * ms  # the scene is built while the optics are these
                 yield name, ms, sequence
-    fast.OPTICS = optics
+    families.OPTICS = optics
     for kind in GLOBAL if "global" in options.part else ():
         for scene in options.scenes:
             name = f"synthetic/{kind}@{scene}?frames={options.frames}"

@@ -369,4 +369,4 @@ def _adapted(sensor: SensorSettings, world: Mapping[str, Any]) -> SensorSettings
 
 def default_threads() -> int:
     """Cores this process may use, at most four; ``NUMBA_NUM_THREADS`` lowers it."""
-    return min(4, numba.config.NUMBA_NUM_THREADS)
+    return min(4, int(numba.config.NUMBA_NUM_THREADS))
