@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import Number, Rule
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
@@ -43,10 +43,6 @@ class CorrelationFilter(Rule[CorrelationSettings]):
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
     provenance: Provenance = "inspired"
     stats_names = ("dropped", "tracked", "settled", "edges", "cut", "components")
-
-    def __init__(self, settings: CorrelationSettings) -> None:
-        super().__init__(settings)
-        self.reset()
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget all tracks."""
@@ -86,14 +82,9 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
         keep[rows[~static]] = False
-        counts: dict[str, Number] = {
-            "tracked": len(rows),
-            "settled": len(old),
-            "edges": total,
-            "cut": cut,
-            "components": components,
-        }
-        return self.verdict(keep, **counts)
+        return self.verdict(
+            keep, tracked=len(rows), settled=len(old), edges=total, cut=cut, components=components
+        )
 
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
         """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
@@ -217,9 +208,7 @@ def point_covariance(
 
 
 def _volume(points: NDArray[np.float64]) -> float:
-    if len(points) < 4:
-        return 0.0
     try:
         return float(ConvexHull(points, qhull_options="QJ").volume)
-    except QhullError:
+    except QhullError:  # too few points
         return 0.0

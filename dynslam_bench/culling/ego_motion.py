@@ -5,12 +5,12 @@ The test finds motion along epipolar lines, and any motion while the camera only
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
+from dynslam_bench.culling.regions import cell_index, cell_mean, coherent
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
@@ -24,11 +24,6 @@ ROLLING_SHUTTER_SHARE = 0.05
 """Added to the scale, as a share of a point's flow: a rolling shutter distorts fast motion."""
 CELL = 32
 """Side of the cells of `static_share`, pixels."""
-COHERENCE_CELL = 16
-COHERENCE_CELLS = 5
-"""Side of the neighbourhood of `coherent` in cells: 5 x 16 px."""
-MIN_FAILING = 3
-"""Fewest failing points of a moving region."""
 CORRELATION = 100.0
 """Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
 (the back end inflates the covariance of its poses for the same reason)."""
@@ -63,22 +58,6 @@ def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floa
     finite = np.isfinite(before).all(axis=1)
     share[finite] = kept[cell_index(before[finite], CELL, frame.gray.shape)[0]]
     return share
-
-
-def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
-    """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
-    rows, columns = -(-shape[0] // size), -(-shape[1] // size)
-    cell = np.floor(xy / size).astype(np.intp)
-    return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
-
-
-def cell_mean(
-    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int], *, empty: float = 0.0
-) -> NDArray[np.float64]:
-    """Mean of values ``[N]`` in each cell of a grid, `empty` where there are none; cells as in `cell_index`."""
-    count = np.bincount(cell, minlength=grid[0] * grid[1])
-    total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1])
-    return np.where(count > 0, total / np.maximum(count, 1), empty)
 
 
 def rigid_flow(
@@ -164,9 +143,7 @@ def _align(
 
     `information` ``[6, 6]`` is that of the prior, the start pose.
     """
-    pose = start
-    inverse_start = se3.inverse(start)
-    weight = prior_weight
+    pose, weight, inverse_start = start, prior_weight, se3.inverse(start)
     rolling_shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
     for number, scale in enumerate(TURN_PX + KERNEL_PX):
         moved = se3.transform(pose, points)
@@ -199,39 +176,6 @@ def _align(
     return pose if weight.sum() >= 0.5 * MIN_POINTS else None
 
 
-def coherent(
-    failing: NDArray[np.bool_],
-    tested: NDArray[np.bool_],
-    xy: NDArray[np.floating],
-    share: float,
-    size: tuple[int, ...],
-) -> NDArray[np.bool_]:
-    """The failing points of whose tested neighbours enough fail too: a lone failure is noise.
-
-    Args:
-        failing: bool ``[N]``, points that failed a test.
-        tested: bool ``[N]``, points that were tested.
-        xy: Raw pixels ``[N, 2]``.
-        share: Share of the tested points in the neighbourhood (80 px wide) that must fail; 0 keeps all failures.
-        size: Image height and width.
-
-    Returns:
-        Bool ``[N]``, a subset of `failing`.
-    """
-    if share <= 0 or not failing.any():
-        return failing
-    index, grid = cell_index(xy, COHERENCE_CELL, size)
-    neighbourhood = (COHERENCE_CELLS, COHERENCE_CELLS)
-
-    def around(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
-        counts = np.bincount(index, weights=flags, minlength=grid[0] * grid[1]).reshape(grid)
-        total = cv2.boxFilter(counts, -1, neighbourhood, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(total, np.float64).ravel()
-
-    failures, tests = around(failing & tested), around(tested)
-    return np.asarray(failing & (failures[index] >= MIN_FAILING) & (failures[index] >= share * tests[index]))
-
-
 class RigidMotionFilter(Rule[RigidMotionSettings]):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
@@ -245,13 +189,9 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
     provenance: Provenance = "assumed"
     stats_names = ("dropped", "tested", "failed")
 
-    def __init__(self, settings: RigidMotionSettings) -> None:
-        super().__init__(settings)
-        self._evidence: NDArray[np.float64] | None = None
-
-    def reset(self, camera: Camera) -> None:
+    def reset(self, camera: Camera | None = None) -> None:
         """Forget the evidence of the previous sequence."""
-        self._evidence = None
+        self._evidence: NDArray[np.float64] | None = None
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the points that have flow and depth."""

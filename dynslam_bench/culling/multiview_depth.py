@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.culling import Number, Rule
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.features.matching import CellGrid, as_words, search_in_radius
@@ -61,12 +61,9 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         region[seeds[:, 1], seeds[:, 0]] = 1
         mask = dilate(region.astype(bool), self.settings.dilation_px)
         dropped = inside(dilate(mask, self.settings.border_px), frame.keypoints.xy)
-        stats: dict[str, Number] = {
-            "references": len(references),
-            "seeds": len(seeds),
-            "mask_fraction": float(mask.mean()),
-        }
-        return self.verdict(~dropped, mask, **stats)
+        return self.verdict(
+            ~dropped, mask, references=len(references), seeds=len(seeds), mask_fraction=float(mask.mean())
+        )
 
     def _choose(self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]) -> list[KeyframeView]:
         """At most `references` keyframes by 0.7 normalised distance + 0.3 normalised rotation."""

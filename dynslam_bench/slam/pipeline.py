@@ -27,7 +27,7 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.ego_motion import refine_prediction
-from dynslam_bench.culling.guard import GuardSettings, restore_starved
+from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -359,6 +359,27 @@ class SlamPipeline:
         if self._camera is None:
             raise TrackerError(f"{method}() was called before reset()")
         return self._camera
+
+
+def restore_starved(verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings) -> tuple[NDArray[np.bool_], int]:
+    """The starvation guard: combine the filters' verdicts, without the last ones while too few features remain.
+
+    The first filter of a system is the most reliable (a semantic mask), the last one the least.
+
+    Args:
+        verdicts: bool ``[N]`` a filter, True = keep, in the order of application; one at least.
+        settings: How many features must remain.
+
+    Returns:
+        The combined keep mask ``[N]`` and how many verdicts were set aside; with all set aside every feature is kept.
+    """
+    total = len(verdicts[0])
+    needed = min(total, max(settings.min_features, int(np.ceil(settings.min_fraction * total))))
+    for undone in range(len(verdicts)):
+        keep = np.logical_and.reduce(verdicts[: len(verdicts) - undone])
+        if np.count_nonzero(keep) >= needed:
+            return keep, undone
+    return np.ones(total, dtype=bool), len(verdicts)
 
 
 def _undistorted(
