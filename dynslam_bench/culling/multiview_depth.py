@@ -261,7 +261,7 @@ def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float =
     expected = np.asarray(camera.project(points), dtype=np.float64)
     octave, before = (keypoints.octave.astype(np.int64) for keypoints in (frame.keypoints, previous.keypoints))
     for radius in (radius_px, 2 * radius_px):
-        match, _ = search_in_radius(
+        match = search_in_radius(
             CellGrid.of(xy, camera.width, camera.height),
             (xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors)),
             state.keep,

@@ -71,31 +71,25 @@ def _brute_force(
 
 
 def match_brute_force(
-    a: Words, b: Words, *, max_distance: int = 64, ratio: float = 0.8, mutual: bool = True
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    a: Words, b: Words, *, max_distance: int = 64, ratio: float = 0.8
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Nearest neighbours among all descriptors.
 
     Args:
         a: Descriptors ``[N, W]``.
         b: Descriptors ``[M, W]``.
         max_distance: Largest Hamming distance of a match.
-        ratio: The nearest must be nearer than `ratio` times the second nearest; 1 switches the test off.
-        mutual: Whether the match must be the nearest in both directions.
+        ratio: The nearest must be nearer than `ratio` times the second nearest, and nearest in both directions.
 
     Returns:
-        Indices into `a`, indices into `b` and distances of the matches, ordered by the first.
+        Indices into `a` and indices into `b` of the matches, ordered by the first.
     """
     if not len(a) or not len(b):
-        empty = np.zeros(0, np.int64)
-        return empty, empty, empty
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     best, first, second, back = _brute_force(np.ascontiguousarray(a), np.ascontiguousarray(b))
-    keep = first <= max_distance
-    if ratio < 1.0:
-        keep &= first < ratio * second
-    if mutual:
-        keep &= back[best] == np.arange(len(a))
-    index = np.flatnonzero(keep)
-    return index, best[index], first[index]
+    mutual = back[best] == np.arange(len(a))
+    index = np.flatnonzero((first <= max_distance) & (first < ratio * second) & mutual)
+    return index, best[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +129,7 @@ def _search(
     target: NDArray[np.float64], target_right: NDArray[np.float64], radius: NDArray[np.float64],
     octave_low: NDArray[np.int64], octave_high: NDArray[np.int64], target_words: Words,
     max_distance: int, ratio: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # fmt: skip
+) -> NDArray[np.int64]:  # fmt: skip
     count = target.shape[0]
     match = np.full(count, -1, np.int64)
     match_distance = np.full(count, FAR, np.int64)
@@ -172,11 +166,10 @@ def _search(
             if match_distance[rival] <= first:
                 continue
             match[rival] = -1
-            match_distance[rival] = FAR
         owner[best] = i
         match[i] = best
         match_distance[i] = first
-    return match, match_distance
+    return match
 
 
 def search_in_radius(
@@ -189,7 +182,7 @@ def search_in_radius(
     *,
     max_distance: int,
     ratio: float = 1.0,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> NDArray[np.int64]:
     """For each target position, the keypoint nearby whose descriptor is nearest; a keypoint is matched once at most.
 
     Args:
@@ -205,15 +198,11 @@ def search_in_radius(
         ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the test off.
 
     Returns:
-        int64 ``[M]`` matched keypoint or -1, and int64 ``[M]`` its distance. Where two targets claim one keypoint the
-        smaller distance wins, then the lower index.
+        int64 ``[M]``, matched keypoint or -1. Where two targets claim one keypoint the smaller distance wins, then the
+        lower index.
     """
-    xy, right, octave, words = keypoints
-    target, target_right, radius = targets
-    return _search(
-        grid.cell, grid.columns, grid.rows, grid.start, grid.order, xy, right, octave, words, free,
-        target, target_right, radius, octaves[0], octaves[1], target_words, max_distance, ratio,
-    )  # fmt: skip
+    cells = grid.cell, grid.columns, grid.rows, grid.start, grid.order
+    return _search(*cells, *keypoints, free, *targets, *octaves, target_words, max_distance, ratio)
 
 
 def rotation_consistent(

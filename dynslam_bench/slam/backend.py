@@ -199,7 +199,7 @@ class RgbdBackend:
             if first is not None and velocity is not None:
                 return self._restart(frame, raw, first, velocity, fit.count)
             result = self._update_map(frame, tracked, fit, root)
-        return replace(result, matches=len(fit.matches), inliers=fit.count, relocalised=initial.relocalised)
+        return replace(result, matches=len(fit.matches.point), inliers=fit.count, relocalised=initial.relocalised)
 
     def _initial_pose(
         self, frame: FrameBundle, raw: Observations, observations: Observations, last: TrackedFrame, prediction: Array

@@ -206,7 +206,7 @@ class SlamPipeline:
 
     def _dynamic_mask(self, instances: Instances, depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
         """The mask of the objects that are dynamic because of their class; None where there are no objects."""
-        if self._segmentation is None or not len(instances):
+        if self._segmentation is None or not instances.class_names:
             return None
         return dynamic_mask(instances, self._segmentation, depth)
 
@@ -270,8 +270,7 @@ class SlamPipeline:
 
     def _remember(self, frame: FrameBundle, static: CullingResult, result: BackendResult) -> None:
         tracked = result.state == "ok"
-        in_root_map = tracked and self._backend.state == "ok"  # predictions of a submap are of another world
-        pose = result.T_world_cam if in_root_map else None
+        pose = result.T_world_cam if tracked and self._backend.state == "ok" else None  # in the root map's world
         self._previous = PreviousFrame(frame, static.keep, static.image, pose)
         self._keyframe_due = not tracked or result.keyframe
 

@@ -156,7 +156,7 @@ def match_keyframe(world: Map, keyframe: int, observations: Observations) -> Mat
     """Match a frame's features to those of a keyframe that observe map points, by descriptor alone."""
     point = world.kf_point[keyframe, : world.kf_count[keyframe]]
     rows = np.flatnonzero(point >= 0)
-    feature, row, _ = match_brute_force(
+    feature, row = match_brute_force(
         observations.words, world.kf_words[keyframe, rows], max_distance=MAX_DISTANCE, ratio=RATIO
     )
     slots = point[rows[row]].astype(np.int64)

@@ -77,7 +77,7 @@ class RotationEstimate:
             observations: Its features.
             camera: Intrinsics without distortion.
         """
-        before, now, _ = match_brute_force(
+        before, now = match_brute_force(
             self.observations.words, observations.words, max_distance=MAX_DISTANCE, ratio=RATIO
         )
         if len(before) < CONNECTED:

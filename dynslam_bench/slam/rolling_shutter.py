@@ -11,16 +11,14 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.map import Array
 from dynslam_bench.slam.motion_model import MAX_GAP_S
-from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, right_coordinates, solve
-
-Array = NDArray[np.float64]
+from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, fit_pose, right_coordinates
 
 MIN_AGREEING = 0.9
 """Share of the inliers before compensation that must be inliers after it."""
@@ -132,7 +130,7 @@ class RollingShutter:
         exposed = regular if abs(dt - regular) <= STAMP_NOISE * usual else dt
         velocity = CameraVelocity.between(last.T_cam_world, pose, max(exposed, self._camera.readout_s))
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
-        refit = replace(fit, estimate=solve(self._camera, compensated, fit.matches, pose))
+        refit = fit_pose(self._camera, compensated, fit.matches, pose, fit.in_view)
         if refit.count < MIN_AGREEING * fit.count and not force:
             return observations, fit, None
         return compensated, refit, velocity
