@@ -82,9 +82,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
         keep[rows[~static]] = False
-        return self.verdict(
-            keep, tracked=len(rows), settled=len(old), edges=total, cut=cut, components=components
-        )
+        return self.verdict(keep, tracked=len(rows), settled=len(old), edges=total, cut=cut, components=components)
 
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
         """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""

@@ -18,7 +18,6 @@ ORB = FeatureSpec(
 FEATURES: Registry[FeatureSpec] = Registry("features", FeatureSpec, lambda: [ORB])
 
 
-
 def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor:
     """Load and construct the extractor that the settings name.
 
