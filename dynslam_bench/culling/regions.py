@@ -1,4 +1,4 @@
-"""Cells of the image, and the region rule: a moving object is a region in which enough points fail, not a lone point."""
+"""Cells of the image, and the region rule: in a moving region many points fail, and a lone failure is noise."""
 
 from __future__ import annotations
 

@@ -76,8 +76,7 @@ class KeyframePolicy:
             return True
         if inliers < s.tracked_share * established_points(world, reference):
             return True
-        newest = int(np.where(world.kf_alive, world.kf_id, -1).argmax())
-        view = share_in_view(world, newest, tracked.T_cam_world)
+        view = share_in_view(world, int(np.where(world.kf_alive, world.kf_id, -1).argmax()), tracked.T_cam_world)
         return view < VIEW_SHARE or (view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers)
 
 

@@ -42,8 +42,7 @@ class CameraVelocity:
     def between(cls, before: Array, now: Array, seconds: float) -> CameraVelocity:
         """From two world-to-camera poses ``[4, 4]`` so many seconds apart; in the camera frame of the later one."""
         angular = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).as_rotvec() / seconds
-        back = se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]
-        return cls(now[:3, :3] @ back / seconds, angular)
+        return cls(now[:3, :3] @ (se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]) / seconds, angular)
 
 
 def compensate_rolling_shutter(observations: Observations, camera: Camera, velocity: CameraVelocity) -> Observations:
@@ -61,8 +60,8 @@ def compensate_rolling_shutter(observations: Observations, camera: Camera, veloc
     """
     if not len(observations):
         return observations
-    row = observations.keypoints.xy[:, 1].astype(np.float64)
-    late = (((row + 0.5) / camera.height - 0.5) * camera.readout_s)[:, None]
+    row = observations.keypoints.xy[:, 1:].astype(np.float64)
+    late = ((row + 0.5) / camera.height - 0.5) * camera.readout_s
     has_depth = observations.z > 0
     points = camera.unproject(observations.xy, np.where(has_depth, observations.z, 1.0))
     points = points - np.where(has_depth[:, None], late, 0.0) * velocity.linear
