@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result, usable_points
-from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, new_state, run_phase
+from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, run_phase
 from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
@@ -115,7 +115,10 @@ class SparseDaisyFlow:
         good &= usable_points(ends, target.gray.shape)
         if settings.forward_backward_px > 0:
             rows = np.flatnonzero(good)
-            error = self._forward_backward_error(points[rows], ends[rows], labels[rows], pair)
+            inverse, window = -labels[rows], Window(1, settings.refinement_window_px // 2, margin=3, warps=1)
+            back = target.framed, reference.framed, window, np.empty(len(rows), np.float32)
+            self.workers.run(similarity_lucas_kanade, 0, len(rows), ends[rows], inverse, *back)
+            error = np.hypot(*(ends[rows] + inverse[:, :2] - points[rows]).T)
             good[rows] = error <= settings.forward_backward_px
         valid, share = np.zeros(len(xy), np.bool_), np.ones(len(xy), np.float32)
         xy[usable], valid[usable], share[usable] = ends, good, cost / pair.tables.ceiling
@@ -170,8 +173,9 @@ class SparseDaisyFlow:
         extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32)
         lower, upper = start[:, 0] - extent, start[:, 0] + extent
         plan = make_plan(settings)
-        state = new_state(n, plan.population, lower, upper, pair.tables.ceiling)
-        state.flames[:, :] = start
+        costs = np.full((n, plan.population), pair.tables.ceiling, np.int64)  # nothing has been evaluated
+        flames = np.repeat(start, plan.population, axis=1)
+        state = SearchState(np.zeros_like(flames), flames, costs, np.zeros(n, np.int64), lower, upper)
         candidates = start
         if STRATEGIES[settings.search].shrink == 0:  # nothing is drawn: zero flow is tried beside the prediction
             zero = np.where(start.any(axis=2, keepdims=True), np.float32(0), np.float32(np.nan))
@@ -186,8 +190,8 @@ class SparseDaisyFlow:
                 candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
                 sources = (points, best, label_turns(best), neighbours, motions)
                 run(transported_labels, 0, n, *sources, lower, upper, candidates)
-            costs = (described, pair.target.side, pair.tables)
-            run(run_phase, 0, n, *costs, state, candidates, end, phase, np.uint64(seed), *plan.options)
+            images = described, pair.target.side, pair.tables
+            run(run_phase, 0, n, *images, state, candidates, end, phase, np.uint64(seed), *plan.options)
         return state
 
     def refine_together(
@@ -240,14 +244,3 @@ class SparseDaisyFlow:
         window = Window(1, self.settings.refinement_window_px // 2, margin=2, warps=2)
         self.workers.run(*arguments, reference.framed, target.framed, window, correlation)
         return correlation
-
-    def _forward_backward_error(
-        self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
-    ) -> NDArray[np.float32]:
-        """Distance in pixels between each point and the end of its inverse label, refined in the other direction."""
-        inverse, correlation = -labels, np.empty(len(points), dtype=np.float32)
-        window = Window(1, self.settings.refinement_window_px // 2, margin=3, warps=1)
-        images = pair.target.framed, pair.reference.framed
-        self.workers.run(similarity_lucas_kanade, 0, len(xy), xy, inverse, *images, window, correlation)
-        distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
-        return distance

@@ -40,7 +40,7 @@ from dynslam_bench.slam.place_recognition import (
     verify_place,
 )
 from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import InitialPose, Matches, Observations, weakly_connected
+from dynslam_bench.slam.tracking import InitialPose, Observations, weakly_connected
 
 CANDIDATES = 3
 """Best-ranked keyframes that are matched feature by feature."""
