@@ -62,8 +62,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         rows = np.flatnonzero(observed.any(axis=0))
         if len(rows) < MIN_POINTS:
             return self.verdict(keep)
-        age = len(past) - observed[::-1, rows].argmax(axis=0)
-        settled = age >= min(self.settings.settled, len(past))
+        settled = len(past) - observed[::-1, rows].argmax(axis=0) >= min(self.settings.settled, len(past))
         now, past, observed, xy = now[rows], past[:, rows], observed[:, rows], frame.xy[rows]
         old = np.flatnonzero(settled)
         if len(old) < MIN_POINTS:
@@ -117,8 +116,9 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         points[valid, :3] = camera.unproject(xy[valid], z[valid])
         variance = depth_variance(depth, raw[valid])
         pixels = np.asarray(xy[valid], np.float64)
-        covariance = point_covariance(pixels, z[valid], variance, camera, self.settings.pixel_sigma)
-        points[valid, 3:] = covariance.reshape(-1, 9)
+        points[valid, 3:] = point_covariance(pixels, z[valid], variance, camera, self.settings.pixel_sigma).reshape(
+            -1, 9
+        )
         return points
 
     def _agree(

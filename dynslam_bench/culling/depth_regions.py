@@ -176,7 +176,6 @@ def covered_blocks(
     edge = cv2.dilate(z, square) - cv2.erode(z, square) > settings.edge_m
     count, label = cv2.connectedComponents((valid & ~edge).view(np.uint8), connectivity=4)
     size = np.bincount(label.ravel(), minlength=count)
-    covered = np.bincount(label[mask], minlength=count)
-    whole = covered >= np.maximum(settings.min_share * size, 1)
+    whole = np.bincount(label[mask], minlength=count) >= np.maximum(settings.min_share * size, 1)
     whole[0] = False  # label 0: edges and pixels without depth
     return np.asarray(whole[label]), int(np.count_nonzero(whole))

@@ -50,13 +50,10 @@ def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floa
     Returns:
         Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there were none.
     """
-    share = np.ones(len(before))
-    if state.previous is None or state.previous_keep is None:
-        return share
-    previous_cell, grid = cell_index(state.previous.keypoints.xy, CELL, frame.gray.shape)
-    kept = cell_mean(state.previous_keep, previous_cell, grid, empty=1.0)
-    finite = np.isfinite(before).all(axis=1)
-    share[finite] = kept[cell_index(before[finite], CELL, frame.gray.shape)[0]]
+    share, finite, shape = np.ones(len(before)), np.isfinite(before).all(axis=1), frame.gray.shape
+    if state.previous is not None and state.previous_keep is not None:
+        kept = cell_mean(state.previous_keep, *cell_index(state.previous.keypoints.xy, CELL, shape), empty=1.0)
+        share[finite] = kept[cell_index(before[finite], CELL, shape)[0]]
     return share
 
 
@@ -205,8 +202,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         failed = coherent(failed, tested, xy, self.settings.min_share, shape)
         evidence = failed.astype(np.float64)
         if self._evidence is not None:
-            origin, _ = cell_index(flow.xy[flow.valid], CELL // 2, shape)
-            evidence[flow.valid] += MEMORY * self._evidence[origin]
+            evidence[flow.valid] += MEMORY * self._evidence[cell_index(flow.xy[flow.valid], CELL // 2, shape)[0]]
         evidence = evidence.clip(0, 1)
         self._evidence = cell_mean(evidence, *cell_index(xy, CELL // 2, shape))
         return self.verdict(evidence < 0.5, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
@@ -214,8 +210,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
     def _fails(self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
         assert state.flow is not None and state.previous is not None
         moved, expected = rigid_flow(frame, state, tested)
-        before = state.camera.undistort_points(state.flow.xy[tested])
-        distance = np.linalg.norm(expected - before, axis=1)
+        distance = np.linalg.norm(expected - state.camera.undistort_points(state.flow.xy[tested]), axis=1)
         explained = np.linalg.norm(expected - frame.xy[tested], axis=1)
         limit_px = self.settings.threshold_px + THRESHOLD_SHARE * explained
         measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])

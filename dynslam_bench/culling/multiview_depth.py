@@ -78,14 +78,14 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         self, views: list[KeyframeView], depth: NDArray[np.float32], pose: NDArray[np.float64], camera: Camera
     ) -> NDArray[np.int64]:
         """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
-        world, from_reference = [], []
+        world, from_view = [], []
         for view in views:
             usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
             world.append(se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable])))
-            from_reference.append(world[-1] - view.T_world_cam[:3, 3])
-        points = np.concatenate(world)
-        from_frame = points - pose[:3, 3]
-        cosine = _cosine(np.concatenate(from_reference), from_frame)
+            from_view.append(world[-1] - view.T_world_cam[:3, 3])
+        from_frame, from_reference = np.concatenate(world) - pose[:3, 3], np.concatenate(from_view)
+        norms = np.linalg.norm(from_reference, axis=1) * np.linalg.norm(from_frame, axis=1)
+        cosine = (from_reference * from_frame).sum(axis=1) / np.maximum(norms, 1e-12)
         local = from_frame @ pose[:3, :3]
         pixels = np.full((len(local), 2), -1.0)
         ahead = local[:, 2] > 0.1
@@ -97,12 +97,6 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         centre = np.ceil(pixels[visible]).astype(np.int64)
         seeds = centre[hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)]
         return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
-
-
-def _cosine(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cosines ``[N]`` of the angles between vectors ``[N, 3]``."""
-    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-    return np.asarray((first * second).sum(axis=1) / np.maximum(norms, 1e-12))
 
 
 def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -274,7 +268,6 @@ def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float =
         if len(now) >= MIN_MATCHES:
             ends = np.full((len(xy), 2), np.nan, np.float32)
             ends[now] = previous.keypoints.xy[rows_matched]
-            valid = np.isin(np.arange(len(xy)), now)
-            matches = FlowResult(ends, valid, np.zeros(len(xy), np.float32))
+            matches = FlowResult(ends, np.isfinite(ends[:, 0]), np.zeros(len(xy), np.float32))
             return refine_prediction(frame, replace(state, flow=matches))
     return state.T_world_pred

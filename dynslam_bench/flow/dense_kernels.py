@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.flow.matching_cost import CostTables, appearance, descriptor_distance, gather, quantised, rotate
+from dynslam_bench.flow.matching_cost import CostTables, appearance, describe_once, descriptor_distance, quantised
 from dynslam_bench.flow.orientation_maps import Side
 from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs
 
@@ -262,7 +262,6 @@ def raw_costs(
     """
     (u, v, s, theta), (left, top, wide, high), (reference, target, tables) = label, patch, sides
     height, width = target.gray.shape
-    turned = np.empty((4, 136), dtype=np.int32)
     si, ti = quantised(s, theta)
     scale = np.float32(np.exp2(s))
     a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
@@ -272,8 +271,7 @@ def raw_costs(
             px, py = np.float32(2 * (left + x)) + np.float32(0.5), np.float32(2 * (top + y)) + np.float32(0.5)
             mine = (ti * size + k) * 136
             if not described[ti]:
-                gather(px, py, reference, tables, turned)
-                rotate(turned, ti, descriptors, mine)
+                describe_once(px, py, ti, reference, tables, descriptors, mine)
             dx, dy = px - centre[0], py - centre[1]
             tx, ty = centre[0] + u + a * dx - b * dy, centre[1] + v + b * dx + a * dy
             cost = np.int64(tables.ceiling)

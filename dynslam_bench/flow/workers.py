@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 
@@ -33,7 +34,7 @@ class Workers:
         The kernels release the GIL and write disjoint rows, so that the result is the same for every number of threads.
         """
         bounds = [start + (stop - start) * part // self.threads for part in range(self.threads + 1)]
-        futures = [self._pool.submit(kernel, *part, *arguments) for part in zip(bounds, bounds[1:-1], strict=False)]
+        futures = [self._pool.submit(kernel, *part, *arguments) for part in pairwise(bounds[:-1])]
         kernel(*bounds[-2:], *arguments)
         for future in futures:
             future.result()

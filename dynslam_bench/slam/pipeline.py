@@ -20,7 +20,6 @@ from dynslam_bench.contracts.checks import check_frame
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
-from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
 from dynslam_bench.core.errors import TrackerError
@@ -191,7 +190,8 @@ class SlamPipeline:
         if self._masks is not None:
             with clock("segmentation"):
                 instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
-                mask = self._dynamic_mask(instances, depth)
+                if self._segmentation is not None and instances.class_names:
+                    mask = dynamic_mask(instances, self._segmentation, depth)
         with clock("features"):
             keypoints = self._extract(gray, mask)
         xy, z = _undistorted(keypoints, depth, camera)
@@ -203,12 +203,6 @@ class SlamPipeline:
         timings = clock.seconds | dict(result.timings)
         stats = self._stats(bundle, state, static, result)
         return TrackResult(result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep)
-
-    def _dynamic_mask(self, instances: Instances, depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
-        """The mask of the objects that are dynamic because of their class; None where there are no objects."""
-        if self._segmentation is None or not instances.class_names:
-            return None
-        return dynamic_mask(instances, self._segmentation, depth)
 
     def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> Keypoints:
         """Keypoints, enough of them outside the dynamic mask."""
@@ -246,12 +240,11 @@ class SlamPipeline:
             state.keep = state.keep & verdict.keep
             verdicts.append(verdict)
             stats |= {f"{dynamic_filter.name}_{key}": value for key, value in verdict.stats.items()}
-        keep, undone, weight = np.ones(len(frame.xy), bool), 0, np.ones(len(frame.xy), np.float32)
-        if verdicts:
-            keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard)
+        keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard, len(frame.xy))
         used = verdicts[: len(verdicts) - undone]
-        if used:
-            weight = np.prod([verdict.weight for verdict in used], axis=0, dtype=np.float32)
+        weight = np.ones(len(frame.xy), np.float32)
+        for verdict in used:
+            weight *= verdict.weight
         masks = [verdict.mask for verdict in used if verdict.mask is not None]
         mask = np.logical_or.reduce(masks) if masks else None
         return CullingResult(keep, weight, mask, stats | {"guard_undone": float(undone)}, image)
@@ -360,19 +353,21 @@ class SlamPipeline:
         return self._camera
 
 
-def restore_starved(verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings) -> tuple[NDArray[np.bool_], int]:
+def restore_starved(
+    verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings, total: int
+) -> tuple[NDArray[np.bool_], int]:
     """The starvation guard: combine the filters' verdicts, without the last ones while too few features remain.
 
     The first filter of a system is the most reliable (a semantic mask), the last one the least.
 
     Args:
-        verdicts: bool ``[N]`` a filter, True = keep, in the order of application; one at least.
+        verdicts: bool ``[N]`` a filter, True = keep, in the order of application.
         settings: How many features must remain.
+        total: N.
 
     Returns:
         The combined keep mask ``[N]`` and how many verdicts were set aside; with all set aside every feature is kept.
     """
-    total = len(verdicts[0])
     needed = min(total, max(settings.min_features, int(np.ceil(settings.min_fraction * total))))
     for undone in range(len(verdicts)):
         keep = np.logical_and.reduce(verdicts[: len(verdicts) - undone])

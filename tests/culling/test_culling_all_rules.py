@@ -68,7 +68,7 @@ def test_guard_undoes_the_least_reliable_verdict_first() -> None:
         ([nothing, nothing], ~nothing, 2),
         ([semantic], semantic, 0),
     ):
-        keep, count = restore_starved(verdicts, settings)
+        keep, count = restore_starved(verdicts, settings, 100)
         assert count == undone
         np.testing.assert_array_equal(keep, expected)
-    assert restore_starved([semantic], GuardSettings(min_features=0, min_fraction=0.8))[1] == 1
+    assert restore_starved([semantic], GuardSettings(min_features=0, min_fraction=0.8), 100)[1] == 1
