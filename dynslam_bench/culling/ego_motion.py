@@ -71,8 +71,8 @@ def rigid_flow(
         Points ``[K, 3]`` in the previous camera's frame, metres, and their undistorted pixels ``[K, 2]``.
     """
     assert state.T_world_prev is not None and state.T_world_pred is not None
-    T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-    moved = se3.transform(T_prev_cur, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+    points = state.camera.unproject(frame.xy[rows], frame.z[rows])
+    moved = se3.transform(se3.inverse(state.T_world_prev) @ state.T_world_pred, points)
     return moved, state.camera.project(moved)
 
 
@@ -98,13 +98,13 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     use = flow.valid & state.keep & (frame.z > 0)
     if np.count_nonzero(use) < MIN_POINTS:
         return state.T_world_pred
-    start, prior = np.eye(4), None
+    start, prior, share = np.eye(4), None, static_share(frame, state, flow.xy[use])
+    points = state.camera.unproject(frame.xy[use], frame.z[use])
+    before = state.camera.undistort_points(flow.xy[use])
     if state.T_world_pred is not None:
         start = se3.inverse(state.T_world_prev) @ state.T_world_pred
         prior = prior_information(state, start)
-    points = state.camera.unproject(frame.xy[use], frame.z[use])
-    before = state.camera.undistort_points(flow.xy[use])
-    T_prev_cur = _align(points, before, state.camera, start, static_share(frame, state, flow.xy[use]), prior)
+    T_prev_cur = _align(points, before, state.camera, start, share, prior)
     return state.T_world_pred if T_prev_cur is None else state.T_world_prev @ T_prev_cur
 
 
@@ -140,8 +140,8 @@ def _align(
 
     `information` ``[6, 6]`` is that of the prior, the start pose.
     """
-    pose, weight, inverse_start = start, prior_weight, se3.inverse(start)
     rolling_shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
+    pose, weight, inverse_start = start, prior_weight, se3.inverse(start)
     for number, scale in enumerate(TURN_PX + KERNEL_PX):
         moved = se3.transform(pose, points)
         z = np.maximum(moved[:, 2], 0.05)

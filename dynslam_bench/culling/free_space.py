@@ -45,8 +45,9 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         xy, rows = frame.keypoints.xy, np.flatnonzero(frame.z > 0)
         if state.T_world_pred is None or not keyframes or not len(rows):
             return self.verdict(np.ones(len(xy), dtype=bool))
+        poses = np.stack([pose for pose, _ in keyframes])
         world = se3.transform(state.T_world_pred, camera.unproject(frame.xy[rows], frame.z[rows]))
-        local = np.stack([se3.transform(se3.inverse(pose), world) for pose, _ in keyframes])
+        local = np.stack(list(map(se3.transform, se3.inverse(poses), [world] * len(poses))))
         ahead = local[..., 2] > 0.1
         pixels = np.full((*ahead.shape, 2), -1.0)
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))

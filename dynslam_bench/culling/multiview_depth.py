@@ -14,7 +14,7 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
-from dynslam_bench.features.matching import CellGrid, as_words, search_in_radius
+from dynslam_bench.features.matching import CellGrid, Features, as_words, search_in_radius
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera, inside
 from dynslam_bench.segmentation.postprocess import dilate
@@ -254,16 +254,11 @@ def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float =
     rows, points = rows[points[:, 2] > 0.1], points[points[:, 2] > 0.1]
     expected = np.asarray(camera.project(points), dtype=np.float64)
     octave, before = (keypoints.octave.astype(np.int64) for keypoints in (frame.keypoints, previous.keypoints))
+    grid, words = CellGrid.of(xy, camera.width, camera.height), as_words(previous.keypoints.descriptors[rows])
+    features = Features(xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors), grid)
     for radius in (radius_px, 2 * radius_px):
-        match = search_in_radius(
-            CellGrid.of(xy, camera.width, camera.height),
-            (xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors)),
-            state.keep,
-            (expected, np.full(len(rows), np.nan), np.full(len(rows), radius)),
-            (before[rows] - 1, before[rows] + 1),
-            as_words(previous.keypoints.descriptors[rows]),
-            max_distance=MAX_DISTANCE,
-        )
+        windows = expected, np.full(len(rows), np.nan), np.full(len(rows), radius)
+        match = search_in_radius(features, state.keep, windows, before[rows], words, max_distance=MAX_DISTANCE)
         rows_matched, now = rows[match >= 0], match[match >= 0]
         if len(now) >= MIN_MATCHES:
             ends = np.full((len(xy), 2), np.nan, np.float32)

@@ -7,6 +7,7 @@ All functions are pure and deterministic; ties are broken by the lower index.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +122,24 @@ class CellGrid:
         return cls(cell, columns, rows, start, np.argsort(index, kind="stable").astype(np.int64))
 
 
+class Features(NamedTuple):
+    """Features that are searched, as the back end's `Observations` are.
+
+    Attributes:
+        xy: Undistorted pixels ``[N, 2]``.
+        right: Right coordinates ``[N]``, NaN without depth.
+        octave: int64 ``[N]``.
+        words: Descriptors ``[N, W]``.
+        grid: Cells of the features.
+    """
+
+    xy: NDArray[np.float64]
+    right: NDArray[np.float64]
+    octave: NDArray[np.int64]
+    words: Words
+    grid: CellGrid
+
+
 @kernel
 def _search(
     cell: float, columns: int, rows: int, start: NDArray[np.int64], order: NDArray[np.int64],
@@ -173,36 +192,36 @@ def _search(
 
 
 def search_in_radius(
-    grid: CellGrid,
-    keypoints: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], Words],
+    features: Any,
     free: NDArray[np.bool_],
-    targets: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    octaves: tuple[NDArray[np.int64], NDArray[np.int64]],
-    target_words: Words,
+    windows: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    octave: NDArray[np.int64],
+    words: Words,
     *,
     max_distance: int,
     ratio: float = 1.0,
 ) -> NDArray[np.int64]:
-    """For each target position, the keypoint nearby whose descriptor is nearest; a keypoint is matched once at most.
+    """For each target, the feature nearby whose descriptor is nearest; a feature is matched once at most.
 
     Args:
-        grid: The keypoints' cells.
-        keypoints: Undistorted pixels ``[N, 2]``, right coordinates ``[N]`` (NaN without depth), octaves ``[N]`` and
-            descriptors ``[N, W]``.
-        free: bool ``[N]``, keypoints that may be matched.
-        targets: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared) and half sides of
+        features: `Features`, or anything with their attributes.
+        free: bool ``[N]``, features that may be matched.
+        windows: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared) and half sides of
             the search windows ``[M]``, pixels.
-        octaves: Lowest and highest octave allowed for each target ``[M]``.
-        target_words: Descriptors of the targets ``[M, W]``.
+        octave: Expected octaves ``[M]``; the feature's may be one off.
+        words: Descriptors of the targets ``[M, W]``.
         max_distance: Largest Hamming distance of a match.
         ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the test off.
 
     Returns:
-        int64 ``[M]``, matched keypoint or -1. Where two targets claim one keypoint the smaller distance wins, then the
+        int64 ``[M]``, matched feature or -1. Where two targets claim one feature the smaller distance wins, then the
         lower index.
     """
-    cells = grid.cell, grid.columns, grid.rows, grid.start, grid.order
-    return _search(*cells, *keypoints, free, *targets, *octaves, target_words, max_distance, ratio)
+    f, grid = features, features.grid
+    return _search(
+        grid.cell, grid.columns, grid.rows, grid.start, grid.order, f.xy, f.right, f.octave, f.words, free,
+        *windows, octave - 1, octave + 1, words, max_distance, ratio,
+    )  # fmt: skip
 
 
 def rotation_consistent(

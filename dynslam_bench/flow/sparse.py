@@ -112,7 +112,6 @@ class SparseDaisyFlow:
         if settings.refinement == "lucas-kanade":
             good &= self.refine_together(points, labels, neighbours, pair) > settings.min_correlation
         ends = points + labels[:, :2]
-        good &= usable_points(ends, target.gray.shape)
         if settings.forward_backward_px > 0:
             rows = np.flatnonzero(good)
             inverse, window = -labels[rows], Window(1, settings.refinement_window_px // 2, margin=3, warps=1)
@@ -120,6 +119,7 @@ class SparseDaisyFlow:
             self.workers.run(similarity_lucas_kanade, 0, len(rows), ends[rows], inverse, *back)
             error = np.hypot(*(ends[rows] + inverse[:, :2] - points[rows]).T)
             good[rows] = error <= settings.forward_backward_px
+        good &= usable_points(ends, target.gray.shape)
         valid, share = np.zeros(len(xy), np.bool_), np.ones(len(xy), np.float32)
         xy[usable], valid[usable], share[usable] = ends, good, cost / pair.tables.ceiling
         return FlowResult(xy, valid, share, flow_stats(len(xy), int(good.sum()), int(evaluations.sum())))

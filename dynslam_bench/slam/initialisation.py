@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle
-from dynslam_bench.features.matching import rotation_consistent
+from dynslam_bench.features.matching import rotation_consistent, search_in_radius
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
@@ -131,7 +131,7 @@ def match_views(first: Observations, second: Observations, expected: Array, radi
     """
     windows = expected, np.full(len(first), np.nan), np.full(len(first), radius_px)
     free = np.ones(len(second), bool)
-    feature = second.search(free, windows, first.octave, first.words, max_distance=MAX_DISTANCE, ratio=RATIO)
+    feature = search_in_radius(second, free, windows, first.octave, first.words, max_distance=MAX_DISTANCE, ratio=RATIO)
     rows = np.flatnonzero(feature >= 0)
     rows = rows[rotation_consistent(first.angle[rows], second.angle[feature[rows]])]
     return np.stack([rows, feature[rows]], axis=1)

@@ -90,7 +90,8 @@ def established_points(world: Map, keyframe: int) -> int:
 def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
     """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
     points = world.kf_point[keyframe]
-    _, _, inside = world.in_image(T_cam_world, world.position[points[points >= 0]])
+    position = world.position[points[points >= 0]]
+    _, inside = world.camera.view(position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
     return float(np.mean(inside)) if len(inside) else 1.0
 
 

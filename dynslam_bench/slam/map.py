@@ -341,16 +341,6 @@ class Map:
             float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2, len(self.scales),
         )  # fmt: skip
 
-    def in_image(
-        self, T_cam_world: Array, position: Array, margin_px: float = 0.0
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """World points ``[N, 3]`` in a camera's frame, their pixels, and which lie in its image or near it."""
-        local, camera = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3], self.camera
-        ahead = local[:, 2] > 0.05
-        uv = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-        size = camera.width + margin_px, camera.height + margin_px
-        return local, uv, ahead & (uv >= -margin_px).all(axis=1) & (uv < size).all(axis=1)
-
     def redundancy(self, slot: int, close_m: float) -> tuple[int, int]:
         """A keyframe's close points, and how many of them three other keyframes see, at most one octave coarser.
 

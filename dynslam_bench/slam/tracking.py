@@ -84,31 +84,6 @@ class Observations:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def search(
-        self,
-        free: NDArray[np.bool_],
-        windows: tuple[Array, Array, Array],
-        octave: Slots,
-        words: Words,
-        *,
-        max_distance: int,
-        ratio: float,
-    ) -> Slots:
-        """The feature, at most one octave off, whose descriptor is nearest to each of M targets; -1 where none.
-
-        Args:
-            free: bool ``[N]``, features that may be matched.
-            windows: Pixels ``[M, 2]``, right coordinates ``[M]`` and half sides of the search windows ``[M]``.
-            octave: Of each target ``[M]``.
-            words: Descriptors of the targets ``[M, W]``.
-            max_distance: Largest Hamming distance.
-            ratio: Nearest over second nearest.
-        """
-        features, octaves = (self.xy, self.right, self.octave, self.words), (octave - 1, octave + 1)
-        return search_in_radius(
-            self.grid, features, free, windows, octaves, words, max_distance=max_distance, ratio=ratio
-        )
-
 
 def observe(
     frame: FrameBundle,
@@ -314,11 +289,13 @@ def match_last_frame(
     if len(unmapped):
         local = camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
         position[~mapped] = se3.transform(se3.inverse(last.T_cam_world), local)
-    local, uv, inside = world.in_image(T_cam_world, position, MARGIN_PX)
+    local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    uv, inside = camera.view(local, MARGIN_PX)
     rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
     octave = last.observations.octave[rows]
     right = uv[:, 0] - camera.fx * camera.baseline_m / depth
-    feature = observations.search(
+    feature = search_in_radius(
+        observations,
         np.ones(len(observations.xy), bool),
         (uv, right, radius_px * world.scales[octave]),
         octave,
@@ -363,7 +340,8 @@ def match_map(
     rest = ~matched[points]
     radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
     wanted = points[rest]
-    feature = observations.search(
+    feature = search_in_radius(
+        observations,
         free,
         (uv[rest], right[rest], radius[rest]),
         octave[rest],

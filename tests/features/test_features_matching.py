@@ -6,6 +6,7 @@ import pytest
 
 from dynslam_bench.features.matching import (
     CellGrid,
+    Features,
     as_words,
     match_brute_force,
     rotation_consistent,
@@ -87,7 +88,7 @@ def test_search_in_radius_against_plain_search():
     free = rng.random(n) < 0.8
     grid = CellGrid.of(xy, 640, 480)
     match = search_in_radius(
-        grid, (xy, right, octave, words), free, (target, target_right, radius), (low, low + 2), target_words,
+        Features(xy, right, octave, words, grid), free, (target, target_right, radius), low + 1, target_words,
         max_distance=30,
     )  # fmt: skip
     used = match[match >= 0]
