@@ -54,9 +54,11 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         column, row = np.moveaxis(np.rint(pixels.clip(-1, 1e6)).astype(np.intp), -1, 0)
         observed = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         at = row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
-        depths = [depth for _, depth in keyframes]  # kept beside the smallest depths, so that no id is used again
-        self._smallest = {id(z): self._smallest.get(id(z)) or (z, cv2.erode(z, PATCH)) for z in depths}
-        surface = np.stack([self._smallest[id(z)][1][r, c] for z, r, c in zip(depths, *at, strict=True)])
+        surface, smallest = np.empty(ahead.shape, np.float32), {}
+        for number, (_, depth) in enumerate(keyframes):  # images are stored too, so that no id is used again
+            smallest[id(depth)] = self._smallest.get(id(depth)) or (depth, cv2.erode(depth, PATCH))
+            surface[number] = smallest[id(depth)][1][at[0][number], at[1][number]]
+        self._smallest = smallest
         limit = np.maximum(self.settings.threshold_m, self.settings.threshold_sigma * depth_sigma(surface))
         violated = observed & (surface > 0) & (surface - local[..., 2] > limit)
         votes, tested = np.zeros(len(xy), dtype=int), np.zeros(len(xy), dtype=bool)

@@ -22,7 +22,7 @@ from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats,
 from dynslam_bench.flow.dense_kernels import Superpixels, aggregate_and_choose, spread_labels, superpixels
 from dynslam_bench.flow.matching_cost import MAX_COST, cost_tables
 from dynslam_bench.flow.orientation_maps import OrientationMaps
-from dynslam_bench.flow.propagation import labels_as_seen
+from dynslam_bench.flow.propagation import labels_as_seen, nearest
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
 from dynslam_bench.flow.sparse import SparseDaisyFlow
@@ -165,7 +165,7 @@ class _RegionLabels:
         self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
         pair, centres = self._pair, self.centres
-        neighbours = sparse.nearest(centres)
+        neighbours = nearest(centres, sparse.workers.run)
         described = sparse.describe(pair.reference, centres, pair.tables)
         state = sparse.search(described, pair, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])

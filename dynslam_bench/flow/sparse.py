@@ -30,7 +30,7 @@ from dynslam_bench.flow.propagation import (
     dissenting_labels,
     label_turns,
     labels_as_seen,
-    nearest_neighbours,
+    nearest,
     transported_labels,
 )
 from dynslam_bench.flow.refinement import Window, similarity_lucas_kanade
@@ -39,12 +39,10 @@ from dynslam_bench.flow.workers import Workers
 
 VOTE = (192, np.float32(5.0))
 """Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
-NEIGHBOUR_WINDOW = 40
-"""Points compared on each side, in the order of x, to find the nearest neighbours."""
 PARABOLA_STEP_PX = np.float32(2.0)
 COARSE = Window(step=2, radius=7, margin=3, warps=2)
 """The refinement at half resolution."""
-MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
+CONSENSUS_PX, CONSENSUS_MARGIN = 3.0, 0.02
 
 
 class Pair(NamedTuple):
@@ -102,7 +100,7 @@ class SparseDaisyFlow:
         pair = self.pair(reference, target)
         if guess is not None:
             guess = np.asarray(guess, dtype=np.float32).reshape(-1, 2)[usable]
-        described, neighbours = self.describe(reference, points, pair.tables), self.nearest(points)
+        described, neighbours = self.describe(reference, points, pair.tables), nearest(points, self.workers.run)
         state = self.search(described, pair, neighbours, guess, seed)
         labels, cost, evaluations = state.flames[:, 0].copy(), state.costs[:, 0], state.used
         if settings.refinement == "lucas-kanade":
@@ -140,15 +138,6 @@ class SparseDaisyFlow:
         if tables.appearance:
             reference_appearance(points, image.side, tables, appearance)
         return Reference(points, descriptors, appearance)
-
-    def nearest(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Indices ``[N, K]`` of each point's nearest others."""
-        n = len(points)
-        neighbours = np.empty((n, min(MOST_NEIGHBOURS, n - 1)), dtype=np.int64)
-        if n > 1:
-            order = np.argsort(points[:, 0], kind="stable")
-            self.workers.run(nearest_neighbours, 0, n, points[order], order, NEIGHBOUR_WINDOW, neighbours)
-        return neighbours
 
     def search(
         self,

@@ -194,7 +194,9 @@ class SlamPipeline:
                     mask = dynamic_mask(instances, self._segmentation, depth)
         with clock("features"):
             keypoints = self._extract(gray, mask)
-        xy, z = _undistorted(keypoints, depth, camera)
+            xy = camera.undistort_points(keypoints.xy)
+        column, row = np.rint(keypoints.xy).astype(np.intp).T
+        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
         bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
         state = self._filter_state(bundle, camera)
         static = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave
@@ -374,15 +376,6 @@ def restore_starved(
         if np.count_nonzero(keep) >= needed:
             return keep, undone
     return np.ones(total, dtype=bool), len(verdicts)
-
-
-def _undistorted(
-    keypoints: Keypoints, depth: NDArray[np.float32], camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Undistorted pixels of keypoints, and the depth there."""
-    column, row = np.rint(keypoints.xy).astype(np.intp).T
-    z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
-    return camera.undistort_points(keypoints.xy), z
 
 
 def flow_to_previous(
