@@ -262,7 +262,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         outcomes = self.episode.outcomes
         reward = outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
-        truncated = len(outcomes) == len(self.sequence)
+        truncated = len(outcomes) == len(self.sequence.timestamps)
         if terminated:
             stamps = self.sequence.timestamps[len(outcomes) :]
             reward += sum(self._reward(self._errors.update(float(stamp), None, False)) for stamp in stamps)
@@ -428,13 +428,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         outcomes = self.episode.outcomes
         here = outcomes[-1].T_world_cam
         before = outcomes[-2].T_world_cam if len(outcomes) > 1 else None
-        motion = se3.inverse(before) @ here if here is not None and before is not None else None
+        motion = None if here is None or before is None else se3.log(se3.inverse(before) @ here)
         stats = stats_observation(
             self.frame,
             self.result,
-            progress=outcomes[-1].index / max(len(self.sequence) - 1, 1),
+            progress=outcomes[-1].index / max(len(self.sequence.timestamps) - 1, 1),
             lost_streak=self.episode.lost_streak,
-            T_prev_cur=motion,
+            motion=motion,
         )
         return stats if self._observation == "stats" else rgbd_observation(self.frame, stats)
 

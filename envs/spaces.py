@@ -24,7 +24,6 @@ from dynslam_bench.core.settings import (
     why_unused,
 )
 from dynslam_bench.evaluation.online import OnlineSample
-from dynslam_bench.geometry import se3
 
 
 class ActionMap:
@@ -217,7 +216,7 @@ def rgbd_space(camera: Camera) -> spaces.Dict:
 
 
 def stats_observation(
-    frame: Frame, result: TrackResult, *, progress: float, lost_streak: int, T_prev_cur: NDArray[np.float64] | None
+    frame: Frame, result: TrackResult, *, progress: float, lost_streak: int, motion: NDArray[np.float64] | None
 ) -> NDArray[np.float32]:
     """The vector of `STATS_LAYOUT` for one tracked frame; finite whatever the tracker reports.
 
@@ -226,13 +225,13 @@ def stats_observation(
         result: What the tracker gave for it.
         progress: Index of the frame, over that of the sequence's last one.
         lost_streak: Frames lost in a row, this one included.
-        T_prev_cur: Estimated motion since the previous frame ``[4, 4]``; None if either frame has no pose.
+        motion: Twist ``[6]`` of the estimated motion since the previous frame; None if either frame has no pose.
     """
     stats = result.stats
     keypoints = _stat(stats, "keypoints")
     culled = _stat(stats, "culled")
     matches = _stat(stats, "matches")
-    motion = np.zeros(6) if T_prev_cur is None else np.tanh(se3.log(T_prev_cur) / 0.1)
+    motion = np.zeros(6) if motion is None else np.tanh(motion / 0.1)
     gray = frame.rgb[::4, ::4].mean(axis=2, dtype=np.float32)
     depth = frame.depth[::4, ::4]
     valid = depth[(depth > 0) & np.isfinite(depth)]

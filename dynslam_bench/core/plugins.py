@@ -105,6 +105,32 @@ class Registry(Generic[P]):
         hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, plugins)
         raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
 
+    def build(self, name: str, kind: type[Any], what: str, *arguments: Any, **options: Any) -> Any:
+        """Load what a spec names, and construct it.
+
+        Args:
+            name: Id of the spec, ``module:Attr`` or ``file.py:Attr``.
+            kind: The protocol that the result must follow.
+            what: The result in words, for messages.
+            arguments: Of the factory.
+            options: Of the factory.
+
+        Raises:
+            DynslamError: What the factory raised; a `PluginError` where it raised anything else, or its result is of
+                another kind.
+        """
+        spec = self.get(name)
+        factory = load_object(spec.entry_point)
+        try:
+            built = factory(*arguments, **options)
+        except DynslamError:
+            raise
+        except Exception as error:  # a plug-in's factory may raise anything
+            raise PluginError(f"{what} '{spec.id}' cannot be built: {_reason(error)}") from error
+        if not isinstance(built, kind):
+            raise PluginError(f"'{spec.entry_point}' gave a {type(built).__name__}, no {kind.__name__}")
+        return built
+
     def refresh(self) -> None:
         """Forget what was discovered, e.g. after the environment variable changed."""
         self._found = None

@@ -21,7 +21,7 @@ Number: TypeAlias = "float | np.number[Any] | np.bool_"
 
 
 class Rule(DynamicFilter, Generic[S]):
-    """A rejection rule that keeps nothing between frames.
+    """A rejection rule; one that keeps something between frames forgets it in its `reset`.
 
     Args:
         settings: Its thresholds.
@@ -29,8 +29,9 @@ class Rule(DynamicFilter, Generic[S]):
 
     def __init__(self, settings: S) -> None:
         self.settings = settings
+        self.reset()
 
-    def reset(self, camera: Camera) -> None:
+    def reset(self, camera: Camera | None = None) -> None:
         """A rule without memory has nothing to reset."""
 
     def verdict(

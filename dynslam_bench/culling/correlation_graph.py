@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import Number, Rule
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
@@ -44,10 +44,6 @@ class CorrelationFilter(Rule[CorrelationSettings]):
     provenance: Provenance = "inspired"
     stats_names = ("dropped", "tracked", "settled", "edges", "cut", "components")
 
-    def __init__(self, settings: CorrelationSettings) -> None:
-        super().__init__(settings)
-        self.reset()
-
     def reset(self, camera: Camera | None = None) -> None:
         """Forget all tracks."""
         self._past = np.zeros((0, 0, 12))  # [frames ago - 1, point of the previous frame, position and covariance]
@@ -66,8 +62,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         rows = np.flatnonzero(observed.any(axis=0))
         if len(rows) < MIN_POINTS:
             return self.verdict(keep)
-        age = len(past) - observed[::-1, rows].argmax(axis=0)
-        settled = age >= min(self.settings.settled, len(past))
+        settled = len(past) - observed[::-1, rows].argmax(axis=0) >= min(self.settings.settled, len(past))
         now, past, observed, xy = now[rows], past[:, rows], observed[:, rows], frame.xy[rows]
         old = np.flatnonzero(settled)
         if len(old) < MIN_POINTS:
@@ -86,14 +81,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
         keep[rows[~static]] = False
-        counts: dict[str, Number] = {
-            "tracked": len(rows),
-            "settled": len(old),
-            "edges": total,
-            "cut": cut,
-            "components": components,
-        }
-        return self.verdict(keep, **counts)
+        return self.verdict(keep, tracked=len(rows), settled=len(old), edges=total, cut=cut, components=components)
 
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
         """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
@@ -128,8 +116,9 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         points[valid, :3] = camera.unproject(xy[valid], z[valid])
         variance = depth_variance(depth, raw[valid])
         pixels = np.asarray(xy[valid], np.float64)
-        covariance = point_covariance(pixels, z[valid], variance, camera, self.settings.pixel_sigma)
-        points[valid, 3:] = covariance.reshape(-1, 9)
+        points[valid, 3:] = point_covariance(pixels, z[valid], variance, camera, self.settings.pixel_sigma).reshape(
+            -1, 9
+        )
         return points
 
     def _agree(
@@ -217,9 +206,7 @@ def point_covariance(
 
 
 def _volume(points: NDArray[np.float64]) -> float:
-    if len(points) < 4:
-        return 0.0
     try:
         return float(ConvexHull(points, qhull_options="QJ").volume)
-    except QhullError:
+    except QhullError:  # too few points
         return 0.0

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling import Number, ObjectRule
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxDepthSettings, DepthBlockSettings, DepthRansacSettings
 from dynslam_bench.geometry.camera import inside
@@ -94,12 +94,8 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         boxes = dynamic_boxes(frame, self.segmentation)
         people = [mask for mask in (self._segment(box, depth) for box in boxes) if mask is not None]
         mask = dilate(np.logical_or.reduce([np.zeros(depth.shape, bool), *people]), self.settings.dilation_px)
-        stats: dict[str, Number] = {
-            "objects": len(boxes),
-            "ignored": len(boxes) - len(people),
-            "mask_fraction": float(mask.mean()),
-        }
-        return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
+        keep, ignored = ~inside(mask, frame.keypoints.xy), len(boxes) - len(people)
+        return self.verdict(keep, mask, objects=len(boxes), ignored=ignored, mask_fraction=float(mask.mean()))
 
     def _segment(self, box: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
         """The mask ``[H, W]`` of the person in a box; None where the box is ignored."""
@@ -155,13 +151,9 @@ class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
         if mask.any():
             whole, blocks = covered_blocks(mask, frame.depth, self.settings)
             mask = dilate(mask | whole, self.segmentation.dilation_px)
-        stats: dict[str, Number] = {
-            "objects": len(people),
-            "touched": len(touched),
-            "blocks": blocks,
-            "mask_fraction": float(mask.mean()),
-        }
-        return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
+        keep, objects = ~inside(mask, frame.keypoints.xy), len(people)
+        share = float(mask.mean())
+        return self.verdict(keep, mask, objects=objects, touched=len(touched), blocks=blocks, mask_fraction=share)
 
 
 def covered_blocks(
@@ -184,7 +176,6 @@ def covered_blocks(
     edge = cv2.dilate(z, square) - cv2.erode(z, square) > settings.edge_m
     count, label = cv2.connectedComponents((valid & ~edge).view(np.uint8), connectivity=4)
     size = np.bincount(label.ravel(), minlength=count)
-    covered = np.bincount(label[mask], minlength=count)
-    whole = covered >= np.maximum(settings.min_share * size, 1)
+    whole = np.bincount(label[mask], minlength=count) >= np.maximum(settings.min_share * size, 1)
     whole[0] = False  # label 0: edges and pixels without depth
     return np.asarray(whole[label]), int(np.count_nonzero(whole))

@@ -5,12 +5,12 @@ The test finds motion along epipolar lines, and any motion while the camera only
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
+from dynslam_bench.culling.regions import cell_index, cell_mean, coherent
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
@@ -24,11 +24,6 @@ ROLLING_SHUTTER_SHARE = 0.05
 """Added to the scale, as a share of a point's flow: a rolling shutter distorts fast motion."""
 CELL = 32
 """Side of the cells of `static_share`, pixels."""
-COHERENCE_CELL = 16
-COHERENCE_CELLS = 5
-"""Side of the neighbourhood of `coherent` in cells: 5 x 16 px."""
-MIN_FAILING = 3
-"""Fewest failing points of a moving region."""
 CORRELATION = 100.0
 """Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
 (the back end inflates the covariance of its poses for the same reason)."""
@@ -55,30 +50,11 @@ def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floa
     Returns:
         Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there were none.
     """
-    share = np.ones(len(before))
-    if state.previous is None or state.previous_keep is None:
-        return share
-    previous_cell, grid = cell_index(state.previous.keypoints.xy, CELL, frame.gray.shape)
-    kept = cell_mean(state.previous_keep, previous_cell, grid, empty=1.0)
-    finite = np.isfinite(before).all(axis=1)
-    share[finite] = kept[cell_index(before[finite], CELL, frame.gray.shape)[0]]
+    share, finite, shape = np.ones(len(before)), np.isfinite(before).all(axis=1), frame.gray.shape
+    if state.previous is not None and state.previous_keep is not None:
+        kept = cell_mean(state.previous_keep, *cell_index(state.previous.keypoints.xy, CELL, shape), empty=1.0)
+        share[finite] = kept[cell_index(before[finite], CELL, shape)[0]]
     return share
-
-
-def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
-    """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
-    rows, columns = -(-shape[0] // size), -(-shape[1] // size)
-    cell = np.floor(xy / size).astype(np.intp)
-    return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
-
-
-def cell_mean(
-    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int], *, empty: float = 0.0
-) -> NDArray[np.float64]:
-    """Mean of values ``[N]`` in each cell of a grid, `empty` where there are none; cells as in `cell_index`."""
-    count = np.bincount(cell, minlength=grid[0] * grid[1])
-    total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1])
-    return np.where(count > 0, total / np.maximum(count, 1), empty)
 
 
 def rigid_flow(
@@ -95,8 +71,8 @@ def rigid_flow(
         Points ``[K, 3]`` in the previous camera's frame, metres, and their undistorted pixels ``[K, 2]``.
     """
     assert state.T_world_prev is not None and state.T_world_pred is not None
-    T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-    moved = se3.transform(T_prev_cur, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+    points = state.camera.unproject(frame.xy[rows], frame.z[rows])
+    moved = se3.transform(se3.inverse(state.T_world_prev) @ state.T_world_pred, points)
     return moved, state.camera.project(moved)
 
 
@@ -122,13 +98,13 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     use = flow.valid & state.keep & (frame.z > 0)
     if np.count_nonzero(use) < MIN_POINTS:
         return state.T_world_pred
-    start, prior = np.eye(4), None
+    start, prior, share = np.eye(4), None, static_share(frame, state, flow.xy[use])
+    points = state.camera.unproject(frame.xy[use], frame.z[use])
+    before = state.camera.undistort_points(flow.xy[use])
     if state.T_world_pred is not None:
         start = se3.inverse(state.T_world_prev) @ state.T_world_pred
         prior = prior_information(state, start)
-    points = state.camera.unproject(frame.xy[use], frame.z[use])
-    before = state.camera.undistort_points(flow.xy[use])
-    T_prev_cur = _align(points, before, state.camera, start, static_share(frame, state, flow.xy[use]), prior)
+    T_prev_cur = _align(points, before, state.camera, start, share, prior)
     return state.T_world_pred if T_prev_cur is None else state.T_world_prev @ T_prev_cur
 
 
@@ -164,10 +140,8 @@ def _align(
 
     `information` ``[6, 6]`` is that of the prior, the start pose.
     """
-    pose = start
-    inverse_start = se3.inverse(start)
-    weight = prior_weight
     rolling_shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
+    pose, weight, inverse_start = start, prior_weight, se3.inverse(start)
     for number, scale in enumerate(TURN_PX + KERNEL_PX):
         moved = se3.transform(pose, points)
         z = np.maximum(moved[:, 2], 0.05)
@@ -199,39 +173,6 @@ def _align(
     return pose if weight.sum() >= 0.5 * MIN_POINTS else None
 
 
-def coherent(
-    failing: NDArray[np.bool_],
-    tested: NDArray[np.bool_],
-    xy: NDArray[np.floating],
-    share: float,
-    size: tuple[int, ...],
-) -> NDArray[np.bool_]:
-    """The failing points of whose tested neighbours enough fail too: a lone failure is noise.
-
-    Args:
-        failing: bool ``[N]``, points that failed a test.
-        tested: bool ``[N]``, points that were tested.
-        xy: Raw pixels ``[N, 2]``.
-        share: Share of the tested points in the neighbourhood (80 px wide) that must fail; 0 keeps all failures.
-        size: Image height and width.
-
-    Returns:
-        Bool ``[N]``, a subset of `failing`.
-    """
-    if share <= 0 or not failing.any():
-        return failing
-    index, grid = cell_index(xy, COHERENCE_CELL, size)
-    neighbourhood = (COHERENCE_CELLS, COHERENCE_CELLS)
-
-    def around(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
-        counts = np.bincount(index, weights=flags, minlength=grid[0] * grid[1]).reshape(grid)
-        total = cv2.boxFilter(counts, -1, neighbourhood, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(total, np.float64).ravel()
-
-    failures, tests = around(failing & tested), around(tested)
-    return np.asarray(failing & (failures[index] >= MIN_FAILING) & (failures[index] >= share * tests[index]))
-
-
 class RigidMotionFilter(Rule[RigidMotionSettings]):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
@@ -245,13 +186,9 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
     provenance: Provenance = "assumed"
     stats_names = ("dropped", "tested", "failed")
 
-    def __init__(self, settings: RigidMotionSettings) -> None:
-        super().__init__(settings)
-        self._evidence: NDArray[np.float64] | None = None
-
-    def reset(self, camera: Camera) -> None:
+    def reset(self, camera: Camera | None = None) -> None:
         """Forget the evidence of the previous sequence."""
-        self._evidence = None
+        self._evidence: NDArray[np.float64] | None = None
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the points that have flow and depth."""
@@ -265,8 +202,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         failed = coherent(failed, tested, xy, self.settings.min_share, shape)
         evidence = failed.astype(np.float64)
         if self._evidence is not None:
-            origin, _ = cell_index(flow.xy[flow.valid], CELL // 2, shape)
-            evidence[flow.valid] += MEMORY * self._evidence[origin]
+            evidence[flow.valid] += MEMORY * self._evidence[cell_index(flow.xy[flow.valid], CELL // 2, shape)[0]]
         evidence = evidence.clip(0, 1)
         self._evidence = cell_mean(evidence, *cell_index(xy, CELL // 2, shape))
         return self.verdict(evidence < 0.5, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
@@ -274,8 +210,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
     def _fails(self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
         assert state.flow is not None and state.previous is not None
         moved, expected = rigid_flow(frame, state, tested)
-        before = state.camera.undistort_points(state.flow.xy[tested])
-        distance = np.linalg.norm(expected - before, axis=1)
+        distance = np.linalg.norm(expected - state.camera.undistort_points(state.flow.xy[tested]), axis=1)
         explained = np.linalg.norm(expected - frame.xy[tested], axis=1)
         limit_px = self.settings.threshold_px + THRESHOLD_SHARE * explained
         measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])

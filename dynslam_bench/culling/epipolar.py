@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Number, ObjectRule, Rule
-from dynslam_bench.culling.ego_motion import coherent, rigid_flow
+from dynslam_bench.culling.ego_motion import rigid_flow
+from dynslam_bench.culling.regions import coherent
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxEpipolarSettings, ClassRuleSettings, EpipolarSettings, Unmatched
 from dynslam_bench.geometry.camera import Camera, inside
@@ -181,10 +182,9 @@ class EpipolarFilter(Rule[EpipolarSettings]):
 
 def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
     """Median distance in pixels between matches ``[N, 2]`` and the best pure rotation: the parallax."""
-    rays = [camera.unproject(xy, np.ones(len(xy))) for xy in (first, second)]
-    rays = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays]
-    weight = np.ones(len(first))
-    residual = np.zeros(len(first))
+    rays = camera.unproject(np.stack([first, second]), np.ones((2, len(first))))
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    weight, residual = np.ones(len(first)), np.zeros(len(first))
     for _ in range(3):  # iteratively reweighted, so that moving objects do not influence the rotation
         u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
@@ -275,12 +275,8 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
             fit = tested & ~in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), previous).any(axis=0)
         if np.count_nonzero(fit) < MIN_OUTSIDE:
             fit = tested
-        stats: dict[str, Number] = {
-            "matches": np.count_nonzero(fit),
-            "lost": np.count_nonzero(lost),
-            "boxes": len(boxes),
-            "f_asked": 1,
-        }
+        stats: dict[str, Number] = {"matches": np.count_nonzero(fit), "lost": np.count_nonzero(lost)}
+        stats |= {"boxes": len(boxes), "f_asked": 1}
         distance = matches.distances(fit, settings.inlier_px)
         if distance is None:
             return self.verdict(keep, failed=1, **stats)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
+from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.ego_motion import coherent, depth_sigma
+from dynslam_bench.culling.ego_motion import depth_sigma
+from dynslam_bench.culling.regions import coherent
 from dynslam_bench.culling.settings import FreeSpaceSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
@@ -32,51 +34,35 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
     provenance: Provenance = "assumed"
     stats_names = ("dropped", "asked", "tested")
 
-    def __init__(self, settings: FreeSpaceSettings) -> None:
-        super().__init__(settings)
-        self._nearest: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
-
-    def reset(self, camera: Camera) -> None:
+    def reset(self, camera: Camera | None = None) -> None:
         """Forget the keyframes of the previous sequence."""
-        self._nearest.clear()
+        self._smallest: dict[int, tuple[Any, Any]] = {}
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Count for each point the keyframes that measured beyond it."""
-        recent = [view for view in state.keyframes if frame.timestamp - view.timestamp <= MAX_AGE_S]
-        keyframes = [view for view in recent if view.depth is not None][:KEYFRAMES]
+        camera, recent = state.camera, [v for v in state.keyframes if frame.timestamp - v.timestamp <= MAX_AGE_S]
+        keyframes = [(v.T_world_cam, v.depth) for v in recent if v.depth is not None][:KEYFRAMES]
         xy, rows = frame.keypoints.xy, np.flatnonzero(frame.z > 0)
         if state.T_world_pred is None or not keyframes or not len(rows):
             return self.verdict(np.ones(len(xy), dtype=bool))
-        points = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+        poses = np.stack([pose for pose, _ in keyframes])
+        world = se3.transform(state.T_world_pred, camera.unproject(frame.xy[rows], frame.z[rows]))
+        local = np.stack(list(map(se3.transform, se3.inverse(poses), [world] * len(poses))))
+        ahead = local[..., 2] > 0.1
+        pixels = np.full((*ahead.shape, 2), -1.0)
+        pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
+        column, row = np.moveaxis(np.rint(pixels.clip(-1, 1e6)).astype(np.intp), -1, 0)
+        observed = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        at = row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
+        surface, smallest = np.empty(ahead.shape, np.float32), {}
+        for number, (_, depth) in enumerate(keyframes):  # images are stored too, so that no id is used again
+            smallest[id(depth)] = self._smallest.get(id(depth)) or (depth, cv2.erode(depth, PATCH))
+            surface[number] = smallest[id(depth)][1][at[0][number], at[1][number]]
+        self._smallest = smallest
+        limit = np.maximum(self.settings.threshold_m, self.settings.threshold_sigma * depth_sigma(surface))
+        violated = observed & (surface > 0) & (surface - local[..., 2] > limit)
         votes, tested = np.zeros(len(xy), dtype=int), np.zeros(len(xy), dtype=bool)
-        for view in keyframes:
-            violated, observed = self._violations(view, points, state.camera)
-            votes[rows] += violated
-            tested[rows] |= observed
-        compared = {id(view.depth) for view in keyframes}
-        self._nearest = {image: depths for image, depths in self._nearest.items() if image in compared}
+        votes[rows], tested[rows] = violated.sum(axis=0), observed.any(axis=0)
         violating = votes >= min(self.settings.min_votes, len(keyframes))
         moving = coherent(violating, tested, xy, self.settings.min_share, frame.gray.shape)
         return self.verdict(~moving, asked=len(keyframes), tested=np.count_nonzero(tested))
-
-    def _violations(
-        self, view: KeyframeView, points: NDArray[np.float64], camera: Camera
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Which world points lie in front of the surface that the keyframe measured, and which lie in its view."""
-        local = se3.transform(se3.inverse(view.T_world_cam), points)
-        ahead = local[:, 2] > 0.1
-        pixels = np.full((len(points), 2), -1.0)
-        pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
-        column, row = np.rint(pixels.clip(-1, 1e6)).astype(np.intp).T
-        observed = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        nearest = self._nearest_depth(view)
-        surface = nearest[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
-        limit = np.maximum(self.settings.threshold_m, self.settings.threshold_sigma * depth_sigma(surface))
-        return observed & (surface > 0) & (surface - local[:, 2] > limit), observed
-
-    def _nearest_depth(self, view: KeyframeView) -> NDArray[np.float32]:
-        """Smallest depth around each pixel of the keyframe, 0 where any depth of the patch is missing."""
-        assert view.depth is not None
-        if id(view.depth) not in self._nearest:  # the image is stored too, so that its id cannot be reused
-            self._nearest[id(view.depth)] = view.depth, np.asarray(cv2.erode(view.depth, PATCH), dtype=np.float32)
-        return self._nearest[id(view.depth)][1]

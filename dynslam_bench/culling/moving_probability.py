@@ -46,9 +46,8 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
     ) -> None:
         super().__init__(settings, segmentation)
         self._boxes = evidence == "boxes"
-        self._probability = np.zeros(0)
 
-    def reset(self, camera: Camera) -> None:
+    def reset(self, camera: Camera | None = None) -> None:
         """Forget all probabilities."""
         self._probability = np.zeros(0)
 

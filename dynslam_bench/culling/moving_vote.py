@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
-from dynslam_bench.culling import Number, ObjectRule
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.epipolar import epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.settings import MovingVoteSettings
 from dynslam_bench.geometry.camera import Camera, inside
@@ -44,16 +44,12 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
         near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
         votes = np.count_nonzero(inside(near_people, moving))
-        stats: dict[str, Number] = {
-            "corners": corners,
-            "moving": len(moving),
-            "votes": votes,
-            "f_asked": asked,
-            "f_judged": judged,
-        }
-        if votes < self.settings.min_votes:
-            return self.verdict(keep, **stats)
-        return self.verdict(~inside(people, frame.keypoints.xy), people, **stats)
+        mask = people if votes >= self.settings.min_votes else None
+        if mask is not None:
+            keep = ~inside(people, frame.keypoints.xy)
+        return self.verdict(
+            keep, mask, corners=corners, moving=len(moving), votes=votes, f_asked=asked, f_judged=judged
+        )
 
     def _moving_corners(
         self, previous: NDArray[np.uint8], current: NDArray[np.uint8], camera: Camera
@@ -98,8 +94,8 @@ def _patch_difference(
 ) -> NDArray[np.int64]:
     """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
     offsets = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-    a = xy1[:, None].astype(np.intp) + offsets
-    b = xy2[:, None].astype(np.intp) + offsets
-    return np.asarray(
-        np.abs(first[a[..., 1], a[..., 0]].astype(np.int64) - second[b[..., 1], b[..., 0]].astype(np.int64)).sum(axis=1)
+    a, b = (
+        image[tuple((xy[:, None].astype(np.intp) + offsets).T[::-1])].astype(np.int64)
+        for image, xy in ((first, xy1), (second, xy2))
     )
+    return np.asarray(np.abs(a - b).sum(axis=0))

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.culling import Number, Rule
+from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
-from dynslam_bench.features.matching import CellGrid, as_words, search_in_radius
+from dynslam_bench.features.matching import CellGrid, Features, as_words, search_in_radius
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera, inside
 from dynslam_bench.segmentation.postprocess import dilate
@@ -61,12 +61,9 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         region[seeds[:, 1], seeds[:, 0]] = 1
         mask = dilate(region.astype(bool), self.settings.dilation_px)
         dropped = inside(dilate(mask, self.settings.border_px), frame.keypoints.xy)
-        stats: dict[str, Number] = {
-            "references": len(references),
-            "seeds": len(seeds),
-            "mask_fraction": float(mask.mean()),
-        }
-        return self.verdict(~dropped, mask, **stats)
+        return self.verdict(
+            ~dropped, mask, references=len(references), seeds=len(seeds), mask_fraction=float(mask.mean())
+        )
 
     def _choose(self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]) -> list[KeyframeView]:
         """At most `references` keyframes by 0.7 normalised distance + 0.3 normalised rotation."""
@@ -81,14 +78,14 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         self, views: list[KeyframeView], depth: NDArray[np.float32], pose: NDArray[np.float64], camera: Camera
     ) -> NDArray[np.int64]:
         """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
-        world, from_reference = [], []
+        world, from_view = [], []
         for view in views:
             usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
             world.append(se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable])))
-            from_reference.append(world[-1] - view.T_world_cam[:3, 3])
-        points = np.concatenate(world)
-        from_frame = points - pose[:3, 3]
-        cosine = _cosine(np.concatenate(from_reference), from_frame)
+            from_view.append(world[-1] - view.T_world_cam[:3, 3])
+        from_frame, from_reference = np.concatenate(world) - pose[:3, 3], np.concatenate(from_view)
+        norms = np.linalg.norm(from_reference, axis=1) * np.linalg.norm(from_frame, axis=1)
+        cosine = (from_reference * from_frame).sum(axis=1) / np.maximum(norms, 1e-12)
         local = from_frame @ pose[:3, :3]
         pixels = np.full((len(local), 2), -1.0)
         ahead = local[:, 2] > 0.1
@@ -100,12 +97,6 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         centre = np.ceil(pixels[visible]).astype(np.int64)
         seeds = centre[hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)]
         return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
-
-
-def _cosine(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cosines ``[N]`` of the angles between vectors ``[N, 3]``."""
-    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-    return np.asarray((first * second).sum(axis=1) / np.maximum(norms, 1e-12))
 
 
 def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -263,21 +254,15 @@ def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float =
     rows, points = rows[points[:, 2] > 0.1], points[points[:, 2] > 0.1]
     expected = np.asarray(camera.project(points), dtype=np.float64)
     octave, before = (keypoints.octave.astype(np.int64) for keypoints in (frame.keypoints, previous.keypoints))
+    grid, words = CellGrid.of(xy, camera.width, camera.height), as_words(previous.keypoints.descriptors[rows])
+    features = Features(xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors), grid)
     for radius in (radius_px, 2 * radius_px):
-        match, _ = search_in_radius(
-            CellGrid.of(xy, camera.width, camera.height),
-            (xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors)),
-            state.keep,
-            (expected, np.full(len(rows), np.nan), np.full(len(rows), radius)),
-            (before[rows] - 1, before[rows] + 1),
-            as_words(previous.keypoints.descriptors[rows]),
-            max_distance=MAX_DISTANCE,
-        )
+        windows = expected, np.full(len(rows), np.nan), np.full(len(rows), radius)
+        match = search_in_radius(features, state.keep, windows, before[rows], words, max_distance=MAX_DISTANCE)
         rows_matched, now = rows[match >= 0], match[match >= 0]
         if len(now) >= MIN_MATCHES:
             ends = np.full((len(xy), 2), np.nan, np.float32)
             ends[now] = previous.keypoints.xy[rows_matched]
-            valid = np.isin(np.arange(len(xy)), now)
-            matches = FlowResult(ends, valid, np.zeros(len(xy), np.float32))
+            matches = FlowResult(ends, np.isfinite(ends[:, 0]), np.zeros(len(xy), np.float32))
             return refine_prediction(frame, replace(state, flow=matches))
     return state.T_world_pred

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling import Number, ObjectRule
+from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import inside
@@ -56,12 +56,8 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         sampled[valid] = moving[label]
         size = frame.depth.shape[::-1]
         mask = cv2.resize(sampled.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-        stats: dict[str, Number] = {
-            "clusters": len(moving),
-            "moving": np.count_nonzero(moving),
-            "mask_fraction": float(mask.mean()),
-        }
-        return self.verdict(~inside(mask, frame.keypoints.xy), mask, **stats)
+        keep, moves = ~inside(mask, frame.keypoints.xy), np.count_nonzero(moving)
+        return self.verdict(keep, mask, clusters=len(moving), moving=moves, mask_fraction=float(mask.mean()))
 
     def _residual(
         self, frame: FrameBundle, state: FilterState, xy: NDArray[np.float64], z: NDArray[np.floating]
@@ -98,12 +94,11 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         measured = np.isfinite(residual)
         members = np.bincount(label[measured], minlength=count)
         mean = np.bincount(label[measured], weights=residual[measured], minlength=count) / np.maximum(members, 1)
-        if not measured.any() or not (members > 0).any():
+        if not measured.any():
             return np.zeros(count, dtype=bool)
         static = max(float(np.median(mean[members > 0])), 1e-4)
         share = np.bincount(label, weights=people, minlength=count) / np.maximum(np.bincount(label, minlength=count), 1)
         prior = STATIC_PRIOR + (self.settings.prior - STATIC_PRIOR) * share
         likelihood = np.exp(-mean / (RATIO * static)) / RATIO
-        other = np.exp(-mean / static)
-        posterior = prior * likelihood / (prior * likelihood + (1 - prior) * other)
+        posterior = prior * likelihood / (prior * likelihood + (1 - prior) * np.exp(-mean / static))
         return np.asarray((posterior > self.settings.threshold) & (members > 0))

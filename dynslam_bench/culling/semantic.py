@@ -26,12 +26,10 @@ class SemanticFilter(Rule[SegmentationSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Drop what lies on the masks; without a segmenter, keep all."""
-        if frame.instances is None or not len(frame.instances):
+        if frame.instances is None or not frame.instances.class_names:
             return self.verdict(np.ones(len(frame.xy), bool))
-        mask = frame.mask
-        if mask is None:
-            mask = dynamic_mask(frame.instances, self.settings, depth=frame.depth)
-        objects = len(select(frame.instances, self.settings))
+        objects = len(select(frame.instances, self.settings).class_names)
+        mask = dynamic_mask(frame.instances, self.settings, frame.depth) if frame.mask is None else frame.mask
         return self.verdict(~inside(mask, frame.keypoints.xy), mask, objects=objects, mask_fraction=mask.mean())
 
 

@@ -39,6 +39,18 @@ _MIN_SHARE: Any = Field(
 )
 
 
+class GuardSettings(Settings):
+    """The starvation guard, which all filters share (SG-SLAM restores all features below 10 %)."""
+
+    min_features: int = tunable(
+        60, low=10, high=200, limits=(0, 2000), online=True,
+        meaning="fewest keypoints that culling must leave: as many as the back end needs to initialise a map",
+    )  # fmt: skip
+    min_fraction: float = Field(
+        0.05, ge=0.0, le=1.0, description="smallest share of the keypoints that culling must leave"
+    )
+
+
 class EpipolarSettings(Settings):
     """The epipolar test (paper, Eq. 23-25) and its degeneracy guard."""
 

@@ -11,7 +11,6 @@ from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
 class TemplateFilter(ObjectRule[TemplateSettings]):
@@ -25,13 +24,9 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
     provenance: Provenance = "inspired"
     stats_names = ("dropped", "in_boxes", "tested", "median_zncc")
 
-    def __init__(self, settings: TemplateSettings, segmentation: SegmentationSettings) -> None:
-        super().__init__(settings, segmentation)
-        self._window: list[tuple[NDArray[np.uint8], NDArray[np.float64]]] = []
-
-    def reset(self, camera: Camera) -> None:
+    def reset(self, camera: Camera | None = None) -> None:
         """Forget the window."""
-        self._window.clear()
+        self._window: list[tuple[NDArray[np.uint8], NDArray[np.float64]]] = []
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Compare patches; features in boxes without depth or history are dropped."""

@@ -103,18 +103,15 @@ class OnlineError:
             self._way_m += float(np.linalg.norm(truth[:3, 3] - self._last_truth[:3, 3]))
         self._last_truth = truth
         error = se3.inverse(truth) @ self._held
+        trans, rot = float(np.linalg.norm(error[:3, 3])), float(np.rad2deg(se3.rotation_angle(error)))
         frame_trans = frame_rot = None
         if self._previous_truth is not None:
             moved = se3.inverse(self._previous_truth) @ truth
             estimated = np.eye(4)
             if pose is not None and self._previous_pose is not None:
                 estimated = se3.inverse(self._previous_pose) @ pose
-            frame_trans, frame_rot = _size(se3.inverse(moved) @ estimated)
+            gap = se3.inverse(moved) @ estimated
+            frame_trans, frame_rot = float(np.linalg.norm(gap[:3, 3])), float(np.rad2deg(se3.rotation_angle(gap)))
             if pose is None:
                 self._lost_way_m += frame_trans
-        return OnlineSample(*_size(error), frame_trans, frame_rot, self._way_m, pose is not None, self._lost_way_m)
-
-
-def _size(error: Array) -> tuple[float, float]:
-    """Length of the translation in metres and rotation angle in degrees."""
-    return float(np.linalg.norm(error[:3, 3])), float(np.rad2deg(se3.rotation_angle(error)))
+        return OnlineSample(trans, rot, frame_trans, frame_rot, self._way_m, pose is not None, self._lost_way_m)

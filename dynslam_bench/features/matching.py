@@ -7,6 +7,7 @@ All functions are pure and deterministic; ties are broken by the lower index.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,31 +72,25 @@ def _brute_force(
 
 
 def match_brute_force(
-    a: Words, b: Words, *, max_distance: int = 64, ratio: float = 0.8, mutual: bool = True
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    a: Words, b: Words, *, max_distance: int = 64, ratio: float = 0.8
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Nearest neighbours among all descriptors.
 
     Args:
         a: Descriptors ``[N, W]``.
         b: Descriptors ``[M, W]``.
         max_distance: Largest Hamming distance of a match.
-        ratio: The nearest must be nearer than `ratio` times the second nearest; 1 switches the test off.
-        mutual: Whether the match must be the nearest in both directions.
+        ratio: The nearest must be nearer than `ratio` times the second nearest, and nearest in both directions.
 
     Returns:
-        Indices into `a`, indices into `b` and distances of the matches, ordered by the first.
+        Indices into `a` and indices into `b` of the matches, ordered by the first.
     """
     if not len(a) or not len(b):
-        empty = np.zeros(0, np.int64)
-        return empty, empty, empty
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     best, first, second, back = _brute_force(np.ascontiguousarray(a), np.ascontiguousarray(b))
-    keep = first <= max_distance
-    if ratio < 1.0:
-        keep &= first < ratio * second
-    if mutual:
-        keep &= back[best] == np.arange(len(a))
-    index = np.flatnonzero(keep)
-    return index, best[index], first[index]
+    mutual = back[best] == np.arange(len(a))
+    index = np.flatnonzero((first <= max_distance) & (first < ratio * second) & mutual)
+    return index, best[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +122,24 @@ class CellGrid:
         return cls(cell, columns, rows, start, np.argsort(index, kind="stable").astype(np.int64))
 
 
+class Features(NamedTuple):
+    """Features that are searched, as the back end's `Observations` are.
+
+    Attributes:
+        xy: Undistorted pixels ``[N, 2]``.
+        right: Right coordinates ``[N]``, NaN without depth.
+        octave: int64 ``[N]``.
+        words: Descriptors ``[N, W]``.
+        grid: Cells of the features.
+    """
+
+    xy: NDArray[np.float64]
+    right: NDArray[np.float64]
+    octave: NDArray[np.int64]
+    words: Words
+    grid: CellGrid
+
+
 @kernel
 def _search(
     cell: float, columns: int, rows: int, start: NDArray[np.int64], order: NDArray[np.int64],
@@ -135,7 +148,7 @@ def _search(
     target: NDArray[np.float64], target_right: NDArray[np.float64], radius: NDArray[np.float64],
     octave_low: NDArray[np.int64], octave_high: NDArray[np.int64], target_words: Words,
     max_distance: int, ratio: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # fmt: skip
+) -> NDArray[np.int64]:  # fmt: skip
     count = target.shape[0]
     match = np.full(count, -1, np.int64)
     match_distance = np.full(count, FAR, np.int64)
@@ -172,47 +185,42 @@ def _search(
             if match_distance[rival] <= first:
                 continue
             match[rival] = -1
-            match_distance[rival] = FAR
         owner[best] = i
         match[i] = best
         match_distance[i] = first
-    return match, match_distance
+    return match
 
 
 def search_in_radius(
-    grid: CellGrid,
-    keypoints: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], Words],
+    features: Any,
     free: NDArray[np.bool_],
-    targets: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    octaves: tuple[NDArray[np.int64], NDArray[np.int64]],
-    target_words: Words,
+    windows: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    octave: NDArray[np.int64],
+    words: Words,
     *,
     max_distance: int,
     ratio: float = 1.0,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """For each target position, the keypoint nearby whose descriptor is nearest; a keypoint is matched once at most.
+) -> NDArray[np.int64]:
+    """For each target, the feature nearby whose descriptor is nearest; a feature is matched once at most.
 
     Args:
-        grid: The keypoints' cells.
-        keypoints: Undistorted pixels ``[N, 2]``, right coordinates ``[N]`` (NaN without depth), octaves ``[N]`` and
-            descriptors ``[N, W]``.
-        free: bool ``[N]``, keypoints that may be matched.
-        targets: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared) and half sides of
+        features: `Features`, or anything with their attributes.
+        free: bool ``[N]``, features that may be matched.
+        windows: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared) and half sides of
             the search windows ``[M]``, pixels.
-        octaves: Lowest and highest octave allowed for each target ``[M]``.
-        target_words: Descriptors of the targets ``[M, W]``.
+        octave: Expected octaves ``[M]``; the feature's may be one off.
+        words: Descriptors of the targets ``[M, W]``.
         max_distance: Largest Hamming distance of a match.
         ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the test off.
 
     Returns:
-        int64 ``[M]`` matched keypoint or -1, and int64 ``[M]`` its distance. Where two targets claim one keypoint the
-        smaller distance wins, then the lower index.
+        int64 ``[M]``, matched feature or -1. Where two targets claim one feature the smaller distance wins, then the
+        lower index.
     """
-    xy, right, octave, words = keypoints
-    target, target_right, radius = targets
+    f, grid = features, features.grid
     return _search(
-        grid.cell, grid.columns, grid.rows, grid.start, grid.order, xy, right, octave, words, free,
-        target, target_right, radius, octaves[0], octaves[1], target_words, max_distance, ratio,
+        grid.cell, grid.columns, grid.rows, grid.start, grid.order, f.xy, f.right, f.octave, f.words, free,
+        *windows, octave - 1, octave + 1, words, max_distance, ratio,
     )  # fmt: skip
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec
-from dynslam_bench.core.errors import DynslamError, PluginError
-from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.plugins import Registry
 from dynslam_bench.features.settings import FeatureSettings
 
 __all__ = ["FEATURES", "ORB", "FeatureSpec"]
@@ -19,9 +18,6 @@ ORB = FeatureSpec(
 FEATURES: Registry[FeatureSpec] = Registry("features", FeatureSpec, lambda: [ORB])
 
 
-# From settings to a feature extractor.
-
-
 def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor:
     """Load and construct the extractor that the settings name.
 
@@ -33,14 +29,5 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
         SettingsError: The extractor refuses the settings.
     """
     settings = settings or FeatureSettings()
-    spec = FEATURES.get(settings.extractor)
-    factory = load_object(spec.entry_point)
-    try:
-        extractor = factory(settings)
-    except DynslamError:
-        raise
-    except Exception as error:
-        raise PluginError(f"extractor '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
-    if not isinstance(extractor, FeatureExtractor):
-        raise PluginError(f"'{spec.entry_point}' gave a {type(extractor).__name__} without extract()")
+    extractor: FeatureExtractor = FEATURES.build(settings.extractor, FeatureExtractor, "extractor", settings)
     return extractor

@@ -22,7 +22,7 @@ from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats,
 from dynslam_bench.flow.dense_kernels import Superpixels, aggregate_and_choose, spread_labels, superpixels
 from dynslam_bench.flow.matching_cost import MAX_COST, cost_tables
 from dynslam_bench.flow.orientation_maps import OrientationMaps
-from dynslam_bench.flow.propagation import labels_as_seen
+from dynslam_bench.flow.propagation import labels_as_seen, nearest
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
 from dynslam_bench.flow.sparse import SparseDaisyFlow
@@ -76,8 +76,9 @@ class DenseDaisyFlow:
         """Use other settings from the next pair on."""
         self.settings = settings
         common = {name: getattr(settings, name) for name in DaisySettings.model_fields}
-        spacing = max(1, settings.superpixel_px // 2)
-        self._sparse.configure(FlowSettings(**common, support=9, support_spacing_px=spacing))
+        self._sparse.configure(
+            FlowSettings(**common, support=9, support_spacing_px=max(1, settings.superpixel_px // 2))
+        )
 
     def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
         """The orientation maps of a uint8 ``[H, W]`` image."""
@@ -106,8 +107,7 @@ class DenseDaisyFlow:
             ends = np.where(valid[:, None], xy, clean)
             error = np.linalg.norm(ends + dense.back[_pixels(ends)] - clean, axis=1)
             valid &= error <= self.settings.forward_backward_px
-        stats = flow_stats(len(clean), int(valid.sum()), int(dense.stats["evaluations"]))
-        return FlowResult(xy, valid, cost, stats)
+        return FlowResult(xy, valid, cost, flow_stats(len(clean), int(valid.sum()), int(dense.stats["evaluations"])))
 
     def flow(self, reference: OrientationMaps, target: OrientationMaps, *, seed: int = 0) -> DenseFlow:
         """Flow of every pixel from the reference to the target.
@@ -165,7 +165,7 @@ class _RegionLabels:
         self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
         pair, centres = self._pair, self.centres
-        neighbours = sparse.nearest(centres)
+        neighbours = nearest(centres, sparse.workers.run)
         described = sparse.describe(pair.reference, centres, pair.tables)
         state = sparse.search(described, pair, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
@@ -296,8 +296,7 @@ def fit_regional_motion(
         normal = weighted.transpose(0, 2, 1) @ basis
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
         motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
-        residual = np.linalg.norm(values - basis @ motion, axis=2)
-        weight = weight / (1 + (residual / 2.0) ** 2)
+        weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
     return RegionalMotion(centres, spread, motion, region)
 
 
@@ -310,6 +309,5 @@ def fill_and_smooth(flow: NDArray[np.float32], valid: NDArray[np.bool_], fitted:
     motion = fitted.motion.astype(np.float32)
     smooth = motion[r, 0] + local[:, :1] * motion[r, 1] + local[:, 1:] * motion[r, 2]
     own = flow.reshape(-1, 2)
-    difference = smooth - own
-    replaced = ~valid.ravel() | ((difference**2).sum(axis=1) < SMOOTH_PX**2)
+    replaced = ~valid.ravel() | (((smooth - own) ** 2).sum(axis=1) < SMOOTH_PX**2)
     return np.where(replaced[:, None], smooth, own).astype(np.float32).reshape(flow.shape)

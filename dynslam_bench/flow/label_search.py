@@ -78,8 +78,8 @@ def make_plan(settings: DaisySettings) -> Plan:
     founding = population * (2 if rules and rules.opposition else 1)
     iterations = max(1, -(-(budget - founding) // population))
     table = moth_flame.flight_table(population, iterations, rules or moth_flame.MFO)
-    step = settings.cauchy_step_px  # of Eq. 13, per dimension of a label: px, px, octaves, radians
-    steps = np.array([step, step, 0.1, np.deg2rad(5.0)], dtype=np.float32)
+    # of Eq. 13, per dimension of a label: px, px, octaves, radians
+    steps = np.array([*[settings.cauchy_step_px] * 2, 0.1, np.deg2rad(5.0)], dtype=np.float32)
     tables = (table, moth_flame.spiral_table(), moth_flame.cauchy_table(), steps)
     return Plan(population, ends, (*tables, rules is not None, np.float32(shrink)))
 
@@ -104,32 +104,12 @@ class SearchState(NamedTuple):
     upper: NDArray[np.float32]
 
 
-def new_state(
-    count: int, population: int, lower: NDArray[np.float32], upper: NDArray[np.float32], ceiling: int
-) -> SearchState:
-    """A state in which nothing has been evaluated: every flame costs `ceiling`."""
-    return SearchState(
-        np.zeros((count, population, 4), dtype=np.float32),
-        np.zeros((count, population, 4), dtype=np.float32),
-        np.full((count, population), ceiling, dtype=np.int64),
-        np.zeros(count, dtype=np.int64),
-        lower,
-        upper,
-    )
-
-
 @inlined
 def scrambled(state: Scalar) -> Scalar:
     """64 random bits of a state (splitmix64)."""
     z = (state ^ (state >> np.uint64(30))) * _MIX1
     z = (z ^ (z >> np.uint64(27))) * _MIX2
     return z ^ (z >> np.uint64(31))
-
-
-@inlined
-def first_state(seed: Scalar, point: int, phase: int) -> Scalar:
-    """First state of a point's random numbers in one phase: a hash of its arguments."""
-    return scrambled(np.uint64(seed) + _GOLDEN * (np.uint64(point) * np.uint64(64) + np.uint64(phase) + np.uint64(1)))
 
 
 @inlined
@@ -141,8 +121,7 @@ def advance(state: Scalar) -> Scalar:
 @inlined
 def uniform(bits: Scalar, quarter: int) -> Scalar:
     """One of the four float32 in [0, 1) that `scrambled` bits make, in steps of 2**-16."""
-    part = np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))
-    return np.float32(part) * np.float32(1.0 / 65536)
+    return np.float32(np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))) * np.float32(1.0 / 65536)
 
 
 @inlined
@@ -214,7 +193,7 @@ def run_phase(
     for i in range(start, stop):
         lower, upper, moths = state.lower[i], state.upper[i], state.moths[i]
         flames, costs = state.flames[i], state.costs[i]
-        random = first_state(seed, i, phase)
+        random = scrambled(np.uint64(seed) + _GOLDEN * (np.uint64(i) * np.uint64(64) + np.uint64(phase) + np.uint64(1)))
         used, placed, stage, window = state.used[i], 0, CANDIDATES, np.float32(0.5)
         while True:  # costs are computed in one place; the stages differ in the labels that are tried
             count = population

@@ -14,10 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-SPIRAL_LOW, SPIRAL_STEPS = -2.0, 1024
-CAUCHY_STEPS = 4096
-
-
 Uniform = Callable[[tuple[int, ...]], Any]
 """Draws numbers of a shape from [0, 1)."""
 
@@ -132,8 +128,8 @@ def opposites(members: Any, least: Any, greatest: Any, low: Any, high: Any, unif
         uniform: Draws.
     """
     opposite = uniform((*members.shape[:-1], 1)) * (least + greatest) - members  # Eq. 19
-    outside = (opposite < low) | (opposite > high)
-    return np.where(outside, low + (high - low) * uniform(members.shape), opposite)  # Eq. 21-22
+    drawn = low + (high - low) * uniform(members.shape)
+    return np.where((opposite < low) | (opposite > high), drawn, opposite)  # Eq. 21-22
 
 
 class FlightTable(NamedTuple):
@@ -159,8 +155,7 @@ class FlightTable(NamedTuple):
 @lru_cache(maxsize=64)
 def flight_table(population: int, iterations: int, rules: MothFlameRules) -> FlightTable:
     """The flights of T iterations, computed in float32."""
-    last = np.float32(iterations)
-    rows = [flight(np.float32(iteration) / last, rules) for iteration in range(1, iterations + 1)]
+    rows = [flight(np.float32(k) / np.float32(iterations), rules) for k in range(1, iterations + 1)]
     span, own, best = (np.array([row[k] for row in rows], dtype=np.float32) for k in range(3))
     stepping = np.array([row.stepping for row in rows], dtype=np.bool_)
     return FlightTable(flame_counts(population, iterations, rules), span, own, best, stepping, rules.opposition)
@@ -169,11 +164,10 @@ def flight_table(population: int, iterations: int, rules: MothFlameRules) -> Fli
 @lru_cache(maxsize=1)
 def spiral_table() -> NDArray[np.float32]:
     """`spiral` of distance 1 for t in [-2, 2), 1,024 steps a unit."""
-    t = SPIRAL_LOW + (np.arange(4 * SPIRAL_STEPS) + 0.5) / SPIRAL_STEPS
-    return np.asarray(spiral(1.0, t), dtype=np.float32)
+    return np.asarray(spiral(1.0, -2 + (np.arange(4 * 1024) + 0.5) / 1024), dtype=np.float32)
 
 
 @lru_cache(maxsize=1)
 def cauchy_table() -> NDArray[np.float32]:
     """`cauchy` for 4,096 values of U."""
-    return np.asarray(cauchy((np.arange(CAUCHY_STEPS) + 0.5) / CAUCHY_STEPS), dtype=np.float32)
+    return np.asarray(cauchy((np.arange(4096) + 0.5) / 4096), dtype=np.float32)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
@@ -9,6 +12,9 @@ from dynslam_bench.flow.label_search import advance, scrambled
 from dynslam_bench.flow.simd import Flags, Floats, Longs
 
 NO_MOTION = np.empty((0, 4), dtype=np.float32)
+NEIGHBOUR_WINDOW = 40
+"""Points compared on each side, in the order of x, to find the nearest neighbours."""
+MOST_NEIGHBOURS = 8
 VOTERS = 256
 """Approximate number of points that vote on a hypothesis."""
 
@@ -205,6 +211,16 @@ def drop_followers(
             x[left], y[left], to_x[left], to_y[left] = x[k], y[k], to_x[k], to_y[k]
             left += 1
     return left
+
+
+def nearest(points: Floats, run: Callable[..., Any]) -> Longs:
+    """Indices ``[N, K]`` of each point's nearest others; `run` divides the work among threads."""
+    n = len(points)
+    neighbours = np.empty((n, min(MOST_NEIGHBOURS, n - 1)), dtype=np.int64)
+    if n > 1:
+        order = np.argsort(points[:, 0], kind="stable")
+        run(nearest_neighbours, 0, n, points[order], order, NEIGHBOUR_WINDOW, neighbours)
+    return neighbours
 
 
 @kernel

@@ -1,6 +1,7 @@
 """SIMD vectors inside the compiled kernels: sixteen float32 or thirty-two uint16 numbers as one value.
 
-Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's instructions. The order of
+Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's instructions. A lane is the
+place of one number in a vector, as in SIMD hardware. The order of
 every sum is part of the program, so that results do not depend on the processor. The uint16 operations are exact but
 for one square root and division, which IEEE 754 defines to the last bit; `tests/flow/exact_reference.py` gives the same
 bytes.
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import Any, Concatenate, ParamSpec, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 from llvmlite import ir
@@ -32,14 +33,13 @@ Doubles = NDArray[np.float64]
 Code: TypeAlias = Any
 """A type, value or builder of numba and llvmlite, neither of which is annotated."""
 
-Arguments = ParamSpec("Arguments")
 Definition: TypeAlias = tuple[Code, Callable[[Code, Code, Code, Code], Code]]
 """Numba's signature of an instruction, and the function that writes its code."""
 
 
-def instruction(define: Callable[Concatenate[Code, Arguments], Definition]) -> Callable[Arguments, Code]:
+def instruction(define: Callable[..., Definition]) -> Code:
     """Make an instruction for kernels from a function of numba's typing context and the types of the arguments."""
-    return cast("Callable[Arguments, Code]", intrinsic(define))
+    return intrinsic(define)
 
 
 FLOAT_LANES, UINT16_LANES = 16, 32
@@ -332,8 +332,7 @@ def store_normalised(typing_context: Code, array: Code, index: Code, halves: Cod
         root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(floats, [floats]), "llvm.sqrt.v4f32")
         norm = builder.call(root, [builder.sitofp(squares, floats)])
         gain = builder.fdiv(constant(floats, 255.0), builder.fadd(norm, splat(builder, floats, floor)))
-        gains = builder.shuffle_vector(gain, gain, _EACH_EIGHT_TIMES)
-        scaled = builder.fmul(builder.sitofp(wide, many), gains)
+        scaled = builder.fmul(builder.sitofp(wide, many), builder.shuffle_vector(gain, gain, _EACH_EIGHT_TIMES))
         rounded = builder.fptosi(builder.fadd(scaled, constant(many, 0.5)), ints)
         pointer = pointer_to(context, builder, kind.args[0], array, index, _BYTES32)
         builder.store(builder.trunc(rounded, _BYTES32), pointer, align=1)
@@ -401,8 +400,7 @@ def descriptor_sum(
             own.align = 1
             distances = _histogram_distances(builder, theirs, own, count)
             limit = splat(builder, lanes, truncation)
-            below = builder.icmp_unsigned("<", distances, limit)
-            kept = builder.select(below, distances, limit)
+            kept = builder.select(builder.icmp_unsigned("<", distances, limit), distances, limit)
             for k in range(count):
                 total = builder.add(total, builder.extract_element(kept, ir.Constant(_INT32, k)))
         return total

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result, usable_points
-from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, new_state, run_phase
+from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, run_phase
 from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
@@ -30,7 +30,7 @@ from dynslam_bench.flow.propagation import (
     dissenting_labels,
     label_turns,
     labels_as_seen,
-    nearest_neighbours,
+    nearest,
     transported_labels,
 )
 from dynslam_bench.flow.refinement import Window, similarity_lucas_kanade
@@ -39,12 +39,10 @@ from dynslam_bench.flow.workers import Workers
 
 VOTE = (192, np.float32(5.0))
 """Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
-NEIGHBOUR_WINDOW = 40
-"""Points compared on each side, in the order of x, to find the nearest neighbours."""
 PARABOLA_STEP_PX = np.float32(2.0)
 COARSE = Window(step=2, radius=7, margin=3, warps=2)
 """The refinement at half resolution."""
-MOST_NEIGHBOURS, CONSENSUS_PX, CONSENSUS_MARGIN = 8, 3.0, 0.02
+CONSENSUS_PX, CONSENSUS_MARGIN = 3.0, 0.02
 
 
 class Pair(NamedTuple):
@@ -102,7 +100,7 @@ class SparseDaisyFlow:
         pair = self.pair(reference, target)
         if guess is not None:
             guess = np.asarray(guess, dtype=np.float32).reshape(-1, 2)[usable]
-        described, neighbours = self.describe(reference, points, pair.tables), self.nearest(points)
+        described, neighbours = self.describe(reference, points, pair.tables), nearest(points, self.workers.run)
         state = self.search(described, pair, neighbours, guess, seed)
         labels, cost, evaluations = state.flames[:, 0].copy(), state.costs[:, 0], state.used
         if settings.refinement == "lucas-kanade":
@@ -112,11 +110,14 @@ class SparseDaisyFlow:
         if settings.refinement == "lucas-kanade":
             good &= self.refine_together(points, labels, neighbours, pair) > settings.min_correlation
         ends = points + labels[:, :2]
-        good &= usable_points(ends, target.gray.shape)
         if settings.forward_backward_px > 0:
             rows = np.flatnonzero(good)
-            error = self._forward_backward_error(points[rows], ends[rows], labels[rows], pair)
+            inverse, window = -labels[rows], Window(1, settings.refinement_window_px // 2, margin=3, warps=1)
+            back = target.framed, reference.framed, window, np.empty(len(rows), np.float32)
+            self.workers.run(similarity_lucas_kanade, 0, len(rows), ends[rows], inverse, *back)
+            error = np.hypot(*(ends[rows] + inverse[:, :2] - points[rows]).T)
             good[rows] = error <= settings.forward_backward_px
+        good &= usable_points(ends, target.gray.shape)
         valid, share = np.zeros(len(xy), np.bool_), np.ones(len(xy), np.float32)
         xy[usable], valid[usable], share[usable] = ends, good, cost / pair.tables.ceiling
         return FlowResult(xy, valid, share, flow_stats(len(xy), int(good.sum()), int(evaluations.sum())))
@@ -137,15 +138,6 @@ class SparseDaisyFlow:
         if tables.appearance:
             reference_appearance(points, image.side, tables, appearance)
         return Reference(points, descriptors, appearance)
-
-    def nearest(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Indices ``[N, K]`` of each point's nearest others."""
-        n = len(points)
-        neighbours = np.empty((n, min(MOST_NEIGHBOURS, n - 1)), dtype=np.int64)
-        if n > 1:
-            order = np.argsort(points[:, 0], kind="stable")
-            self.workers.run(nearest_neighbours, 0, n, points[order], order, NEIGHBOUR_WINDOW, neighbours)
-        return neighbours
 
     def search(
         self,
@@ -170,8 +162,9 @@ class SparseDaisyFlow:
         extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32)
         lower, upper = start[:, 0] - extent, start[:, 0] + extent
         plan = make_plan(settings)
-        state = new_state(n, plan.population, lower, upper, pair.tables.ceiling)
-        state.flames[:, :] = start
+        costs = np.full((n, plan.population), pair.tables.ceiling, np.int64)  # nothing has been evaluated
+        flames = np.repeat(start, plan.population, axis=1)
+        state = SearchState(np.zeros_like(flames), flames, costs, np.zeros(n, np.int64), lower, upper)
         candidates = start
         if STRATEGIES[settings.search].shrink == 0:  # nothing is drawn: zero flow is tried beside the prediction
             zero = np.where(start.any(axis=2, keepdims=True), np.float32(0), np.float32(np.nan))
@@ -186,8 +179,8 @@ class SparseDaisyFlow:
                 candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
                 sources = (points, best, label_turns(best), neighbours, motions)
                 run(transported_labels, 0, n, *sources, lower, upper, candidates)
-            costs = (described, pair.target.side, pair.tables)
-            run(run_phase, 0, n, *costs, state, candidates, end, phase, np.uint64(seed), *plan.options)
+            images = described, pair.target.side, pair.tables
+            run(run_phase, 0, n, *images, state, candidates, end, phase, np.uint64(seed), *plan.options)
         return state
 
     def refine_together(
@@ -240,14 +233,3 @@ class SparseDaisyFlow:
         window = Window(1, self.settings.refinement_window_px // 2, margin=2, warps=2)
         self.workers.run(*arguments, reference.framed, target.framed, window, correlation)
         return correlation
-
-    def _forward_backward_error(
-        self, points: NDArray[np.float32], xy: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
-    ) -> NDArray[np.float32]:
-        """Distance in pixels between each point and the end of its inverse label, refined in the other direction."""
-        inverse, correlation = -labels, np.empty(len(points), dtype=np.float32)
-        window = Window(1, self.settings.refinement_window_px // 2, margin=3, warps=1)
-        images = pair.target.framed, pair.reference.framed
-        self.workers.run(similarity_lucas_kanade, 0, len(xy), xy, inverse, *images, window, correlation)
-        distance: NDArray[np.float32] = np.hypot(*(xy + inverse[:, :2] - points).T)
-        return distance

@@ -5,11 +5,8 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
-
-
-def _call(kernel: Callable[..., Any], *arguments: Any) -> None:
-    kernel(*arguments)
 
 
 class Workers:
@@ -25,7 +22,8 @@ class Workers:
 
     def __init__(self, threads: int = 1) -> None:
         self.threads = max(1, threads)
-        self.run: Callable[..., Any] = getattr(operator, "call", _call)  # without an `operator.call` in Python 3.10
+        # Python 3.10 has no `operator.call`
+        self.run: Callable[..., Any] = getattr(operator, "call", lambda kernel, *arguments: kernel(*arguments))
         if self.threads > 1:
             self.run = self._divide
             self._pool = ThreadPoolExecutor(self.threads - 1, "flow")
@@ -35,9 +33,8 @@ class Workers:
 
         The kernels release the GIL and write disjoint rows, so that the result is the same for every number of threads.
         """
-        parts = max(1, min(self.threads, stop - start))
-        bounds = [start + (stop - start) * part // parts for part in range(parts + 1)]
-        futures = [self._pool.submit(kernel, bounds[i], bounds[i + 1], *arguments) for i in range(parts - 1)]
-        kernel(bounds[-2], bounds[-1], *arguments)
+        bounds = [start + (stop - start) * part // self.threads for part in range(self.threads + 1)]
+        futures = [self._pool.submit(kernel, *part, *arguments) for part in pairwise(bounds[:-1])]
+        kernel(*bounds[-2:], *arguments)
         for future in futures:
             future.result()

@@ -80,6 +80,18 @@ class Camera:
             xy = points[..., :2] / points[..., 2:3]
         return xy * (self.fx, self.fy) + (self.cx, self.cy)
 
+    def view(
+        self, points: NDArray[np.float64], margin_px: float = 0.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Undistorted pixels of points ``[N, 3]`` of the camera frame, and which lie in the image or near it.
+
+        The pixels of points behind the camera mean nothing.
+        """
+        ahead = points[:, 2] > 0.05
+        uv = self.project(np.where(ahead[:, None], points, [0.0, 0.0, 1.0]))
+        size = self.width + margin_px, self.height + margin_px
+        return uv, ahead & (uv >= -margin_px).all(axis=1) & (uv < size).all(axis=1)
+
     def unproject(self, pixels: NDArray[np.floating], depth: NDArray[np.floating]) -> NDArray[np.float64]:
         """Points ``[..., 3]`` of the camera frame (metres) at undistorted pixels ``[..., 2]`` and z-depth ``[...]``."""
         pixels = np.asarray(pixels, dtype=np.float64)

@@ -328,7 +328,7 @@ class ConfiguredSegmenter:
         from dynslam_bench.segmentation.postprocess import select  # needs OpenCV, which the registry does not
 
         instances = self.inner.segment(frame)
-        if instances.masks.shape[1:] != frame.rgb.shape[:2] or len(instances.masks) != len(instances):
+        if instances.masks.shape[1:] != frame.rgb.shape[:2] or len(instances.masks) != len(instances.class_names):
             raise SegmentationError(
                 f"{self.source} gave {len(instances)} objects with masks of shape {instances.masks.shape}, the frame "
                 f"is {frame.rgb.shape[1]}x{frame.rgb.shape[0]}",

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.settings import REPAIR_BAND_PX, SegmentationSettings
+from dynslam_bench.segmentation.settings import REPAIR_BAND_PX, SegmentationSettings, expand_classes
 
 HOLE_RADIUS_PX = 3
 """Radius of the closing that fills small gaps (MOR-SLAM's morphological step; the radius is this project's)."""
@@ -27,7 +27,7 @@ def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 def select(instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()) -> Instances:
     """The objects that count: confident, and of a dynamic class or one of `also`, or known to move."""
-    names = settings.class_names() | also
+    names = expand_classes(settings.classes) | also
     wanted = np.array([name in names for name in instances.class_names], dtype=bool)
     if instances.moving is not None:
         wanted |= instances.moving
@@ -66,8 +66,8 @@ def dynamic_mask(
             f"the depth image is {depth.shape[1]}x{depth.shape[0]}, the masks {width}x{height}",
             "masks must have the frame's size",
         )
-    union = chosen.union()
-    if settings.repair == "depth" and len(chosen):
+    union = chosen.masks.any(axis=0)
+    if settings.repair == "depth" and chosen.class_names:
         union = np.any([repair(mask, depth, settings.repair_depth_m) for mask in chosen.masks], axis=0)
     return dilate(np.asarray(union), settings.dilation_px)
 

@@ -165,7 +165,7 @@ class MissedDetections:
             elif track.hits >= LEAST_HITS and track.missed < self.limit and track.move(predicted[index]):
                 bridged.append(track)
         self._tracks = tracks + bridged
-        for new in sorted(set(range(len(detections))) - set(matches.values())):
+        for new in sorted(set(range(len(detections.scores))) - set(matches.values())):
             box, mask, score = detections.boxes[new], detections.masks[new], float(detections.scores[new])
             self._tracks.append(_Track(box, mask, detections.class_names[new], score, np.zeros(4, np.float32)))
         if not bridged:
@@ -181,7 +181,7 @@ class MissedDetections:
 
 def associate(predicted: list[NDArray[np.float32]], names: list[str], detections: Instances) -> list[tuple[int, int]]:
     """Greedy one-to-one pairs (track, detection) of one class by falling box IoU, at least `ASSOCIATION_IOU`."""
-    if not predicted or not len(detections):
+    if not predicted or not detections.class_names:
         return []
     same = np.array([[name == other for other in detections.class_names] for name in names], dtype=bool)
     overlap = np.where(same, box_iou(np.stack(predicted), detections.boxes), 0.0)

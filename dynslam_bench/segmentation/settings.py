@@ -6,7 +6,8 @@ segmenter runs.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from functools import cache
 from typing import Any, Literal
 
 from pydantic import Field, field_validator
@@ -51,15 +52,15 @@ PRESETS: dict[str, tuple[str, ...]] = {"person": ("person",), "dynaslam19": DYNA
 """Named class sets; a preset's name may stand wherever a class name may."""
 
 
-def expand_classes(names: str | Iterable[str]) -> frozenset[str]:
-    """The COCO names meant by a comma-separated list (or an iterable) of class names and presets.
+@cache
+def expand_classes(names: str) -> frozenset[str]:
+    """The COCO names meant by a comma-separated list of class names and presets.
 
     Raises:
         SegmentationError: A name is neither a COCO class nor a preset (with a did-you-mean), or there is none.
     """
-    parts = [part.strip() for part in (names.split(",") if isinstance(names, str) else names)]
     classes: set[str] = set()
-    for part in filter(None, parts):
+    for part in filter(None, map(str.strip, names.split(","))):
         if part not in PRESETS and part not in COCO_NAMES:
             raise SegmentationError(f"unknown class '{part}'", did_you_mean(part, [*PRESETS, *COCO_NAMES]))
         classes.update(PRESETS.get(part, (part,)))
@@ -159,7 +160,7 @@ class SegmentationSettings(Settings):
     @property
     def unused(self) -> Mapping[str, str]:
         """Tunable fields without effect: exact masks have no scores, recorded masks no probabilities."""
-        fields: dict[str, Iterable[str]] = {
+        fields: dict[str, tuple[str, ...]] = {
             "none": type(self).model_fields.keys() - {"source"},
             "oracle": ("confidence", "mask_threshold"),
             "oracle-classes": ("confidence", "mask_threshold"),

@@ -146,8 +146,7 @@ class Atlas:
         submap = self.submaps.get(left)
         if submap is None:
             return last.copy(), bound_m
-        length = self._unit_ratio * float(np.linalg.norm(last - submap.start))
-        return submap.anchor, submap.bound_m + length + bound_m
+        return submap.anchor, submap.bound_m + self._unit_ratio * float(np.linalg.norm(last - submap.start)) + bound_m
 
 
 # ---------------------------------------------------------------------- from and to a file

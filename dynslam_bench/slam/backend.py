@@ -168,9 +168,8 @@ class RgbdBackend:
         self._resume()
         observations = observe(frame, keep, weight, self.camera, self._scales)
         result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
-        tracking = perf_counter() - begin - sum(result.timings.values())
-        stages = {"tracking": tracking, "mapping": 0.0, "bundle_adjustment": 0.0}
-        return replace(result, timings={**stages, **result.timings})
+        stages = {"tracking": perf_counter() - begin - sum(result.timings.values())}
+        return replace(result, timings={**stages, "mapping": 0.0, "bundle_adjustment": 0.0, **result.timings})
 
     def _track(self, frame: FrameBundle, raw: Observations) -> BackendResult:
         """Predict, match the last frame or relocalise, track the local map, insert a keyframe."""
@@ -185,8 +184,9 @@ class RgbdBackend:
         fit = track_local_map(self.world, observations, initial.matches, initial.T_cam_world, points, tracking)
         velocity = None
         if rolling and self._tracked:
-            force = self._first is not None
-            observations, fit, velocity = self.shutter.refitted(raw, observations, fit, last, stamp, force=force)
+            observations, fit, velocity = self.shutter.refitted(
+                raw, observations, fit, last, stamp, force=self._first is not None
+            )
         if self._grows:
             self.world.visible[fit.in_view] += 1
         required = tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
@@ -199,7 +199,7 @@ class RgbdBackend:
             if first is not None and velocity is not None:
                 return self._restart(frame, raw, first, velocity, fit.count)
             result = self._update_map(frame, tracked, fit, root)
-        return replace(result, matches=len(fit.matches), inliers=fit.count, relocalised=initial.relocalised)
+        return replace(result, matches=len(fit.matches.point), inliers=fit.count, relocalised=initial.relocalised)
 
     def _initial_pose(
         self, frame: FrameBundle, raw: Observations, observations: Observations, last: TrackedFrame, prediction: Array
@@ -258,8 +258,7 @@ class RgbdBackend:
         self._tracked, self._unrecognised = True, 0
         self._last = tracked = TrackedFrame(observations, point, pose, frame.timestamp)
         near, _ = self.world.covisible_of(points)
-        if len(near):
-            self._reference = int(near[0])
+        self._reference = int(near[0]) if len(near) else self._reference
         self._update_state()
         return tracked
 
@@ -268,16 +267,14 @@ class RgbdBackend:
     ) -> BackendResult:
         """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
         self.state, self._first = "lost", None
-        usable = np.count_nonzero(observations.z > 0) if self.uses_depth else len(observations)
-        textured = bool(usable >= MIN_INITIAL)
+        textured = np.count_nonzero((observations.z > 0) | (not self.uses_depth)) >= MIN_INITIAL
         if self._tracked:
             self._gate.lose(last, observations, textured=textured)
         self._tracked = False
         self._forget_motion()
         self._unrecognised = self._unrecognised + 1 if textured else 0
-        enough = self._unrecognised >= self.settings.relocalisation.new_map_after
-        begun = None
-        if enough and self._grows and self.settings.loop_closing.enabled:
+        begun, s = None, self.settings
+        if self._grows and s.loop_closing.enabled and self._unrecognised >= s.relocalisation.new_map_after:
             begun = self._begin_submap(frame, observations, last)
         return begun or self._result(None if self._last is None else prediction)
 
@@ -365,15 +362,13 @@ class RgbdBackend:
         self, frame: FrameBundle, tracked: TrackedFrame, fit: MapFit, root: InitialPose | None
     ) -> BackendResult:
         """Make the tracked frame a keyframe if the policy or a merge asks for it, and add its pose to the history."""
-        timings: dict[str, float] = {}
-        pose = fit.estimate.T_cam_world
+        timings, pose = {}, fit.estimate.T_cam_world
         needed = root is not None or self._keyframes.needed(self.world, tracked, frame.index, self._reference)
         if self._grows and needed:
             timings = self._insert_keyframe(frame, tracked, root)
             pose = tracked.T_cam_world
             self.motion.relocated(pose)
-        relative = pose @ se3.inverse(self.world.kf_pose[self._reference])
-        self._remember(frame, relative, fit.estimate.information)
+        self._remember(frame, pose @ se3.inverse(self.world.kf_pose[self._reference]), fit.estimate.information)
         self._update_state()
         result = replace(self._result(tracked.T_cam_world, timings), residual_px=fit.estimate.residual_px)
         if root is None or not self.atlas.active or not self.loops.in_root_map:

@@ -129,14 +129,9 @@ def match_views(first: Observations, second: Observations, expected: Array, radi
     Returns:
         int64 ``[M, 2]``, features of the first view and of the second.
     """
-    count = len(first)
-    windows = expected, np.full(count, np.nan), np.full(count, radius_px)
-    octaves = first.octave - 1, first.octave + 1
+    windows = expected, np.full(len(first), np.nan), np.full(len(first), radius_px)
     free = np.ones(len(second), bool)
-    arrays = second.xy, second.right, second.octave, second.words
-    feature, _ = search_in_radius(
-        second.grid, arrays, free, windows, octaves, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
-    )
+    feature = search_in_radius(second, free, windows, first.octave, first.words, max_distance=MAX_DISTANCE, ratio=RATIO)
     rows = np.flatnonzero(feature >= 0)
     rows = rows[rotation_consistent(first.angle[rows], second.angle[feature[rows]])]
     return np.stack([rows, feature[rows]], axis=1)

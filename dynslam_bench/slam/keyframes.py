@@ -76,8 +76,7 @@ class KeyframePolicy:
             return True
         if inliers < s.tracked_share * established_points(world, reference):
             return True
-        newest = int(np.where(world.kf_alive, world.kf_id, -1).argmax())
-        view = share_in_view(world, newest, tracked.T_cam_world)
+        view = share_in_view(world, int(np.where(world.kf_alive, world.kf_id, -1).argmax()), tracked.T_cam_world)
         return view < VIEW_SHARE or (view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers)
 
 
@@ -91,13 +90,9 @@ def established_points(world: Map, keyframe: int) -> int:
 def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
     """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
     points = world.kf_point[keyframe]
-    local = world.position[points[points >= 0]] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
-    if not len(local):
-        return 1.0
-    ahead = local[:, 2] > 0.05
-    uv = world.camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-    inside = ahead & (uv >= 0).all(axis=1) & (uv[:, 0] < world.camera.width) & (uv[:, 1] < world.camera.height)
-    return float(np.mean(inside))
+    position = world.position[points[points >= 0]]
+    _, inside = world.camera.view(position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
+    return float(np.mean(inside)) if len(inside) else 1.0
 
 
 class MapView(NamedTuple):
@@ -131,7 +126,7 @@ class MapViews:
     def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
         """A keyframe was made; those that were culled for it lose their depth images."""
         self._depth_images[slot] = depth
-        newest = self._world.keyframes[-self._most_images :].tolist() if self._most_images else []
+        newest = self._world.keyframes[::-1][: self._most_images]
         self._depth_images = {at: image for at, image in self._depth_images.items() if at in newest}
 
     def of(self, submap: int) -> MapView:
@@ -140,8 +135,7 @@ class MapViews:
         if self._made_for != (world.next_keyframe, submap):
             self._made_for = world.next_keyframe, submap
             newest, points = world.submap(submap)[::-1][:VIEWS].tolist(), self._points_of(submap)
-            keyframes = tuple(self._keyframe(slot) for slot in newest)
-            self._view = MapView(keyframes, world.id[points], world.position[points])
+            self._view = MapView(tuple(map(self._keyframe, newest)), world.id[points], world.position[points])
         return self._view
 
     def outputs(self) -> MapOutputs:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.features.matching import FAR, CellGrid, Words, distance, search_in_radius
+from dynslam_bench.features.matching import FAR, CellGrid, Features, Words, distance, search_in_radius
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.bundle_adjustment import (
     Bundle,
@@ -117,8 +117,7 @@ class LocalMapper:
             return
         free = free[np.argsort(observations.z[free], kind="stable")]
         if not everything:
-            close = int(np.count_nonzero(observations.z[free] < self.close_m))
-            free = free[: max(close, MIN_DEPTH_POINTS)]
+            free = free[: max(np.count_nonzero(observations.z[free] < self.close_m), MIN_DEPTH_POINTS)]
         position = se3.transform(
             se3.inverse(world.kf_pose[slot]), world.camera.unproject(observations.xy[free], observations.z[free])
         )
@@ -180,10 +179,9 @@ class LocalMapper:
         xy = world.kf_xy[keyframe, :n]
         grid = CellGrid.of(xy, world.camera.width, world.camera.height)
         levels = world.kf_octave[keyframe, :n].astype(np.int64)
-        arrays = xy, world.kf_right[keyframe, :n], levels, world.kf_words[keyframe, :n]
-        windows, octaves = (uv, right, 3.0 * world.scales[octave]), (octave - 1, octave + 1)
-        free, words = np.ones(n, bool), world.words[points]
-        feature, _ = search_in_radius(grid, arrays, free, windows, octaves, words, max_distance=MAX_DISTANCE)
+        features = Features(xy, world.kf_right[keyframe, :n], levels, world.kf_words[keyframe, :n], grid)
+        windows, words = (uv, right, 3.0 * world.scales[octave]), world.words[points]
+        feature = search_in_radius(features, np.ones(n, bool), windows, octave, words, max_distance=MAX_DISTANCE)
         hit = feature >= 0
         points, feature = points[hit], feature[hit]
         good = ((xy[feature] - uv[hit]) ** 2).sum(axis=1) / world.scales[levels[feature]] ** 2 < 5.991
@@ -194,10 +192,7 @@ class LocalMapper:
             duplicate = int(world.kf_point[keyframe, row])
             if duplicate < 0 or duplicate == point or not world.alive[point]:
                 continue
-            if world.n_obs[duplicate] > world.n_obs[point]:
-                world.merge(point, duplicate)
-            else:
-                world.merge(duplicate, point)
+            world.replace_point(*sorted((duplicate, point), key=world.n_obs.__getitem__))  # the less observed one
 
     # ------------------------------------------------------------------ bundle adjustment
 

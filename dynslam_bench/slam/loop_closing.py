@@ -40,7 +40,7 @@ from dynslam_bench.slam.place_recognition import (
     verify_place,
 )
 from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import InitialPose, Matches, Observations, weakly_connected
+from dynslam_bench.slam.tracking import InitialPose, Observations, weakly_connected
 
 CANDIDATES = 3
 """Best-ranked keyframes that are matched feature by feature."""
@@ -63,8 +63,8 @@ ROTATION_M, ROTATION_DEPTHS = 3.0, 1.0
 wall so far away."""
 DRIFT_SECTION = 100.0
 """Path along which drift adds up; sections of a longer one drift independently, so that its root counts."""
-NEGLIGIBLE_M, NEGLIGIBLE_DEG, NEGLIGIBLE_SCALE = 0.01, 0.3, 0.01
-"""A smaller correction is left to fusion and bundle adjustment; of a scale, its logarithm."""
+NEGLIGIBLE = 0.01, 0.3, 0.01
+"""A smaller correction is left to fusion and bundle adjustment: distance, degrees, logarithm of the scale."""
 MAX_SCALE = 3.0
 """Factor by which scale may have drifted at most."""
 MIN_SCALE_POINTS = 20
@@ -256,23 +256,18 @@ class LoopCloser:
         score = recognition_scores(world, np.concatenate([near, old]), observations)
         least, score = score[: len(near)].min(initial=np.inf), score[len(near) :]
         rng = stream(self._seed, "loop", int(world.kf_id[slot]))
-        for row in np.argsort(-score, kind="stable")[:CANDIDATES]:
-            if score[row] < least:
-                continue
-            matches = match_keyframe(world, int(old[row]), observations)
-            if len(matches) < MIN_MATCHES:
-                continue
-            loop = self._verified_candidate(slot, int(old[row]), observations, matches, rng)
-            if loop is not None:
-                return loop
-        return None
+        best = np.argsort(-score, kind="stable")[:CANDIDATES]
+        loops = (self._verified_candidate(slot, int(old[k]), observations, rng) for k in best if score[k] >= least)
+        return next((loop for loop in loops if loop is not None), None)
 
     def _verified_candidate(
-        self, slot: int, candidate: int, observations: Observations, matches: Matches, rng: np.random.Generator
+        self, slot: int, candidate: int, observations: Observations, rng: np.random.Generator
     ) -> Loop | None:
         """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
-        s = self.settings.loop_closing
-        ransac = ransac_matches(matches, observations, self.world.camera, rng, MIN_MATCHES // 2)
+        s, matches = self.settings.loop_closing, match_keyframe(self.world, candidate, observations)
+        ransac = None
+        if len(matches) >= MIN_MATCHES:
+            ransac = ransac_matches(matches, observations, self.world.camera, rng, MIN_MATCHES // 2)
         if ransac is None:
             return None
         pose, inliers = ransac
@@ -292,8 +287,8 @@ class LoopCloser:
             return None
         if (loop.fits or self._scale_is_known) and self._aliased(slot, observations, loop):
             return None
-        precise = root.uncertainty <= MERGE_UNCERTAINTY
-        well = loop.inliers >= s.min_inliers and loop.share >= MERGE_SHARE and precise
+        enough = loop.inliers >= s.min_inliers and loop.share >= MERGE_SHARE
+        well = enough and root.uncertainty <= MERGE_UNCERTAINTY
         self.in_root_map = loop.fits
         self._met_at = frame if self._met_at is None else self._met_at
         self.leaves_submap = self.in_root_map and not well and frame - self._met_at >= PATIENCE
@@ -333,9 +328,8 @@ class LoopCloser:
             return loop.fits and bool(np.radians(loop.rotated_deg) <= self.atlas.slack(here, there))
         if not 1 / MAX_SCALE < loop.scale < MAX_SCALE:
             return False
-        path = self._path_since(loop.keyframe)
-        moved_limit = SLACK_M + self.settings.loop_closing.drift_share * path
-        return loop.moved_m <= moved_limit and loop.rotated_deg <= SLACK_DEG + DRIFT_DEG * path
+        path, share = self._path_since(loop.keyframe), self.settings.loop_closing.drift_share
+        return loop.moved_m <= SLACK_M + share * path and loop.rotated_deg <= SLACK_DEG + DRIFT_DEG * path
 
     def _fits(self, slot: int, loop: Loop) -> bool:
         """Whether the younger of two submaps can have begun where the merge puts its start."""
@@ -355,8 +349,8 @@ class LoopCloser:
         depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[own])[:, 2]))
         hypotheses = {here: PlaceHypothesis(world.kf_pose[slot], loop.share, depth)}
         hypotheses[there] = PlaceHypothesis(loop.T_cam_world, loop.share, depth * loop.scale)
-        old = weakly_connected(world, slot)
-        return is_aliased(world, observations, hypotheses, old, self.settings.tracking, self._seed)
+        tracking = self.settings.tracking
+        return is_aliased(world, observations, hypotheses, weakly_connected(world, slot), tracking, self._seed)
 
     def _path_since(self, slot: int) -> float:
         """The path whose drift adds up since a keyframe: the length since then, or over a closed loop."""
@@ -377,8 +371,8 @@ class LoopCloser:
         loop_edge = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=LOOP_WEIGHT)
         older = edges_within(world.kf_id[world.keyframes], self._loop_edges)
         self._loop_edges = [*older, loop_edge]
-        small = loop.moved_m < NEGLIGIBLE_M and loop.rotated_deg < NEGLIGIBLE_DEG
-        if small and abs(np.log(loop.scale)) < NEGLIGIBLE_SCALE:
+        correction = np.array([loop.moved_m, loop.rotated_deg, abs(np.log(loop.scale))])
+        if (correction < NEGLIGIBLE).all():
             return
         submap = int(world.kf_map[slot])
         slots = world.submap(submap)
@@ -421,9 +415,8 @@ class LoopCloser:
         self.rescaled = dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array) -> Edge:
-        world = self.world
-        relative = pose_of_other @ se3.inverse(world.kf_pose[one])
-        return Edge(int(world.kf_id[one]), int(world.kf_id[other]), relative)
+        ids = self.world.kf_id[[one, other]].tolist()
+        return Edge(*ids, pose_of_other @ se3.inverse(self.world.kf_pose[one]))
 
     def _covisibility_edges(self, slots: Slots) -> list[Edge]:
         """Edges of each keyframe to the older ones that share many points, and to the one that shares most.

@@ -185,7 +185,8 @@ class Map:
 
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
-        counts = _covisibility(self.obs_kf, self.obs_at, self.n_obs, np.asarray(points, np.int32), self.kf_alive.size)
+        observers = self.obs_kf[self.observations(points[points >= 0])]
+        counts = np.bincount(observers, minlength=self.kf_alive.size)
         if exclude >= 0:
             counts[exclude] = 0
         slots = np.flatnonzero(counts)
@@ -267,16 +268,17 @@ class Map:
         """Remove points and their observations."""
         points = np.unique(points)
         points = points[self.alive[points]]
-        _drop_points(*self._observed, self.kf_point, points)
-        self.alive[points] = False
+        rows = self.observations(points)
+        self.kf_point[self.obs_kf[rows], self.obs_ft[rows]] = -1
+        self.n_obs[points], self.alive[points] = 0, False
         self._freed_points.extend(points.tolist())
 
-    def merge(self, old: int, new: int) -> None:
+    def replace_point(self, old: int, new: int) -> None:
         """Replace a point by another that is the same point of the scene."""
         if old == new or not self.alive[old] or not self.alive[new]:
             return
         self._reserve(np.array([new]), int(self.n_obs[old]))
-        _merge(*self._observed, self.kf_point, old, new)
+        _replace(*self._observed, self.kf_point, old, new)
         self.visible[new] += self.visible[old]
         self.found[new] += self.found[old]
         self.alive[old] = False
@@ -296,7 +298,7 @@ class Map:
     def _observed(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Slots, NDArray[np.int32]]:
         return self.obs_kf, self.obs_ft, self.obs_at, self.n_obs
 
-    def observations(self, points: Slots) -> Slots:
+    def observations(self, points: NDArray[np.integer]) -> Slots:
         """Rows of `obs_kf` and `obs_ft` that belong to points, one point after the other."""
         count = self.n_obs[points].astype(np.int64)
         begin = self.obs_at[points] - (np.cumsum(count) - count)
@@ -398,34 +400,12 @@ def _unlink(
 
 
 @kernel
-def _drop_points(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, points: Slots) -> None:
-    """Remove all observations of the points."""
-    for i in range(points.shape[0]):
-        p = points[i]
-        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
-            kf_point[obs_kf[o], obs_ft[o]] = -1
-        n_obs[p] = 0
-
-
-@kernel
-def _merge(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, old: int, new: int) -> None:
+def _replace(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, old: int, new: int) -> None:
     """Move the observations of `old` to `new`; where one keyframe observes both, that of `new` stays."""
     for o in range(obs_at[old], obs_at[old] + n_obs[old]):
         kf_point[obs_kf[o], obs_ft[o]] = -1
         _link_one(obs_kf, obs_ft, obs_at, n_obs, kf_point, obs_kf[o], obs_ft[o], new)
     n_obs[old] = 0
-
-
-@kernel
-def _covisibility(obs_kf: Ints, obs_at: Slots, n_obs: Ints, points: Ints, slots: int) -> Slots:
-    """How many of the points each keyframe slot observes."""
-    counts = np.zeros(slots, np.int64)
-    for i in range(points.shape[0]):
-        p = points[i]
-        if p >= 0:
-            for o in range(obs_at[p], obs_at[p] + n_obs[p]):
-                counts[obs_kf[o]] += 1
-    return counts
 
 
 @kernel

@@ -50,24 +50,17 @@ def pose_covariance(T_cam_world: Array, information: Array, inflation: float = I
     j = np.zeros((6, 6))
     j[:3, :3] = -T_cam_world[:3, :3]
     j[3:, 3:] = np.eye(3)
-    matrix = j.T @ information @ j / inflation
-    covariance = np.linalg.inv(matrix + 1e-3 * np.eye(6))
+    covariance = np.linalg.inv(j.T @ information @ j / inflation + 1e-3 * np.eye(6))
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
-    q = np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3)
-    noise = np.zeros((12, 12))
-    noise[:6, :6] = np.diag(q * dt**4 / 4)
-    noise[:6, 6:] = noise[6:, :6] = np.diag(q * dt**3 / 2)
-    noise[6:, 6:] = np.diag(q * dt**2)
-    return noise
+    q = np.diag(np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3))
+    return np.block([[q * dt**4 / 4, q * dt**3 / 2], [q * dt**3 / 2, q * dt**2]])
 
 
 def _transition(dt: float) -> Array:
-    f = np.eye(12)
-    f[:6, 6:] = dt * np.eye(6)
-    return f
+    return np.eye(12) + dt * np.eye(12, k=6)
 
 
 @dataclass(eq=False)
@@ -113,8 +106,7 @@ class MotionState:
         """The state after a correction ``[12]``."""
         pose = np.eye(4)
         pose[:3, :3] = self.rotation
-        twist = np.concatenate([np.zeros(3), correction[3:6]])
-        rotation = apply_twist(pose, twist)[:3, :3]  # keeps it orthonormal
+        rotation = apply_twist(pose, np.append(np.zeros(3), correction[3:6]))[:3, :3]  # keeps it orthonormal
         return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
 
     def transformed(self, rotation: Array, scale: float) -> MotionState:
@@ -128,17 +120,15 @@ class MotionState:
     def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
         """The state `dt` seconds later."""
         f = _transition(dt)
-        noise = _process_noise(dt, settings)
-        step = np.concatenate([self.speed * dt, np.zeros(6)])
-        return self.moved(step, f @ self.covariance @ f.T + noise)
+        covariance = f @ self.covariance @ f.T + _process_noise(dt, settings)
+        return self.moved(np.append(self.speed * dt, np.zeros(6)), covariance)
 
     def motion_covariance(self, dt: float, settings: MotionModelSettings) -> Array:
         """Covariance ``[6, 6]`` of the motion in the next `dt` seconds.
 
         Of (position in the world, rotation in the camera frame); where the camera is now plays no part.
         """
-        noise = _process_noise(dt, settings)
-        return np.asarray(dt**2 * self.covariance[6:, 6:] + noise[:6, :6])
+        return np.asarray(dt**2 * self.covariance[6:, 6:] + _process_noise(dt, settings)[:6, :6])
 
     def updated(self, T_cam_world: Array, covariance: Array) -> MotionState:
         """The state after a measured pose; one beyond the chi-square limit inflates the predicted covariance."""
@@ -187,8 +177,7 @@ def _smooth_part(stamps: Array, poses: Array, covariances: Array, settings: Moti
     later = state
     for k in range(len(stamps) - 2, -1, -1):
         ahead = predicted[k + 1]
-        f = _transition(float(steps[k]))
-        gain = np.linalg.solve(ahead.covariance, f @ filtered[k].covariance).T
+        gain = np.linalg.solve(ahead.covariance, _transition(float(steps[k])) @ filtered[k].covariance).T
         error = np.concatenate([ahead.difference(later.T_cam_world), later.speed - ahead.speed])
         covariance = filtered[k].covariance + gain @ (later.covariance - ahead.covariance) @ gain.T
         later = filtered[k].moved(gain @ error, covariance)
@@ -245,8 +234,8 @@ class CameraMotion:
         dt = timestamp - last.timestamp
         if self.state is None or not 0 < dt <= MAX_GAP_S:
             return last.T_cam_world, None
-        pose = self.state.predicted(dt, self._settings).T_cam_world
-        return pose, self.state.motion_covariance(dt, self._settings)
+        covariance = self.state.motion_covariance(dt, self._settings)
+        return self.state.predicted(dt, self._settings).T_cam_world, covariance
 
     def filtered(self, last: TrackedFrame, timestamp: float, measured: Array, information: Array) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion.
@@ -294,11 +283,10 @@ class FramePose:
 def rescale(history: Sequence[FramePose], scales: Mapping[int, float]) -> None:
     """Lengths around keyframes, by their slots, were multiplied by scales: so are those of their frames."""
     for frame in history:
-        if frame.reference in scales:
-            scale = scales[frame.reference]
-            frame.T_cam_ref[:3, 3] *= scale
-            frame.information[:3] /= scale
-            frame.information[:, :3] /= scale
+        scale = scales.get(frame.reference, 1.0)
+        frame.T_cam_ref[:3, 3] *= scale
+        frame.information[:3] /= scale
+        frame.information[:, :3] /= scale
 
 
 def trajectory(history: Sequence[FramePose], world: Map, settings: MotionModelSettings) -> Trajectory:
@@ -311,7 +299,8 @@ def trajectory(history: Sequence[FramePose], world: Map, settings: MotionModelSe
     ordered = [frames[stamp] for stamp in stamps.tolist()]
     poses = np.array([frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]).reshape(-1, 4, 4)
     if settings.smooth and len(poses) > 2:
-        information = [frame.information.astype(np.float64) for frame in ordered]
-        covariances = [pose_covariance(*pair) for pair in zip(poses, information, strict=True)]
+        covariances = [
+            pose_covariance(pose, f.information.astype(float)) for pose, f in zip(poses, ordered, strict=True)
+        ]
         poses = smooth(stamps, poses, np.array(covariances), settings)
     return Trajectory(stamps, se3.inverse(poses))

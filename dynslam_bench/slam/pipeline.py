@@ -20,14 +20,13 @@ from dynslam_bench.contracts.checks import check_frame
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
-from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.ego_motion import refine_prediction
-from dynslam_bench.culling.guard import GuardSettings, restore_starved
+from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -191,10 +190,13 @@ class SlamPipeline:
         if self._masks is not None:
             with clock("segmentation"):
                 instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
-                mask = self._dynamic_mask(instances, depth)
+                if self._segmentation is not None and instances.class_names:
+                    mask = dynamic_mask(instances, self._segmentation, depth)
         with clock("features"):
             keypoints = self._extract(gray, mask)
-        xy, z = _undistorted(keypoints, depth, camera)
+            xy = camera.undistort_points(keypoints.xy)
+        column, row = np.rint(keypoints.xy).astype(np.intp).T
+        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
         bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
         state = self._filter_state(bundle, camera)
         static = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave
@@ -203,12 +205,6 @@ class SlamPipeline:
         timings = clock.seconds | dict(result.timings)
         stats = self._stats(bundle, state, static, result)
         return TrackResult(result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep)
-
-    def _dynamic_mask(self, instances: Instances, depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
-        """The mask of the objects that are dynamic because of their class; None where there are no objects."""
-        if self._segmentation is None or not len(instances):
-            return None
-        return dynamic_mask(instances, self._segmentation, depth)
 
     def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> Keypoints:
         """Keypoints, enough of them outside the dynamic mask."""
@@ -246,12 +242,11 @@ class SlamPipeline:
             state.keep = state.keep & verdict.keep
             verdicts.append(verdict)
             stats |= {f"{dynamic_filter.name}_{key}": value for key, value in verdict.stats.items()}
-        keep, undone, weight = np.ones(len(frame.xy), bool), 0, np.ones(len(frame.xy), np.float32)
-        if verdicts:
-            keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard)
+        keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard, len(frame.xy))
         used = verdicts[: len(verdicts) - undone]
-        if used:
-            weight = np.prod([verdict.weight for verdict in used], axis=0, dtype=np.float32)
+        weight = np.ones(len(frame.xy), np.float32)
+        for verdict in used:
+            weight *= verdict.weight
         masks = [verdict.mask for verdict in used if verdict.mask is not None]
         mask = np.logical_or.reduce(masks) if masks else None
         return CullingResult(keep, weight, mask, stats | {"guard_undone": float(undone)}, image)
@@ -270,8 +265,7 @@ class SlamPipeline:
 
     def _remember(self, frame: FrameBundle, static: CullingResult, result: BackendResult) -> None:
         tracked = result.state == "ok"
-        in_root_map = tracked and self._backend.state == "ok"  # predictions of a submap are of another world
-        pose = result.T_world_cam if in_root_map else None
+        pose = result.T_world_cam if tracked and self._backend.state == "ok" else None  # in the root map's world
         self._previous = PreviousFrame(frame, static.keep, static.image, pose)
         self._keyframe_due = not tracked or result.keyframe
 
@@ -361,13 +355,27 @@ class SlamPipeline:
         return self._camera
 
 
-def _undistorted(
-    keypoints: Keypoints, depth: NDArray[np.float32], camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Undistorted pixels of keypoints, and the depth there."""
-    column, row = np.rint(keypoints.xy).astype(np.intp).T
-    z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
-    return camera.undistort_points(keypoints.xy), z
+def restore_starved(
+    verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings, total: int
+) -> tuple[NDArray[np.bool_], int]:
+    """The starvation guard: combine the filters' verdicts, without the last ones while too few features remain.
+
+    The first filter of a system is the most reliable (a semantic mask), the last one the least.
+
+    Args:
+        verdicts: bool ``[N]`` a filter, True = keep, in the order of application.
+        settings: How many features must remain.
+        total: N.
+
+    Returns:
+        The combined keep mask ``[N]`` and how many verdicts were set aside; with all set aside every feature is kept.
+    """
+    needed = min(total, max(settings.min_features, int(np.ceil(settings.min_fraction * total))))
+    for undone in range(len(verdicts)):
+        keep = np.logical_and.reduce(verdicts[: len(verdicts) - undone])
+        if np.count_nonzero(keep) >= needed:
+            return keep, undone
+    return np.ones(total, dtype=bool), len(verdicts)
 
 
 def flow_to_previous(

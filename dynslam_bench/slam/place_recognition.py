@@ -156,7 +156,7 @@ def match_keyframe(world: Map, keyframe: int, observations: Observations) -> Mat
     """Match a frame's features to those of a keyframe that observe map points, by descriptor alone."""
     point = world.kf_point[keyframe, : world.kf_count[keyframe]]
     rows = np.flatnonzero(point >= 0)
-    feature, row, _ = match_brute_force(
+    feature, row = match_brute_force(
         observations.words, world.kf_words[keyframe, rows], max_distance=MAX_DISTANCE, ratio=RATIO
     )
     slots = point[rows[row]].astype(np.int64)
@@ -190,14 +190,13 @@ def ransac_pose(
         if not len(poses):
             continue
         local = np.swapaxes(poses[:, :3, :3] @ position.T + poses[:, :3, 3:], 1, 2)
-        error = camera.project(local) - xy
-        inliers = (local[..., 2] > 0.05) & (info * np.square(error).sum(axis=-1) < 2.0 * 5.991)
+        chi2 = info * np.square(camera.project(local) - xy).sum(axis=-1)
+        inliers = (local[..., 2] > 0.05) & (chi2 < 2.0 * 5.991)
         count = np.count_nonzero(inliers, axis=1)
         most = int(count.argmax())
         if count[most] > best_count:
             best, best_count = (poses[most], inliers[most]), int(count[most])
-            share = min(best_count / n, 0.999)
-            needed = int(np.ceil(np.log(0.001) / np.log1p(-(share**3)))) + 1
+            needed = int(np.ceil(np.log(0.001) / np.log1p(-(min(best_count / n, 0.999) ** 3)))) + 1
     return best
 
 

@@ -77,7 +77,7 @@ class RotationEstimate:
             observations: Its features.
             camera: Intrinsics without distortion.
         """
-        before, now, _ = match_brute_force(
+        before, now = match_brute_force(
             self.observations.words, observations.words, max_distance=MAX_DISTANCE, ratio=RATIO
         )
         if len(before) < CONNECTED:
@@ -111,8 +111,7 @@ class RotationEstimate:
             T_now_world: That of now.
             more: How far the two worlds may be rotated against each other, radians.
         """
-        off = se3.rotation_angle(T_now_world @ se3.inverse(self.applied(T_last_world)))
-        return bool(off <= self.slack + more)
+        return bool(se3.rotation_angle(T_now_world @ se3.inverse(self.applied(T_last_world))) <= self.slack + more)
 
 
 def _bearings(xy: Array, camera: Camera) -> Array:
@@ -173,8 +172,7 @@ class RelocalisationGate:
         """
         self.start(last)
         self._advance(observations)
-        many_points = np.count_nonzero(last.point >= 0) >= KIDNAP_POINTS
-        self._kidnapped = self.rotation is None and textured and bool(many_points)
+        self._kidnapped = self.rotation is None and textured and np.count_nonzero(last.point >= 0) >= KIDNAP_POINTS
 
     def start(self, last: TrackedFrame) -> None:
         """The camera counts as lost from the next frame on; `last` is the last tracked one."""
@@ -193,7 +191,7 @@ class RelocalisationGate:
         A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera `prediction`.
         """
         rotation = RotationEstimate(last.observations, np.eye(3)).advanced(observations, self._atlas.world.camera)
-        centres = [se3.inverse(pose)[:3, 3] for pose in (last.T_cam_world, prediction)]
+        centres = se3.inverse(np.stack([last.T_cam_world, prediction]))[:, :3, 3]
         step = float(np.linalg.norm(centres[1] - centres[0]))
         return MotionBound(self._atlas, last.T_cam_world, step + self._distance(last, timestamp), rotation)
 
@@ -269,8 +267,7 @@ class PoseSearch:
     def in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
         pose = replace(self, keyframes=self.world.submap(0), lost=True)._relocalise(MIN_MATCHES)
-        enough = self.settings.relocalisation.min_inliers
-        return pose if pose is not None and len(pose.matches) >= enough else None
+        return pose if pose and len(pose.matches) >= self.settings.relocalisation.min_inliers else None
 
     def _relocalise(self, min_inliers: int) -> InitialPose | None:
         """A pose by descriptors: from the reference keyframe, else from the best-ranked candidates."""
@@ -281,12 +278,9 @@ class PoseSearch:
                 if candidate.estimate.count >= min_inliers and self._within_bound(candidate):
                     return candidate.initial_pose(relocalised=True)
         keyframes = top_candidates(world, self.keyframes, self.observations, CANDIDATES)
-        for candidate in pnp_poses(world, keyframes, self.observations, rng, least):
-            if candidate.estimate.count >= min_inliers:
-                verified = self._verified(candidate)
-                if verified is not None:
-                    return verified
-        return None
+        candidates = pnp_poses(world, keyframes, self.observations, rng, least)
+        verified = (self._verified(one) for one in candidates if one.estimate.count >= min_inliers)
+        return next((pose for pose in verified if pose is not None), None)
 
     def _verified(self, candidate: PoseCandidate) -> InitialPose | None:
         """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
@@ -298,16 +292,14 @@ class PoseSearch:
         place = verify_place(
             world, candidate.keyframe, observations, inliers, candidate.estimate.T_cam_world, s.tracking
         )
-        many = len(place.matches) >= MANY_POINTS
-        if place.share < (MANY_POINTS_SHARE if many else 1.0) * s.relocalisation.min_share:
+        factor = MANY_POINTS_SHARE if len(place.matches) >= MANY_POINTS else 1.0
+        if place.share < factor * s.relocalisation.min_share:
             return None
         uncertainty = 0.0
         if self.lost:
             uncertainty = pose_uncertainty(world, observations, place, stream(self.seed, "halves", self.frame))
-            hypotheses = {submap: place.hypothesis}
-            if uncertainty > 1 or is_aliased(
-                world, observations, hypotheses, self.keyframes, s.tracking, self.seed, admits
-            ):
+            candidates = {submap: place.hypothesis}, self.keyframes
+            if uncertainty > 1 or is_aliased(world, observations, *candidates, s.tracking, self.seed, admits):
                 return None
         return InitialPose(place.T_cam_world, place.matches, candidate.keyframe, True, place.share, uncertainty)
 

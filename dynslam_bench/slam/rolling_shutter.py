@@ -11,16 +11,14 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.map import Array
 from dynslam_bench.slam.motion_model import MAX_GAP_S
-from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, right_coordinates, solve
-
-Array = NDArray[np.float64]
+from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, fit_pose, right_coordinates
 
 MIN_AGREEING = 0.9
 """Share of the inliers before compensation that must be inliers after it."""
@@ -44,8 +42,7 @@ class CameraVelocity:
     def between(cls, before: Array, now: Array, seconds: float) -> CameraVelocity:
         """From two world-to-camera poses ``[4, 4]`` so many seconds apart; in the camera frame of the later one."""
         angular = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).as_rotvec() / seconds
-        back = se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]
-        return cls(now[:3, :3] @ back / seconds, angular)
+        return cls(now[:3, :3] @ (se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]) / seconds, angular)
 
 
 def compensate_rolling_shutter(observations: Observations, camera: Camera, velocity: CameraVelocity) -> Observations:
@@ -63,8 +60,8 @@ def compensate_rolling_shutter(observations: Observations, camera: Camera, veloc
     """
     if not len(observations):
         return observations
-    row = observations.keypoints.xy[:, 1].astype(np.float64)
-    late = (((row + 0.5) / camera.height - 0.5) * camera.readout_s)[:, None]
+    row = observations.keypoints.xy[:, 1:].astype(np.float64)
+    late = ((row + 0.5) / camera.height - 0.5) * camera.readout_s
     has_depth = observations.z > 0
     points = camera.unproject(observations.xy, np.where(has_depth, observations.z, 1.0))
     points = points - np.where(has_depth[:, None], late, 0.0) * velocity.linear
@@ -132,7 +129,7 @@ class RollingShutter:
         exposed = regular if abs(dt - regular) <= STAMP_NOISE * usual else dt
         velocity = CameraVelocity.between(last.T_cam_world, pose, max(exposed, self._camera.readout_s))
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
-        refit = replace(fit, estimate=solve(self._camera, compensated, fit.matches, pose))
+        refit = fit_pose(self._camera, compensated, fit.matches, pose, fit.in_view)
         if refit.count < MIN_AGREEING * fit.count and not force:
             return observations, fit, None
         return compensated, refit, velocity

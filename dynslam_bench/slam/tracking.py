@@ -106,27 +106,27 @@ def observe(
     """
     weight = np.clip(np.nan_to_num(np.asarray(weight, np.float64), nan=0.0), 0.0, 1.0)
     index = np.flatnonzero(np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0))
-    keypoints = frame.keypoints.select(index)
-    xy = np.ascontiguousarray(frame.xy[index], dtype=np.float64)
-    z = np.nan_to_num(frame.z[index].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    xy, z = np.ascontiguousarray(frame.xy[index], dtype=np.float64), frame.z[index].astype(np.float64)
     z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
+    right = right_coordinates(xy, z, camera)
+    keypoints = frame.keypoints.select(index)
     octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
     variance = scales[octave] ** 2
     noise = RIGHT_SIGMA_PX**2 * variance + (camera.fx * camera.baseline_m * DEPTH_NOISE) ** 2
-    column = np.clip(np.rint(keypoints.xy[:, 0]).astype(np.int64), 0, frame.rgb.shape[1] - 1)
-    row = np.clip(np.rint(keypoints.xy[:, 1]).astype(np.int64), 0, frame.rgb.shape[0] - 1)
+    height, width = frame.rgb.shape[:2]
+    column, row = np.rint(keypoints.xy).astype(np.int64).T
     return Observations(
         keypoints,
         xy,
         z,
-        right_coordinates(xy, z, camera),
+        right,
         octave,
         keypoints.angle.astype(np.float64),
         as_words(keypoints.descriptors),
         weight[index] / variance,
         np.where(z > 0, weight[index] / noise, 0.0),
         CellGrid.of(xy, camera.width, camera.height),
-        frame.rgb[row, column],
+        frame.rgb[row.clip(0, height - 1), column.clip(0, width - 1)],
         frame.mask,
     )
 
@@ -177,9 +177,7 @@ class Matches:
 
     def joined(self, other: Matches) -> Matches:
         """These matches, then the others."""
-        feature = np.concatenate((self.feature, other.feature))
-        point = np.concatenate((self.point, other.point))
-        return Matches(feature, point, np.concatenate((self.position, other.position)))
+        return Matches(*map(np.concatenate, zip(vars(self).values(), vars(other).values(), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +196,8 @@ class PoseCandidate:
 
     def initial_pose(self, *, relocalised: bool) -> InitialPose:
         """The pose with the matches that are inliers."""
-        inliers = self.matches.select(self.estimate.inliers)
-        return InitialPose(self.estimate.T_cam_world, inliers, self.keyframe, relocalised)
+        pose, inliers = self.estimate.T_cam_world, self.matches.select(self.estimate.inliers)
+        return InitialPose(pose, inliers, self.keyframe, relocalised)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,35 +282,24 @@ def match_last_frame(
     """
     camera = world.camera
     from_map = last.point >= 0
-    from_depth = ~from_map & (last.observations.z > 0) & (last.observations.z < close_m)
-    rows = np.flatnonzero(from_map | from_depth)
-    position = np.zeros((len(rows), 3))
+    rows = np.flatnonzero(from_map | (last.observations.z > 0) & (last.observations.z < close_m))
     mapped = from_map[rows]
-    position[mapped] = world.position[last.point[rows[mapped]]]
+    position = world.position[last.point[rows]]
     unmapped = rows[~mapped]
     if len(unmapped):
         local = camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
         position[~mapped] = se3.transform(se3.inverse(last.T_cam_world), local)
     local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
-    ahead = local[:, 2] > 0.05
-    uv = camera.project(np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
-    inside = (
-        ahead
-        & (uv >= -MARGIN_PX).all(axis=1)
-        & (uv < (camera.width + MARGIN_PX, camera.height + MARGIN_PX)).all(axis=1)
-    )
+    uv, inside = camera.view(local, MARGIN_PX)
     rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
     octave = last.observations.octave[rows]
-    free, words = np.ones(len(observations.xy), bool), last.observations.words[rows]
     right = uv[:, 0] - camera.fx * camera.baseline_m / depth
-    windows, octaves = (uv, right, radius_px * world.scales[octave]), (octave - 1, octave + 1)
-    feature, _ = search_in_radius(
-        observations.grid,
-        (observations.xy, observations.right, observations.octave, observations.words),
-        free,
-        windows,
-        octaves,
-        words,
+    feature = search_in_radius(
+        observations,
+        np.ones(len(observations.xy), bool),
+        (uv, right, radius_px * world.scales[octave]),
+        octave,
+        last.observations.words[rows],
         max_distance=max_distance,
         ratio=LAST_FRAME_RATIO,
     )
@@ -353,16 +340,13 @@ def match_map(
     rest = ~matched[points]
     radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
     wanted = points[rest]
-    windows, octaves = (uv[rest], right[rest], radius[rest]), (octave[rest] - 1, octave[rest] + 1)
-    words, bits = world.words[wanted], settings.max_distance
-    feature, _ = search_in_radius(
-        observations.grid,
-        (observations.xy, observations.right, observations.octave, observations.words),
+    feature = search_in_radius(
+        observations,
         free,
-        windows,
-        octaves,
-        words,
-        max_distance=bits,
+        (uv[rest], right[rest], radius[rest]),
+        octave[rest],
+        world.words[wanted],
+        max_distance=settings.max_distance,
         ratio=MAP_RATIO,
     )
     hit = feature >= 0
@@ -386,21 +370,24 @@ class MapFit:
         matches: The matches it was fitted to.
         estimate: The pose.
         in_view: Slots of the map points that should be in view.
+        inliers: bool ``[M]``, which matches fit the pose and show a map point.
+        count: How many do.
     """
 
     matches: Matches
     estimate: PoseEstimate
     in_view: Slots
+    inliers: NDArray[np.bool_]
+    count: int
 
-    @property
-    def inliers(self) -> NDArray[np.bool_]:
-        """Boolean ``[M]``: which matches fit the pose and show a map point."""
-        return self.estimate.inliers & (self.matches.point >= 0)
 
-    @property
-    def count(self) -> int:
-        """Number of inliers."""
-        return int(np.count_nonzero(self.inliers))
+def fit_pose(
+    camera: Camera, observations: Observations, matches: Matches, T_cam_world: Array, in_view: Slots
+) -> MapFit:
+    """Fit the pose to matches with the local map."""
+    estimate = solve(camera, observations, matches, T_cam_world)
+    inliers = estimate.inliers & (matches.point >= 0)
+    return MapFit(matches, estimate, in_view, inliers, int(np.count_nonzero(inliers)))
 
 
 def track_local_map(
@@ -426,9 +413,8 @@ def track_local_map(
     more, in_view = match_map(world, observations, T_cam_world, matches, candidates, settings)
     matches = matches.joined(more)
     mapped = matches.select(matches.point >= 0)
-    if len(mapped) >= 2 * settings.min_inliers:
-        matches = mapped
-    return MapFit(matches, solve(world.camera, observations, matches, T_cam_world), in_view)
+    enough = len(mapped.point) >= 2 * settings.min_inliers
+    return fit_pose(world.camera, observations, mapped if enough else matches, T_cam_world, in_view)
 
 
 # ---------------------------------------------------------------------- the local map
@@ -490,8 +476,6 @@ def weakly_connected(world: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> 
 
 
 def _long_ago(world: Map, keyframe: int, gap: int, connected: Slots) -> Slots:
-    here = np.zeros(world.kf_alive.size, bool)
-    here[keyframe] = True
-    here[connected] = True
-    long_ago = (np.abs(world.kf_id - world.kf_id[keyframe]) >= gap) & ~here
+    long_ago = np.abs(world.kf_id - world.kf_id[keyframe]) >= gap
+    long_ago[connected] = False
     return np.flatnonzero(world.kf_alive & (long_ago | (world.kf_map != world.kf_map[keyframe])))

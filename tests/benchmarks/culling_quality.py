@@ -24,7 +24,6 @@ import os
 import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -79,38 +78,6 @@ ROWS: dict[str, tuple[str, dict[str, object]]] = {
 }
 
 
-@dataclass
-class Counts:
-    """Features by what they lie on: how many there were and how many were culled."""
-
-    seen: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    culled: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    frames: int = 0
-    idle: int = 0
-
-    def add(self, kind: np.ndarray, keep: np.ndarray) -> None:
-        """Count one frame's features of kinds 0 (background), 1 (still person) and 2 (moving)."""
-        self.seen += np.bincount(kind, minlength=3)
-        self.culled += np.bincount(kind[~keep], minlength=3)
-        self.frames += 1
-        self.idle += bool(keep.all())
-
-    @property
-    def recall(self) -> float:
-        """Share of the moving features that were culled."""
-        return float(self.culled[2] / max(self.seen[2], 1))
-
-    @property
-    def precision(self) -> float:
-        """Share of the moving ones among culled moving and background features; NaN where none was culled."""
-        total = self.culled[2] + self.culled[0]
-        return float(self.culled[2] / total) if total else float("nan")
-
-    def loss(self, kind: int) -> float:
-        """Share of the features of a kind that was culled."""
-        return float(self.culled[kind] / max(self.seen[kind], 1))
-
-
 def kinds(masks: FrameMasks, xy: np.ndarray) -> np.ndarray:
     """What each feature (raw pixels ``[N, 2]``) lies on: 0 background, 1 a person standing still, 2 a moving thing."""
     height, width = masks.instances.shape
@@ -121,30 +88,32 @@ def kinds(masks: FrameMasks, xy: np.ndarray) -> np.ndarray:
 
 
 def measure(
-    tracker_id: str, settings: dict[str, object], name: str, part: tuple[int, int | None], cache: Path, counts: Counts
-) -> tuple[float, float]:
-    """Run one tracker on one sequence; adds to `counts`, returns ATE in metres and coverage."""
+    tracker_id: str, settings: dict[str, object], name: str, part: tuple[int, int | None], cache: Path
+) -> tuple[float, float, np.ndarray]:
+    """Run one tracker on one sequence.
+
+    Returns:
+        ATE in metres, coverage, and of each frame ``[F, 2, 3]`` the number of features and of culled ones by kind.
+    """
     sequence = open_sequence(name, frames=part)
     assert sequence.masks is not None and sequence.ground_truth is not None, f"{name} has no exact masks"
     context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache))
     tracker = build_tracker(tracker_id, settings, context)
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
-    stamps, poses = [], []
+    poses, counts = {}, []
     for i in range(len(sequence)):
         frame = sequence[i]
         result = tracker.track(frame)
         if result.state == "ok":
-            stamps.append(frame.timestamp)
-            poses.append(result.T_world_cam)
-        assert result.keypoints_xy is not None and result.keypoints_keep is not None
-        counts.add(kinds(sequence.masks[i], result.keypoints_xy), result.keypoints_keep)
-    if len(stamps) < 3:
-        return float("nan"), len(stamps) / len(sequence)
-    online = Trajectory(np.array(stamps), np.array(poses))
-    metrics = evaluate(
-        online, sequence.ground_truth, get_protocol("tum-rgbd/v1"), input_timestamps=sequence.timestamps
-    ).metrics
-    return float(metrics["ate_rmse_m"]), len(stamps) / len(sequence)
+            poses[frame.timestamp] = result.T_world_cam
+        kind = kinds(sequence.masks[i], result.keypoints_xy)
+        counts.append([np.bincount(which, minlength=3) for which in (kind, kind[~result.keypoints_keep])])
+    coverage, ate = len(poses) / len(sequence), np.nan
+    if len(poses) >= 3:
+        online, due = Trajectory(np.array([*poses]), np.array([*poses.values()])), sequence.timestamps
+        protocol = get_protocol("tum-rgbd/v1")
+        ate = evaluate(online, sequence.ground_truth, protocol, input_timestamps=due).metrics["ate_rmse_m"]
+    return ate, coverage, np.array(counts)
 
 
 def row(label: str, names: list[str], part: tuple[int, int | None], masks: str | None, cache: Path) -> str:
@@ -154,13 +123,15 @@ def row(label: str, names: list[str], part: tuple[int, int | None], masks: str |
     default = getattr(TRACKERS.get(tracker_id).settings(), "segmentation", None)
     if masks is not None and default is not None and default.source != "none":
         settings = settings | {"segmentation.source": masks}
-    counts = Counts()
-    runs = [measure(tracker_id, settings, name, part, cache, counts) for name in names]
-    each = " ".join(f"{1e3 * ate:.1f}" for ate, _ in runs)
+    ates, coverages, counts = zip(*(measure(tracker_id, settings, name, part, cache) for name in names), strict=True)
+    by_frame = np.concatenate(counts)
+    seen, culled = by_frame.sum(axis=0)
+    precision = culled[2] / (culled[0] + culled[2]) if culled[[0, 2]].any() else np.nan
+    background, still, recall = 100 * culled / np.maximum(seen, 1)
+    idle = 100 * np.mean(by_frame[:, 1].sum(axis=1) == 0)
     return (
-        f"| {label} | {100 * counts.precision:.1f} % | {100 * counts.recall:.1f} % "
-        f"| {100 * counts.loss(0):.1f} % | {100 * counts.loss(1):.1f} % | {100 * counts.idle / counts.frames:.0f} % "
-        f"| {1e3 * np.mean([ate for ate, _ in runs]):.1f} ({each}) | {100 * min(c for _, c in runs):.0f} % |"
+        f"| {label} | {100 * precision:.1f} % | {recall:.1f} % | {background:.1f} % | {still:.1f} % | {idle:.0f} % "
+        f"| {1e3 * np.mean(ates):.1f} ({' '.join(f'{1e3 * ate:.1f}' for ate in ates)}) | {100 * min(coverages):.0f} % |"
     )
 
 

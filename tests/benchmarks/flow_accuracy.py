@@ -105,8 +105,7 @@ def dense_table(budgets: Sequence[int]) -> None:
     def row(name: str, flow: np.ndarray, valid: np.ndarray | None, spent: float) -> None:
         e = np.linalg.norm(flow - truth, axis=2)
         good = known if valid is None else known & valid
-        share = "-" if valid is None else f"{100 * valid[known].mean():.0f} | {np.median(e[good]):.2f}"
-        share = "- | -" if valid is None else share
+        share = "- | -" if valid is None else f"{100 * valid[known].mean():.0f} | {np.median(e[good]):.2f}"
         print(
             f"| {name} | {np.median(e[known]):.2f} | {100 * (e[known] > 3).mean():.1f} | {share} | {spent:.0f} |",
             flush=True,

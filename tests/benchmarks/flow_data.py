@@ -7,16 +7,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 
+from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.slam.pose_optimisation import optimise_pose
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-FR1 = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
-BONN = Camera(640, 480, 542.822841, 542.576870, 315.593520, 237.756098, (0.039903, -0.099343, -0.00073, -0.000144, 0.0))
 RECORDINGS = {
-    "fr1_xyz": (DATA / "tum/rgbd_dataset_freiburg1_xyz", FR1),
-    "fr1_rpy": (DATA / "tum/rgbd_dataset_freiburg1_rpy", FR1),
-    "bonn": (DATA / "bonn/rgbd_bonn_crowd", BONN),
+    "fr1_xyz": DATA / "tum/rgbd_dataset_freiburg1_xyz",
+    "fr1_rpy": DATA / "tum/rgbd_dataset_freiburg1_rpy",
+    "bonn": DATA / "bonn/rgbd_bonn_crowd",
 }
 
 
@@ -37,23 +40,17 @@ class Pair:
 
 def corners(gray: np.ndarray, count: int = 1000) -> np.ndarray:
     """ORB keypoints over all octaves, spread over a grid, float32 ``[N, 2]``."""
-    found = cv2.ORB.create(4 * count, fastThreshold=7).detect(gray)
-    found = sorted(found, key=lambda k: -k.response)
-    cells: dict[tuple[int, int], int] = {}
-    quota = max(1, int(1.5 * count / (16 * 12)))
-    xy = []
-    for k in found:
-        cell = (int(k.pt[0] * 16 / gray.shape[1]), int(k.pt[1] * 12 / gray.shape[0]))
-        if cells.get(cell, 0) < quota:
-            cells[cell] = cells.get(cell, 0) + 1
-            xy.append(k.pt)
-    return np.asarray(xy[:count], dtype=np.float32)
+    keypoints = sorted(cv2.ORB.create(4 * count, fastThreshold=7).detect(gray), key=lambda k: -k.response)
+    xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
+    column, row = (xy * (16, 12) // gray.shape[::-1]).astype(int).T
+    cells = pd.Series(16 * row + column)
+    return xy[cells.groupby(cells).cumcount() < max(1, int(1.5 * count / (16 * 12)))][:count]
 
 
 def textures(limit: int) -> list[np.ndarray]:
     """Frames of the recordings and photographs, 640x480 grey."""
     paths = []
-    for folder, _ in RECORDINGS.values():
+    for folder in RECORDINGS.values():
         files = sorted((folder / "rgb").glob("*.png"))
         paths += [files[0], files[len(files) // 2]]
     photos = sorted((DATA / "coco128-seg/images/train2017").glob("*.jpg"))
@@ -132,81 +129,6 @@ def synthetic(kinds: tuple[str, ...], images: int, seed: int = 7) -> list[Pair]:
     return pairs
 
 
-def _stamped(folder: Path, kind: str) -> list[tuple[float, Path]]:
-    return sorted((float(path.stem), path) for path in (folder / kind).glob("*.png"))
-
-
-def _poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    rows = np.loadtxt(folder / "groundtruth.txt", comments="#")
-    q = rows[:, 4:8] / np.linalg.norm(rows[:, 4:8], axis=1, keepdims=True)
-    x, y, z, w = q.T
-    rotation = np.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ], axis=1).reshape(-1, 3, 3)  # fmt: skip
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotation, rows[:, 1:4]
-    return rows[:, 0], poses
-
-
-def _exp(w: np.ndarray) -> np.ndarray:
-    return cv2.Rodrigues(w.astype(np.float64))[0]
-
-
-def _refine_pose(
-    motion: np.ndarray, points: np.ndarray, observed: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, float]:
-    """Robust Gauss-Newton on the reprojection error, from the ground truth on; returns the median residual."""
-    for scale in (6.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0):
-        p = points @ motion[:3, :3].T + motion[:3, 3]
-        z = np.maximum(p[:, 2], 0.1)
-        uv = np.stack([camera.fx * p[:, 0] / z + camera.cx, camera.fy * p[:, 1] / z + camera.cy], axis=1)
-        r = uv - observed
-        weight = (1 - np.minimum((r**2).sum(1) / (3 * scale) ** 2, 1)) ** 2
-        jacobian = np.zeros((len(p), 2, 6))
-        jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * p[:, 0] / z**2
-        jacobian[:, 1, 1], jacobian[:, 1, 2] = camera.fy / z, -camera.fy * p[:, 1] / z**2
-        skew = np.zeros((len(p), 3, 3))
-        skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -p[:, 2], p[:, 1], -p[:, 0]
-        skew -= skew.transpose(0, 2, 1)
-        jacobian[:, :, 3:] = -jacobian[:, :, :3] @ skew
-        h = np.einsum("nki,n,nkj->ij", jacobian, weight, jacobian) + 1e-6 * np.eye(6)
-        step = np.linalg.solve(h, -np.einsum("nki,n,nk->i", jacobian, weight, r))
-        delta = np.eye(4)
-        delta[:3, :3], delta[:3, 3] = _exp(step[3:]), step[:3]
-        motion = delta @ motion
-    good = weight > 0.2
-    return motion, float(np.median(np.linalg.norm(r[good], axis=1))) if good.any() else np.inf
-
-
-@dataclass
-class _Shot:
-    """A recorded frame: grey image, depth in metres, pose of the motion capture."""
-
-    gray: np.ndarray
-    depth: np.ndarray
-    pose: np.ndarray
-
-
-def _shots(folder: Path) -> list[tuple[Path, Path, np.ndarray]]:
-    """Colour image, depth image and pose of every frame that has all three."""
-    colour, depth = _stamped(folder, "rgb"), _stamped(folder, "depth")
-    stamps, poses = _poses(folder)
-    depth_stamps = np.array([stamp for stamp, _ in depth])
-    frames = []
-    for stamp, path in colour:
-        near, pose = int(np.argmin(abs(depth_stamps - stamp))), int(np.argmin(abs(stamps - stamp)))
-        if abs(depth_stamps[near] - stamp) < 0.02 and abs(stamps[pose] - stamp) < 0.02:
-            frames.append((path, depth[near][1], poses[pose]))
-    return frames
-
-
-def _read(frame: tuple[Path, Path, np.ndarray]) -> _Shot:
-    gray = cv2.imread(str(frame[0]), cv2.IMREAD_GRAYSCALE)
-    return _Shot(gray, cv2.imread(str(frame[1]), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000, frame[2])
-
-
 def _lift(xy: np.ndarray, z: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Points in space (metres, camera frame), and whether the depth around them is known and smooth."""
     column, row = np.rint(xy).astype(int).T
@@ -216,21 +138,24 @@ def _lift(xy: np.ndarray, z: np.ndarray, camera: Camera) -> tuple[np.ndarray, np
     return camera.unproject(camera.undistort_points(xy), z[row, column]), smooth
 
 
-def _motion(first: _Shot, second: _Shot, camera: Camera) -> np.ndarray | None:
+def _motion(first: Frame, second: Frame, motion: np.ndarray, camera: Camera) -> np.ndarray | None:
     """``T_second_first`` of the camera: the ground truth's, refined on ORB matches; None where these contradict it."""
     orb = cv2.ORB.create(2000, fastThreshold=7)
-    (k1, d1), (k2, d2) = (orb.detectAndCompute(shot.gray, None) for shot in (first, second))
+    (k1, d1), (k2, d2) = (orb.detectAndCompute(grey(frame), None) for frame in (first, second))
     if d1 is None or d2 is None:
         return None
-    found = [m for m in cv2.BFMatcher(cv2.NORM_HAMMING).match(d1, d2) if m.distance < 50]
-    xy1 = np.array([k1[m.queryIdx].pt for m in found], np.float32).reshape(-1, 2)
-    xy2 = np.array([k2[m.trainIdx].pt for m in found], np.float32).reshape(-1, 2)
-    if len(xy1) < 50:
-        return None
+    matches = [m for m in cv2.BFMatcher(cv2.NORM_HAMMING).match(d1, d2) if m.distance < 50]
+    xy1 = np.array([k1[m.queryIdx].pt for m in matches], np.float32).reshape(-1, 2)
+    xy2 = np.array([k2[m.trainIdx].pt for m in matches], np.float32).reshape(-1, 2)
     space, smooth = _lift(xy1, first.depth, camera)
-    observed = camera.undistort_points(xy2)[smooth]
-    motion, residual = _refine_pose(np.linalg.inv(second.pose) @ first.pose, space[smooth], observed, camera)
-    return motion if residual < 1.0 else None
+    uv, one, none = camera.undistort_points(xy2)[smooth], np.ones(smooth.sum()), np.zeros(smooth.sum())
+    estimate = optimise_pose(motion, space[smooth], uv, none, one, none, camera)
+    return estimate.T_cam_world if len(xy1) >= 50 and estimate.residual_px < 1.0 else None
+
+
+def grey(frame: Frame) -> np.ndarray:
+    """The intensities of a frame, uint8 ``[H, W]``."""
+    return cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
 
 
 def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
@@ -243,26 +168,29 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
         gaps: Frames between the two images.
         every: First images are this far apart, further for wide gaps.
     """
-    folder, camera = RECORDINGS[name]
-    frames = _shots(folder)
+    sequence = open_sequence(str(RECORDINGS[name]))
+    camera, truth = sequence.camera, sequence.ground_truth
+    away = np.abs(truth.timestamps[:, None] - sequence.timestamps)
+    known = np.flatnonzero(away.min(axis=0) < 0.02)
+    poses = truth.T_world_cam[away.argmin(axis=0)]
     pairs = []
     for gap in gaps:
-        for start in range(0, len(frames) - gap, every * max(1, gap // 2)):
-            first, second = _read(frames[start]), _read(frames[start + gap])
-            motion = _motion(first, second, camera)
+        for start in range(0, len(known) - gap, every * max(1, gap // 2)):
+            at, then = known[start], known[start + gap]
+            first, second = sequence[int(at)], sequence[int(then)]
+            motion = _motion(first, second, se3.inverse(poses[then]) @ poses[at], camera)
             if motion is None:
                 continue
-            points = corners(first.gray)
+            points = corners(grey(first))
             space, smooth = _lift(points, first.depth, camera)
-            moved = space @ motion[:3, :3].T + motion[:3, 3]
-            truth = camera.distort_points(camera.project(moved))
-            seen = smooth & (moved[:, 2] > 0.2) & ((truth >= 4) & (truth < (636, 476))).all(axis=1)
-            column, row = np.clip(np.nan_to_num(np.rint(truth)), 0, (639, 479)).astype(int).T
-            there = second.depth[row, column]
-            seen &= (there > 0) & (abs(there - moved[:, 2]) < 0.04 * moved[:, 2])
-            if seen.sum() < 50:
-                continue
-            pairs.append(Pair(f"{name} +{gap}", first.gray, second.gray, points[seen], truth[seen]))
+            moved = se3.transform(motion, space)
+            ends = camera.distort_points(camera.project(moved))
+            seen = smooth & (moved[:, 2] > 0.2) & ((ends >= 4) & (ends < (636, 476))).all(axis=1)
+            column, row = np.clip(np.nan_to_num(np.rint(ends)), 0, (639, 479)).astype(int).T
+            depth = second.depth[row, column]
+            seen &= (depth > 0) & (abs(depth - moved[:, 2]) < 0.04 * moved[:, 2])
+            if seen.sum() >= 50:
+                pairs.append(Pair(f"{name} +{gap}", grey(first), grey(second), points[seen], ends[seen]))
     return pairs
 
 

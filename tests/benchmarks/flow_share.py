@@ -123,7 +123,7 @@ def rendered(scene: int, start: int, strides: Sequence[int], count: int) -> list
         guess = np.where((z > 0)[:, None] & (moved[:, 2:] > 0.1), camera.project(moved), np.nan).astype(np.float32)
         target = cv2.cvtColor(sequence[start + stride].rgb, cv2.COLOR_RGB2GRAY)
         name = f"{motion}?scene={scene} +{stride}"
-        pairs.append(Pair(name, gray, target, points[seen], truth[seen], guess[seen], start))
+        pairs.append(Pair(name, gray, target, points[seen], truth[seen], guess[seen]))
     return pairs
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import pkgutil
 from typing import get_args
 
@@ -13,23 +12,22 @@ from scenes import CAMERA, SEGMENTATION, box_instance, bundle, scene
 
 import dynslam_bench.culling as culling
 from dynslam_bench.contracts.filter import DynamicFilter, FilterState
-from dynslam_bench.culling.guard import GuardSettings, restore_starved
 from dynslam_bench.culling.reseeding import ReseedingFilter
+from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.slam.pipeline import restore_starved
 
 
 def rules() -> list[DynamicFilter]:
     """Every rule of the package with its default settings."""
+    for module in pkgutil.iter_modules(culling.__path__):
+        importlib.import_module(f"{culling.__name__}.{module.name}")
     built = []
-    for found in pkgutil.iter_modules(culling.__path__):
-        module = importlib.import_module(f"{culling.__name__}.{found.name}")
-        for kind in vars(module).values():
-            if inspect.isclass(kind) and issubclass(kind, culling.Rule) and kind.__module__ == module.__name__:
-                settings = get_args(kind.__orig_bases__[0])[0]()
-                more = [SEGMENTATION] if issubclass(kind, culling.ObjectRule) else []
-                built.append(kind(settings, *([FeatureSettings()] if kind is ReseedingFilter else more)))
+    for kind in {*culling.Rule.__subclasses__(), *culling.ObjectRule.__subclasses__()} - {culling.ObjectRule}:
+        more = {ReseedingFilter: [FeatureSettings()]}.get(kind, [SEGMENTATION] * issubclass(kind, culling.ObjectRule))
+        built.append(kind(get_args(kind.__orig_bases__[0])[0](), *more))
     assert len(built) == 16
-    return built
+    return sorted(built, key=lambda rule: rule.name)
 
 
 @pytest.mark.parametrize("rule", rules(), ids=lambda rule: rule.name)
@@ -70,7 +68,7 @@ def test_guard_undoes_the_least_reliable_verdict_first() -> None:
         ([nothing, nothing], ~nothing, 2),
         ([semantic], semantic, 0),
     ):
-        keep, count = restore_starved(verdicts, settings)
+        keep, count = restore_starved(verdicts, settings, 100)
         assert count == undone
         np.testing.assert_array_equal(keep, expected)
-    assert restore_starved([semantic], GuardSettings(min_features=0, min_fraction=0.8))[1] == 1
+    assert restore_starved([semantic], GuardSettings(min_features=0, min_fraction=0.8), 100)[1] == 1

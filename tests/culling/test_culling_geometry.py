@@ -13,7 +13,6 @@ from dynslam_bench.culling.correlation_graph import CorrelationFilter, depth_var
 from dynslam_bench.culling.ego_motion import (
     CORRELATION,
     RigidMotionFilter,
-    coherent,
     depth_sigma,
     prior_information,
     refine_prediction,
@@ -21,6 +20,7 @@ from dynslam_bench.culling.ego_motion import (
 from dynslam_bench.culling.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.free_space import MAX_AGE_S, FreeSpaceFilter
 from dynslam_bench.culling.multiview_depth import refine_by_matches
+from dynslam_bench.culling.regions import coherent
 from dynslam_bench.culling.settings import (
     CorrelationSettings,
     EpipolarSettings,

@@ -9,6 +9,7 @@ import pytest
 
 from dynslam_bench.flow import moth_flame as rules
 from dynslam_bench.flow.label_search import advance, move_moths, scrambled
+from dynslam_bench.flow.propagation import nearest
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.flow.sparse import SparseDaisyFlow
 
@@ -102,7 +103,9 @@ def searched(search):
     guess[::2] = np.nan
     flow = SparseDaisyFlow(FlowSettings(search=search))
     pair = flow.pair(flow.prepare(image), flow.prepare(target))
-    return flow.search(flow.describe(pair.reference, points, pair.tables), pair, flow.nearest(points), guess, 9)
+    return flow.search(
+        flow.describe(pair.reference, points, pair.tables), pair, nearest(points, flow.workers.run), guess, 9
+    )
 
 
 STORED = {

@@ -84,7 +84,7 @@ def test_classes_are_names_and_presets():
     with pytest.raises(SettingsError, match="empty"):
         build(SegmentationSettings, {"classes": " , "})
     with pytest.raises(SegmentationError):
-        expand_classes([])
+        expand_classes("")
 
 
 def test_what_studies_tune_and_agents_steer():

@@ -62,7 +62,7 @@ def test_merged_points_keep_every_observation_once(room):
     world.observe(slots[1], np.array([2]), np.array([last]))
     before = observers(world, last), observers(world, one), observers(world, other)
     assert [len(pairs) for pairs in before] == [2, 40, 20]
-    world.merge(int(one), int(last))
+    world.replace_point(int(one), int(last))
     merged = observers(world, last)
     assert set(merged) >= set(before[0]) and len({slot for slot, _ in merged}) == len(merged) == 40
     assert observers(world, other) == before[2]
@@ -76,7 +76,7 @@ def test_the_room_of_removed_points_is_used_again(room):
         points = world.add_points(np.ones((200, 3)), np.zeros((200, 3), np.uint8), slots[0], np.arange(200))
         for slot in slots[1:]:
             world.observe(slot, np.arange(200), points)
-        world.merge(int(points[0]), int(points[1]))
+        world.replace_point(int(points[0]), int(points[1]))
         world.remove_points(points)
         world.release()
         assert not world.n_obs.any() and (world.kf_point[slots] < 0).all()

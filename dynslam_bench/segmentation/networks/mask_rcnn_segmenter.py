@@ -19,7 +19,7 @@ from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoi
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.postprocess import pick
-from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
+from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings, expand_classes
 
 
 class MaskRCNNSegmenter:
@@ -52,7 +52,7 @@ class MaskRCNNSegmenter:
             image = torch.from_numpy(np.ascontiguousarray(frame.rgb)).to(self.device).permute(2, 0, 1).float() / 255
             detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
             boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
-        config, wanted = self.network.config, self.settings.class_names()
+        config, wanted = self.network.config, expand_classes(self.settings.classes)
         names = [config.classes[label - 1] for label in labels]
         masks = np.zeros((len(names), height, width), bool)
         for index in (index for index, name in enumerate(names) if name in wanted):

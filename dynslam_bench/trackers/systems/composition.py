@@ -13,8 +13,7 @@ from dynslam_bench.contracts.tracker import Tracker, TrackerContext
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.culling.guard import GuardSettings
-from dynslam_bench.culling.settings import Unmatched
+from dynslam_bench.culling.settings import GuardSettings, Unmatched
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes

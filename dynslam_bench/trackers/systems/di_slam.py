@@ -1,8 +1,7 @@
 """DI-SLAM (Wei et al. 2025): boxes, epipolar test, multi-view geometry."""
 
 from dynslam_bench.contracts.tracker import TrackerSpec
-from dynslam_bench.culling.guard import GuardSettings
-from dynslam_bench.culling.settings import BoxEpipolarSettings, MultiViewSettings
+from dynslam_bench.culling.settings import BoxEpipolarSettings, GuardSettings, MultiViewSettings
 from dynslam_bench.trackers.systems.composition import (
     ObjectSettings,
     PublishedFlowSettings,
