@@ -47,6 +47,7 @@ class Spec(Protocol):
 
 
 P = TypeVar("P", bound=Spec)
+B = TypeVar("B")
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,33 @@ def load_object(target: str) -> Any:
     except AttributeError:
         public = [name for name in vars(module) if not name.startswith("_")]
         raise PluginError(f"{location} has no '{attribute}'", did_you_mean(attribute, public)) from None
+
+
+def build_plugin(
+    kind: str, spec: Spec, protocol: type[B], fault: type[DynslamError], call: Callable[[Any], object]
+) -> B:
+    """Load a plug-in's factory, call it, and check what it gives.
+
+    Args:
+        kind: For messages, e.g. ``flow``.
+        spec: The plug-in.
+        protocol: What the factory has to give.
+        fault: Type of the error.
+        call: Calls the factory that it is given.
+
+    Raises:
+        DynslamError: Of the type `fault` where the factory fails or gives something else; its own pass unchanged.
+    """
+    factory = load_object(spec.entry_point)
+    try:
+        built = call(factory)
+    except DynslamError:
+        raise
+    except Exception as error:  # a plug-in may raise anything
+        raise fault(f"{kind} '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
+    if not isinstance(built, protocol):
+        raise fault(f"'{spec.entry_point}' gave a {type(built).__name__}, not a {protocol.__name__}")
+    return built
 
 
 def import_module(location: str) -> ModuleType:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec
-from dynslam_bench.core.errors import DynslamError, PluginError
-from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.features.settings import FeatureSettings
 
 __all__ = ["FEATURES", "ORB", "FeatureSpec"]
@@ -34,13 +34,4 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
     """
     settings = settings or FeatureSettings()
     spec = FEATURES.get(settings.extractor)
-    factory = load_object(spec.entry_point)
-    try:
-        extractor = factory(settings)
-    except DynslamError:
-        raise
-    except Exception as error:
-        raise PluginError(f"extractor '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
-    if not isinstance(extractor, FeatureExtractor):
-        raise PluginError(f"'{spec.entry_point}' gave a {type(extractor).__name__} without extract()")
-    return extractor
+    return build_plugin("extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dynslam_bench.contracts.flow import FlowEstimator, FlowSpec
-from dynslam_bench.core.errors import DynslamError, PluginError
-from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 
 __all__ = ["FLOWS", "FlowSpec"]
@@ -42,16 +42,9 @@ def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu
     """
     settings = settings or FlowSettings()
     spec = FLOWS.get(settings.plugin or settings.method)
-    factory = load_object(spec.entry_point)
-    try:
-        flow = factory(settings, device=device, threads=threads)
-    except DynslamError:
-        raise
-    except Exception as error:
-        raise PluginError(f"flow '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
-    if not isinstance(flow, FlowEstimator):
-        raise PluginError(f"'{spec.entry_point}' gave a {type(flow).__name__} without prepare() and track()")
-    return flow
+    return build_plugin(
+        "flow", spec, FlowEstimator, PluginError, lambda build: build(settings, device=device, threads=threads)
+    )
 
 
 def build_daisy(settings: FlowMethodSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:

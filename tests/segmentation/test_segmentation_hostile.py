@@ -19,7 +19,7 @@ from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.loading import FORMAT, load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.training.labelled_images import CocoImages, YoloImages, decode_runs
+from dynslam_bench.segmentation.training.labelled_images import coco_images, decode_runs, yolo_images
 from dynslam_bench.segmentation.training.prepared import PreparedImages
 
 SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1, classes=("person",), box_hidden=1,
@@ -44,7 +44,7 @@ SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1,
     ],
 )
 def test_a_damaged_mask_is_one_clear_line(tmp_path: Path, segmentation: Any) -> None:
-    images = CocoImages(coco(tmp_path, segmentation))
+    images = coco_images(coco(tmp_path, segmentation))
     with pytest.raises(SegmentationError, match="a segmentation is"):
         images[0]
 
@@ -63,7 +63,7 @@ def test_a_damaged_mask_is_one_clear_line(tmp_path: Path, segmentation: Any) -> 
 )
 def test_damaged_annotations_are_one_clear_line(tmp_path: Path, changes: dict[str, object], words: str) -> None:
     with pytest.raises(SegmentationError, match=words):
-        CocoImages(coco(tmp_path, [], changes=changes))
+        coco_images(coco(tmp_path, [], changes=changes))
 
 
 def test_run_lengths_of_any_text_end(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_damaged_yolo_labels_are_one_clear_line(tmp_path: Path, line: bytes) -> 
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "labels" / "a.txt").write_bytes(line)
     with pytest.raises(SegmentationError, match=r"is no polygon label|is not a text file"):
-        YoloImages(tmp_path)[0]
+        yolo_images(tmp_path)[0]
 
 
 def saved(path: Path, content: object) -> Path:

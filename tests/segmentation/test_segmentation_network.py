@@ -12,7 +12,7 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.networks import boxes as box_ops
-from dynslam_bench.segmentation.networks.backbone import NetworkConfig, resnet18_config
+from dynslam_bench.segmentation.networks.backbone import RESNET18, NetworkConfig
 from dynslam_bench.segmentation.networks.loading import load_network, save_network
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter, paste
 from dynslam_bench.segmentation.networks.network import MaskRCNN, levels_of, roi_align
@@ -209,14 +209,14 @@ def test_our_own_format_carries_the_shape(tmp_path):
 
 
 def test_a_resnet18_checkpoint_is_recognised(tmp_path):
-    torch.save(published(resnet18_config(), "counted"), tmp_path / "r18.pth")
+    torch.save(published(RESNET18, "counted"), tmp_path / "r18.pth")
     config = load_network(tmp_path / "r18.pth").config
     assert (config.blocks, config.bottleneck, config.stem, config.classes) == ((2, 2, 2, 2), False, 64, ("person",))
 
 
 def test_foreign_checkpoints_say_what_is_wrong(tmp_path):
     path = tmp_path / "bad.pth"
-    good = published(resnet18_config(), "frozen")
+    good = published(RESNET18, "frozen")
 
     def refused(content, *texts):
         if isinstance(content, bytes):

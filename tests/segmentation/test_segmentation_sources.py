@@ -125,7 +125,7 @@ def test_oracle_refuses_what_does_not_fit():
         def __getitem__(self, index):
             return FrameMasks(np.full((24, 32), 9, np.uint8), {1: "person"}, frozenset())
 
-    with pytest.raises(SegmentationError, match="instance 9 has no class name"):
+    with pytest.raises(SegmentationError, match="object 9 has no class name"):
         OracleSegmenter(Nameless()).segment(frame())
 
 
@@ -248,7 +248,7 @@ def test_plugins():
     assert len(built.segment(frame())) == 2
     with pytest.raises(SegmentationError, match=r"masks of shape \(0, 12, 16\), the frame is 32x24"):
         build_segmenter(source("SMALL")).segment(frame())
-    with pytest.raises(SegmentationError, match="gave a int without segment"):
+    with pytest.raises(SegmentationError, match="gave a int, not a Segmenter"):
         build_segmenter(source("BROKEN"))
     with pytest.raises(PluginError, match=r"unknown segmenter 'oracel'.*'oracle'"):
         build_segmenter(SegmentationSettings(source="plugin:oracel"))

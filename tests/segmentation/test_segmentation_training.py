@@ -13,11 +13,10 @@ from dynslam_bench.segmentation.networks.network import crop_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
 from dynslam_bench.segmentation.training.labelled_images import (
-    CocoImages,
     LabelledImage,
-    RenderedFrames,
-    YoloImages,
+    coco_images,
     open_labelled,
+    yolo_images,
 )
 from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
 from dynslam_bench.segmentation.training.settings import TrainSettings
@@ -46,7 +45,7 @@ def write_yolo(folder, count=6, seed=0):
 
 
 def test_yolo_polygons(tmp_path):
-    images = YoloImages(write_yolo(tmp_path))
+    images = yolo_images(write_yolo(tmp_path))
     assert len(images) == 6
     image = images[2]
     assert image.class_names == ("person", "chair") and image.rgb.shape == (120, 160, 3)
@@ -58,7 +57,7 @@ def test_yolo_polygons(tmp_path):
     (tmp_path / "labels" / "2.txt").unlink()
     assert images[2].masks.shape == (0, 120, 160)
     with pytest.raises(SegmentationError, match="there are no images"):
-        YoloImages(tmp_path / "none")
+        yolo_images(tmp_path / "none")
 
 
 def test_coco_polygons_and_run_lengths(tmp_path):
@@ -67,18 +66,18 @@ def test_coco_polygons_and_run_lengths(tmp_path):
     polygon = [[2, 1, 6, 1, 6, 4, 2, 4]]
     counts = [13, 3, 3, 3, 3, 3, 3, 3, 14]
     for segmentation in (polygon, {"size": [6, 8], "counts": counts}):
-        image = CocoImages(coco(tmp_path, segmentation))[0]
+        image = coco_images(coco(tmp_path, segmentation))[0]
         assert image.class_names == ("person",)
         assert np.count_nonzero(image.masks[0] != expected) == 0
-    assert len(CocoImages(coco(tmp_path, polygon, iscrowd=1))[0].masks) == 0
+    assert len(coco_images(coco(tmp_path, polygon, iscrowd=1))[0].masks) == 0
     with pytest.raises(SegmentationError, match="a mask of 9x6"):
-        CocoImages(coco(tmp_path, {"size": [6, 9], "counts": [54]}))[0]
+        coco_images(coco(tmp_path, {"size": [6, 9], "counts": [54]}))[0]
 
 
 def test_rendered_frames_are_a_function_of_their_name():
     text = "synthetic:scenes=3-4,frames=2,length=30,options=0.5,seed=7"
     one, two = open_labelled(text), open_labelled(text)
-    assert isinstance(one, RenderedFrames) and one.name == text and len(one) == 2 * 8 * 2
+    assert one.name == text and len(one) == 2 * 8 * 2
     a, b = one[5], two[5]
     assert np.array_equal(a.rgb, b.rgb) and np.array_equal(a.masks, b.masks) and "person" in a.class_names
     assert not np.array_equal(a.rgb, one[4].rgb)
@@ -213,4 +212,8 @@ def test_evaluating_a_network_and_writing_the_score(tmp_path):
     assert score.images == 2 and score.classes["person"]["truths"] == 2 and len(score.weights) == 12
     assert SegmenterScore.read(tmp_path / "score.json") == score
     prepared = PreparedImages(prepare(open_labelled(f"yolo:{data}"), tmp_path / "cache", 240, 320), ("person",))
-    assert len(prepared) == 3 and prepared[0].labels.tolist() == [1] and prepared[0].masks.shape == (1, 240, 320)
+    assert (
+        len(prepared) == 3
+        and prepared.example(0).labels.tolist() == [1]
+        and prepared.example(0).masks.shape == (1, 240, 320)
+    )

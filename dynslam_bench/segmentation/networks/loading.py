@@ -63,19 +63,17 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     Raises:
         SegmentationError: The file is missing, truncated, or holds anything but tensors and plain values.
     """
-    path = path.expanduser()
+    path, size = path.expanduser(), 0
     try:
-        with path.open("rb") as file:
-            size = len(file.read(1)) and path.stat().st_size
-    except OSError as error:
-        raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
-    try:
+        size = path.stat().st_size
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 unpacked = sum(entry.file_size for entry in archive.infolist())
             if unpacked > MAX_EXPANSION * size:
                 raise ValueError(f"it claims to unpack to {unpacked} bytes")
         content = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
     except Exception as error:  # torch raises many types for a damaged file
         reason = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
         raise SegmentationError(
@@ -153,8 +151,7 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         "ratios": "rpn.head.cls_logits.weight",
         "mask_channels": "roi_heads.mask_head.0.0.weight",
     }
-    missing = [key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)]
-    if missing:
+    if missing := [key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)]:
         raise SegmentationError(
             f"{path} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
             f"for example {_some(state)})"
@@ -197,8 +194,7 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) ->
 
 
 def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:
-    own = _weights(network)
-    has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
+    own, has_cfpn = _weights(network), any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
     unknown = [key for key in state if key not in own]
     shapes = [
