@@ -51,6 +51,10 @@ class Instances:
         moving = None if self.moving is None else self.moving[keep]
         return Instances(self.masks[keep], self.boxes[keep], names, self.scores[keep], moving)
 
+    def visible(self) -> Instances:
+        """Only the objects with a pixel."""
+        return self.select(np.asarray(self.masks.any(axis=(1, 2))))
+
     def union(self) -> NDArray[np.bool_]:
         """Bool ``[H, W]``: pixels of any object."""
         return np.asarray(self.masks.any(axis=0))

@@ -34,4 +34,4 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
     """
     settings = settings or FeatureSettings()
     spec = FEATURES.get(settings.extractor)
-    return build_plugin("extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings))
+    return build_plugin("extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings))  # type: ignore[type-abstract]

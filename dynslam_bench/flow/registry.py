@@ -42,8 +42,9 @@ def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu
     """
     settings = settings or FlowSettings()
     spec = FLOWS.get(settings.plugin or settings.method)
+    protocol: type[FlowEstimator] = FlowEstimator  # type: ignore[type-abstract]
     return build_plugin(
-        "flow", spec, FlowEstimator, PluginError, lambda build: build(settings, device=device, threads=threads)
+        "flow", spec, protocol, PluginError, lambda build: build(settings, device=device, threads=threads)
     )
 
 

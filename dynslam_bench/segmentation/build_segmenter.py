@@ -222,7 +222,8 @@ def build_segmenter(
 def _load(name: str, settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
     """Construct a registered segmenter."""
     spec = SEGMENTERS.get(name)
-    return build_plugin("segmenter", spec, Segmenter, SegmentationError, lambda build: build(settings, context))
+    protocol: type[Segmenter] = Segmenter  # type: ignore[type-abstract]
+    return build_plugin("segmenter", spec, protocol, SegmentationError, lambda build: build(settings, context))
 
 
 @cache

@@ -171,4 +171,4 @@ def _similarity(mask: NDArray[np.bool_], previous: Gray, current: Gray) -> NDArr
 def _moved(instances: Instances, masks: list[NDArray[np.bool_]]) -> Instances:
     """The same objects under new masks, without those that left the image."""
     stack = np.array(masks, bool).reshape(instances.masks.shape)
-    return replace(instances, masks=stack, boxes=boxes_of(stack)).select(stack.any(axis=(1, 2)))
+    return replace(instances, masks=stack, boxes=boxes_of(stack)).visible()

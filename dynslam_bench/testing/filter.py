@@ -52,8 +52,8 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     if declared and report.run("results", lambda: _run(construct(), steps)):
         report.run("declared stats", lambda: _declared_stats(construct(), steps))
         report.run("frames are left alone", lambda: _left_alone(construct(), steps))
-        report.run("determinism", lambda: _repeated(construct(), construct(), steps, *_TWO_RUNS))
-        report.run("two resets", lambda: _repeated(*[construct()] * 2, steps, *_TWO_RESETS))
+        report.run("determinism", lambda: _repeated((construct(), construct()), steps, *_TWO_RUNS))
+        report.run("two resets", lambda: _repeated((construct(),) * 2, steps, *_TWO_RESETS))
         for name, change in _DEGENERATE.items():
             changed = [change(frame, state) for frame, state in steps]
             report.run(name, lambda changed=changed: _run(construct(), changed))  # type: ignore[misc]
@@ -161,9 +161,9 @@ def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
         require_unchanged(partial(candidate.apply, frame, state), *inputs, what=f"frame {frame.index} or its state")
 
 
-def _repeated(first: DynamicFilter, second: DynamicFilter, steps: Steps, fault: str, cause: str) -> None:
+def _repeated(pair: tuple[DynamicFilter, DynamicFilter], steps: Steps, fault: str, cause: str) -> None:
     """Run two filters, or one twice, which have to give the same."""
-    for index, (a, b) in enumerate(zip(_run(first, steps), _run(second, steps), strict=True)):
+    for index, (a, b) in enumerate(zip(*(_run(candidate, steps) for candidate in pair), strict=True)):
         same = np.array_equal(a.keep, b.keep) and np.array_equal(a.weight, b.weight)
         require(same, f"{fault} at frame {index}", cause)
 

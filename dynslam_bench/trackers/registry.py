@@ -132,7 +132,7 @@ def build_tracker(
         takes_context = "context" in inspect.signature(build).parameters
         return build(settings, context=context or TrackerContext()) if takes_context else build(settings)
 
-    return build_plugin("tracker", spec, Tracker, TrackerError, construct)
+    return build_plugin("tracker", spec, Tracker, TrackerError, construct)  # type: ignore[type-abstract]
 
 
 def epipolar_skipped(tracker: str) -> dict[str, float]:

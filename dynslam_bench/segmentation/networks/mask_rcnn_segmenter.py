@@ -56,8 +56,7 @@ class MaskRCNNSegmenter:
         for mask, plane, box, name in zip(masks, planes, boxes, names, strict=True):
             if name in wanted:
                 mask[:] = paste(plane, box, height, width, self.settings.mask_threshold, exact=config.exact_paste)
-        instances = Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32))
-        return instances.select(masks.any(axis=(1, 2)))
+        return Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32)).visible()
 
 
 def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:

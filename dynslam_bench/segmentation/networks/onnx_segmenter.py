@@ -409,7 +409,7 @@ def _paste(
     shift, stretch = np.tile(offset, 2).astype(np.float32), np.tile(scale, 2).astype(np.float32)
     in_frame = np.clip((boxes - shift) / stretch, 0, np.array([width, height] * 2)).astype(np.float32)
     names = tuple(layout.names[int(number)] for number in labels)
-    return Instances(masks, in_frame, names, scores.astype(np.float32)).select(masks.any(axis=(1, 2)))
+    return Instances(masks, in_frame, names, scores.astype(np.float32)).visible()
 
 
 def _decode_semantic(
