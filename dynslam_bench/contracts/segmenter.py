@@ -41,10 +41,19 @@ class Instances:
 
     def of_classes(self, names: Collection[str]) -> Instances:
         """Only the objects of these classes."""
-        keep = np.array([name in names for name in self.class_names], dtype=bool)
-        kept = tuple(name for name in self.class_names if name in names)
+        return self.select(np.array([name in names for name in self.class_names], dtype=bool))
+
+    def select(self, keep: NDArray[np.bool_]) -> Instances:
+        """Only the objects where `keep`, bool ``[K]``, is true."""
+        if keep.all():
+            return self
+        names = tuple(name for name, kept in zip(self.class_names, keep, strict=True) if kept)
         moving = None if self.moving is None else self.moving[keep]
-        return Instances(self.masks[keep], self.boxes[keep], kept, self.scores[keep], moving)
+        return Instances(self.masks[keep], self.boxes[keep], names, self.scores[keep], moving)
+
+    def visible(self) -> Instances:
+        """Only the objects with a pixel."""
+        return self.select(np.asarray(self.masks.any(axis=(1, 2))))
 
     def union(self) -> NDArray[np.bool_]:
         """Bool ``[H, W]``: pixels of any object."""

@@ -47,6 +47,7 @@ class Spec(Protocol):
 
 
 P = TypeVar("P", bound=Spec)
+B = TypeVar("B")
 
 
 @dataclass(frozen=True)
@@ -104,32 +105,6 @@ class Registry(Generic[P]):
         broken = [failure for failure in self._failures if name in failure.source]
         hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, plugins)
         raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
-
-    def build(self, name: str, kind: type[Any], what: str, *arguments: Any, **options: Any) -> Any:
-        """Load what a spec names, and construct it.
-
-        Args:
-            name: Id of the spec, ``module:Attr`` or ``file.py:Attr``.
-            kind: The protocol that the result must follow.
-            what: The result in words, for messages.
-            arguments: Of the factory.
-            options: Of the factory.
-
-        Raises:
-            DynslamError: What the factory raised; a `PluginError` where it raised anything else, or its result is of
-                another kind.
-        """
-        spec = self.get(name)
-        factory = load_object(spec.entry_point)
-        try:
-            built = factory(*arguments, **options)
-        except DynslamError:
-            raise
-        except Exception as error:  # a plug-in's factory may raise anything
-            raise PluginError(f"{what} '{spec.id}' cannot be built: {_reason(error)}") from error
-        if not isinstance(built, kind):
-            raise PluginError(f"'{spec.entry_point}' gave a {type(built).__name__}, no {kind.__name__}")
-        return built
 
     def refresh(self) -> None:
         """Forget what was discovered, e.g. after the environment variable changed."""
@@ -198,6 +173,33 @@ def load_object(target: str) -> Any:
     except AttributeError:
         public = [name for name in vars(module) if not name.startswith("_")]
         raise PluginError(f"{location} has no '{attribute}'", did_you_mean(attribute, public)) from None
+
+
+def build_plugin(
+    kind: str, spec: Spec, protocol: type[B], fault: type[DynslamError], call: Callable[[Any], object]
+) -> B:
+    """Load a plug-in's factory, call it, and check what it gives.
+
+    Args:
+        kind: For messages, e.g. ``flow``.
+        spec: The plug-in.
+        protocol: What the factory has to give.
+        fault: Type of the error.
+        call: Calls the factory that it is given.
+
+    Raises:
+        DynslamError: Of the type `fault` where the factory fails or gives something else; its own pass unchanged.
+    """
+    factory = load_object(spec.entry_point)
+    try:
+        built = call(factory)
+    except DynslamError:
+        raise
+    except Exception as error:  # a plug-in may raise anything
+        raise fault(f"{kind} '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
+    if not isinstance(built, protocol):
+        raise fault(f"'{spec.entry_point}' gave a {type(built).__name__}, not a {protocol.__name__}")
+    return built
 
 
 def import_module(location: str) -> ModuleType:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec
-from dynslam_bench.core.plugins import Registry
+from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.features.settings import FeatureSettings
 
 __all__ = ["FEATURES", "ORB", "FeatureSpec"]
@@ -29,5 +30,5 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
         SettingsError: The extractor refuses the settings.
     """
     settings = settings or FeatureSettings()
-    extractor: FeatureExtractor = FEATURES.build(settings.extractor, FeatureExtractor, "extractor", settings)
-    return extractor
+    spec = FEATURES.get(settings.extractor)
+    return build_plugin("extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings))  # type: ignore[type-abstract]

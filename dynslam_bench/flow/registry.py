@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dynslam_bench.contracts.flow import FlowEstimator, FlowSpec
-from dynslam_bench.core.plugins import Registry
+from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 
 __all__ = ["FLOWS", "FlowSpec"]
@@ -40,9 +41,11 @@ def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu
         SettingsError: The flow refuses the settings.
     """
     settings = settings or FlowSettings()
-    method = settings.plugin or settings.method
-    flow: FlowEstimator = FLOWS.build(method, FlowEstimator, "flow", settings, device=device, threads=threads)
-    return flow
+    spec = FLOWS.get(settings.plugin or settings.method)
+    protocol: type[FlowEstimator] = FlowEstimator  # type: ignore[type-abstract]
+    return build_plugin(
+        "flow", spec, protocol, PluginError, lambda build: build(settings, device=device, threads=threads)
+    )
 
 
 def build_daisy(settings: FlowMethodSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:

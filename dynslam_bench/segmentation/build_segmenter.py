@@ -11,9 +11,9 @@ import numpy as np
 
 from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
 from dynslam_bench.contracts.sequence import Frame, MaskSource, Sequence
-from dynslam_bench.core.errors import DynslamError, SegmentationError
+from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, path_digest
-from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.core.stage_cache import Arrays, StageCache
@@ -87,11 +87,11 @@ def resolve_source(
     """
     if settings.source != "auto":
         return settings.source
-    if sequence_id.startswith("synthetic/"):
-        if embedded_weights() is not None:
-            return "embedded"
-        if masks is not None:
-            return "oracle"
+    rendered = sequence_id.startswith("synthetic/")
+    if rendered and embedded_weights() is not None:
+        return "embedded"
+    if rendered and masks is not None:
+        return "oracle"
     if cached_checkpoint(COCO) is not None:
         return "coco"
     options = [
@@ -99,8 +99,7 @@ def resolve_source(
         "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
         "segmentation.source=recorded:DIR takes masks that were stored before",
     ]
-    if masks is not None:
-        options.append("segmentation.source=oracle takes the sequence's exact masks")
+    options += ["segmentation.source=oracle takes the sequence's exact masks"] if masks is not None else []
     without = "segmentation.source=none" if optional else "a tracker such as 'emfoa-oft?masks=none' or orb-slam2"
     options.append(f"without masks: {without}")
     raise NetworkNotFetched(
@@ -205,13 +204,12 @@ def build_segmenter(
     context = SegmenterContext(sequence_id, masks, device, threads, argument, floor)
     if cache is None or kind not in NETWORKS:
         return ConfiguredSegmenter(_load(name, settings, context), settings, source, also)
-    named = ("mask_threshold", "classes", "network_side", "onnx_normalisation")
     identity = {
         "code": _code_of(name),
         "source": source,
         "weights": weights_digest(settings, sequence_id),
         "confidence": floor,
-        "settings": {field: getattr(settings, field) for field in named},
+        "settings": settings.model_dump(include={"mask_threshold", "classes", "network_side", "onnx_normalisation"}),
         "device": device,
         "threads": threads,
     }
@@ -224,15 +222,8 @@ def build_segmenter(
 def _load(name: str, settings: SegmentationSettings, context: SegmenterContext) -> Segmenter:
     """Construct a registered segmenter."""
     spec = SEGMENTERS.get(name)
-    try:
-        segmenter = load_object(spec.entry_point)(settings, context)
-    except DynslamError:
-        raise
-    except Exception as error:  # a plug-in's factory may raise anything
-        raise SegmentationError(f"segmenter '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
-    if not isinstance(segmenter, Segmenter):
-        raise SegmentationError(f"'{spec.entry_point}' gave a {type(segmenter).__name__} without segment()")
-    return segmenter
+    protocol: type[Segmenter] = Segmenter  # type: ignore[type-abstract]
+    return build_plugin("segmenter", spec, protocol, SegmentationError, lambda build: build(settings, context))
 
 
 @cache
@@ -348,14 +339,10 @@ def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks:
         SegmentationError: The file cannot be read.
     """
     kind, _, argument = resolve_source(settings, sequence_id, masks).partition(":")
-    path: Path | None = None
-    if kind == "embedded":
-        path = embedded_weights()
-    elif kind == "coco":
-        path = cached_checkpoint(COCO)
-        if path is None:
-            return COCO.sha256_prefix
-    elif kind in ("onnx", "weights", "recorded"):
+    path = {"embedded": embedded_weights(), "coco": cached_checkpoint(COCO)}.get(kind)
+    if kind == "coco" and path is None:
+        return COCO.sha256_prefix
+    if kind in ("onnx", "weights", "recorded"):
         path = Path(argument).expanduser()
     try:
         return path_digest(path)[:12] if path is not None and path.exists() else ""

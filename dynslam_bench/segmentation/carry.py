@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.segmentation.postprocess import boxes_of, pick, region
+from dynslam_bench.segmentation.postprocess import boxes_of, region
 
 Gray = NDArray[np.uint8]
 WORK_SIDE = 240
@@ -105,8 +105,7 @@ def carry_dense(instances: Instances, previous: Gray, current: Gray) -> Instance
 
 def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.bool_]:
     """One object's moved mask, computed in a window around the object only."""
-    moved = np.zeros_like(mask)
-    height, width = flow.shape[:2]
+    moved, (height, width) = np.zeros_like(mask), flow.shape[:2]
     step_y, step_x = mask.shape[0] / height, mask.shape[1] / width
     small = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     inside = region(small, 0)
@@ -172,4 +171,4 @@ def _similarity(mask: NDArray[np.bool_], previous: Gray, current: Gray) -> NDArr
 def _moved(instances: Instances, masks: list[NDArray[np.bool_]]) -> Instances:
     """The same objects under new masks, without those that left the image."""
     stack = np.array(masks, bool).reshape(instances.masks.shape)
-    return pick(replace(instances, masks=stack, boxes=boxes_of(stack)), np.asarray(stack.any(axis=(1, 2))))
+    return replace(instances, masks=stack, boxes=boxes_of(stack)).visible()

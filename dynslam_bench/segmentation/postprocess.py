@@ -31,16 +31,7 @@ def select(instances: Instances, settings: SegmentationSettings, also: frozenset
     wanted = np.array([name in names for name in instances.class_names], dtype=bool)
     if instances.moving is not None:
         wanted |= instances.moving
-    return pick(instances, wanted & (instances.scores >= settings.confidence))
-
-
-def pick(instances: Instances, keep: NDArray[np.bool_]) -> Instances:
-    """The objects where `keep` (bool ``[K]``) is true."""
-    if keep.all():
-        return instances
-    names = tuple(name for name, kept in zip(instances.class_names, keep, strict=True) if kept)
-    moving = None if instances.moving is None else instances.moving[keep]
-    return Instances(instances.masks[keep], instances.boxes[keep], names, instances.scores[keep], moving)
+    return instances.select(wanted & (instances.scores >= settings.confidence))
 
 
 def dynamic_mask(
@@ -80,8 +71,7 @@ def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     """
     if radius <= 0:
         return mask
-    part = region(mask, radius + 1)
-    if part is None:
+    if (part := region(mask, radius + 1)) is None:
         return mask
     grown = mask.copy()
     distance = cv2.distanceTransform((~mask[part]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -96,14 +86,10 @@ def repair(mask: NDArray[np.bool_], depth: NDArray[np.float32] | None, step_m: f
     `step_m` of the mean depth of the object's core nearby. This is mask repair by depth fusion as in Blitz-SLAM and
     MOR-SLAM; band and local mean are assumptions. Pixels without depth stay as they are.
     """
-    part = region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)
-    if part is None:
+    if (part := region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)) is None:
         return mask
-    patch = fill_holes(mask[part])
-    if depth is not None:
-        patch = _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
-    repaired = mask.copy()
-    repaired[part] = patch
+    patch, repaired = fill_holes(mask[part]), mask.copy()
+    repaired[part] = patch if depth is None else _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
     return repaired
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings
 CLASSES_FILE = "classes.json"
 MAX_DIFFERENCE_S = 0.02
 """Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
+PERSONS = dict.fromkeys(range(1 << 16), "person")
+"""Classes of the numbers in label images without a file of classes."""
 ORIGIN_FILE = "recorded.json"
 """Beside the masks: the sequence and the settings that they were made of."""
 
@@ -75,7 +77,7 @@ class RecordedSegmenter:
         order = np.argsort(numbers, kind="stable")
         self._keys: NDArray[np.float64] = numbers[order]
         self._files = [files[i] for i in order]
-        self._names = read_classes(self.folder / CLASSES_FILE)
+        self._names = read_classes(self.folder / CLASSES_FILE) or PERSONS
 
     def segment(self, frame: Frame) -> Instances:
         """The recorded objects of a frame.
@@ -100,19 +102,12 @@ class RecordedSegmenter:
             flags=cv2.IMREAD_UNCHANGED,
             kind=SegmentationError,
         )
-        if labels.ndim == 3:
-            if (labels[:, :, :3] != labels[:, :, :1]).any():
-                raise SegmentationError(
-                    f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
-                )
-            labels = np.asarray(labels[:, :, 0])
-        numbers = [int(value) for value in np.unique(labels) if value != 0]
-        names = dict.fromkeys(numbers, "person") if self._names is None else self._names
-        nameless = [number for number in numbers if number not in names]
-        if nameless:
-            named = ", ".join(map(str, sorted(names)))
-            raise SegmentationError(f"{path}: object {nameless[0]} has no class in {CLASSES_FILE}", f"known: {named}")
-        return _objects(labels, {number: names[number] for number in numbers})
+        labels = np.atleast_3d(labels)
+        if (labels[:, :, :3] != labels[:, :, :1]).any():
+            raise SegmentationError(
+                f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
+            )
+        return _objects(labels[:, :, 0], self._names, str(path))[0]
 
     def missing(self, timestamps: NDArray[np.float64]) -> list[int]:
         """Indices of the frames that have no file.
@@ -130,20 +125,30 @@ class RecordedSegmenter:
         return nearest, float(distance[nearest])
 
 
-def _objects(labels: NDArray[Any], names: dict[int, str]) -> Instances:
-    """The objects of a label image by number, with exact boxes and score 1."""
-    masks = np.asarray(labels[None] == np.array(list(names), labels.dtype)[:, None, None])
-    return Instances(masks, boxes_of(masks), tuple(names.values()), np.ones(len(names), np.float32))
+def _objects(labels: NDArray[Any], names: Mapping[int, str], where: str) -> tuple[Instances, list[int]]:
+    """The objects of a label image in order of their numbers, with exact boxes and score 1; and the numbers.
+
+    Raises:
+        SegmentationError: A number in the image has no class name.
+    """
+    numbers = [int(number) for number in np.unique(labels) if number != 0]
+    nameless = [number for number in numbers if number not in names]
+    if nameless:
+        named = ", ".join(map(str, sorted(names))) or "none"
+        raise SegmentationError(f"{where}: object {nameless[0]} has no class name", f"known numbers: {named}")
+    masks = np.asarray(labels[None] == np.array(numbers, labels.dtype)[:, None, None])
+    classes = tuple(names[number] for number in numbers)
+    return Instances(masks, boxes_of(masks), classes, np.ones(len(numbers), np.float32)), numbers
 
 
-def read_classes(path: Path) -> dict[int, str] | None:
-    """The COCO name of each number in the label images; None without that file.
+def read_classes(path: Path) -> dict[int, str]:
+    """The COCO name of each number in the label images; empty without that file.
 
     Raises:
         SegmentationError: The file cannot be read, or names an unknown class.
     """
     if not path.is_file():
-        return None
+        return {}
     try:
         names = {int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()}
     except (ValueError, AttributeError) as error:
@@ -161,7 +166,7 @@ def record_masks(
     *,
     device: str = "cpu",
     threads: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], object] = lambda *_: None,
 ) -> int:
     """Segment every frame of a sequence, one PNG a frame, named by stamp; existing files are kept.
 
@@ -193,8 +198,7 @@ def record_masks(
         "confidence": settings.confidence,
     }
     _begin(folder, origin)
-    classes = read_classes(folder / CLASSES_FILE) or {}
-    segmented = 0
+    classes, segmented = read_classes(folder / CLASSES_FILE), 0
     for index in range(len(sequence)):
         path = folder / f"{sequence.timestamps[index]:.6f}.png"
         if not path.exists():
@@ -204,8 +208,7 @@ def record_masks(
                 write_atomic(folder / CLASSES_FILE, json.dumps(classes, indent=1))
             write_atomic(path, cv2.imencode(".png", labels)[1].tobytes())
             segmented += 1
-        if progress is not None:
-            progress(index + 1, len(sequence))
+        progress(index + 1, len(sequence))
     return segmented
 
 
@@ -221,8 +224,7 @@ def _begin(folder: Path, origin: dict[str, object]) -> None:
                     f"{folder} holds other masks: {name} is '{before.get(name)}' there and '{value}' now",
                     "record into a folder of their own",
                 )
-        return
-    if folder.exists() and any(folder.iterdir()):
+    elif folder.exists() and any(folder.iterdir()):
         raise SegmentationError(f"{folder} holds something else", "record into an empty folder")
     folder.mkdir(parents=True, exist_ok=True)
     write_atomic(path, json.dumps(origin, indent=1))
@@ -239,12 +241,9 @@ def label_image(instances: Instances, classes: dict[int, str]) -> NDArray[np.uin
     free = sorted(classes)
     for index in np.argsort(instances.scores, kind="stable"):
         name = instances.class_names[index]
-        number = next((number for number in free if classes[number] == name), 0)
-        if number:
-            free.remove(number)
-        else:
-            number = max(classes, default=0) + 1
-            classes[number] = name
+        number = next((number for number in free if classes[number] == name), max(classes, default=0) + 1)
+        classes[number] = name
+        free = [other for other in free if other != number]
         labels[instances.masks[index]] = number
     return labels
 
@@ -262,16 +261,8 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
     Raises:
         SegmentationError: An id in the image has no class name.
     """
-    labels = np.asarray(masks.instances)
-    ids = [int(number) for number in np.unique(labels) if number != 0]
-    nameless = [number for number in ids if number not in masks.class_names]
-    if nameless:
-        raise SegmentationError(
-            f"{where}: instance {nameless[0]} has no class name",
-            "known ids: " + (", ".join(map(str, sorted(masks.class_names))) or "none"),
-        )
-    moving = np.array([number in masks.moving for number in ids], dtype=bool)
-    return replace(_objects(labels, {number: masks.class_names[number] for number in ids}), moving=moving)
+    instances, numbers = _objects(np.asarray(masks.instances), masks.class_names, where)
+    return replace(instances, moving=np.array([number in masks.moving for number in numbers], dtype=bool))
 
 
 class OracleSegmenter:
@@ -283,8 +274,7 @@ class OracleSegmenter:
     """
 
     def __init__(self, source: MaskSource, *, motion: bool = True) -> None:
-        self.source = source
-        self.motion = motion
+        self.source, self.motion = source, motion
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of frame `frame.index`.

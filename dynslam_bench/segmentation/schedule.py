@@ -54,7 +54,7 @@ class MaskScheduler:
         """Forget the masks of the previous sequence."""
         self._missed.reset()
         self._instances = Instances.empty(0, 0)
-        self._gray: NDArray[np.uint8] | None = None
+        self._gray = np.zeros((0, 0), np.uint8)
         self._age = 0
         self.segmented = False
 
@@ -66,14 +66,13 @@ class MaskScheduler:
             gray: uint8 ``[H, W]``, its intensities.
             keyframe: Whether the tracker asks for segmentation: on the first frame, after a keyframe, when lost.
         """
-        if self._gray is None or self._gray.shape != gray.shape or self._due(keyframe):
+        self.segmented = self._gray.shape != gray.shape or self._due(keyframe)
+        if self.segmented:
             self._instances = self._missed.update(self.segmenter.segment(frame), max(self._age, 1))
             self._age = 0
-            self.segmented = True
         else:
             carry = carry_dense if self._settings.carry == "dis" else carry_sparse
             self._instances = carry(self._instances, self._gray, gray)
-            self.segmented = False
         self._age += 1
         self._gray = gray
         return self._instances
@@ -82,10 +81,8 @@ class MaskScheduler:
         settings = self._settings
         if settings.schedule == "every":
             return True
-        if settings.crowded_share < 1 and len(self._instances):
-            covered = float(select(self._instances, settings).union().mean())  # by the masks of the previous frame
-            if covered > settings.crowded_share:
-                return True
+        if settings.crowded_share < 1 and select(self._instances, settings).union().mean() > settings.crowded_share:
+            return True  # the masks of the previous frame cover too much
         if settings.schedule == "every_nth":
             return self._age >= settings.n
         return keyframe or self._age >= MAX_CARRY
@@ -107,8 +104,7 @@ class _Track:
         velocity = (box - self.box) / np.float32(max(frames * (self.missed + 1), 1))
         self.velocity = np.asarray(SMOOTHING * velocity + (1 - SMOOTHING) * self.velocity, np.float32)
         self.box, self.mask, self.score = box, detections.masks[index], float(detections.scores[index])
-        self.hits += 1
-        self.missed = 0
+        self.hits, self.missed = self.hits + 1, 0
 
     def move(self, box: NDArray[np.float32]) -> bool:
         """Move a missed object to its predicted box; False if it left the image."""
@@ -156,15 +152,13 @@ class MissedDetections:
             return detections
         predicted = [np.asarray(track.box + track.velocity * frames, np.float32) for track in self._tracks]
         matches = dict(associate(predicted, [track.name for track in self._tracks], detections))
-        tracks: list[_Track] = []
-        bridged: list[_Track] = []
-        for index, track in enumerate(self._tracks):
-            if index in matches:
-                track.see(detections, matches[index], frames)
-                tracks.append(track)
-            elif track.hits >= LEAST_HITS and track.missed < self.limit and track.move(predicted[index]):
-                bridged.append(track)
-        self._tracks = tracks + bridged
+        for index, detection in matches.items():
+            self._tracks[index].see(detections, detection, frames)
+        missed = [(track, predicted[index]) for index, track in enumerate(self._tracks) if index not in matches]
+        bridged = [
+            track for track, box in missed if track.hits >= LEAST_HITS and track.missed < self.limit and track.move(box)
+        ]
+        self._tracks = [track for index, track in enumerate(self._tracks) if index in matches] + bridged
         for new in sorted(set(range(len(detections.scores))) - set(matches.values())):
             box, mask, score = detections.boxes[new], detections.masks[new], float(detections.scores[new])
             self._tracks.append(_Track(box, mask, detections.class_names[new], score, np.zeros(4, np.float32)))

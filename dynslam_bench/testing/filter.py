@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
-from typing import Any, get_args
+from functools import lru_cache, partial
+from typing import get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.contracts import (
     DynamicFilter,
@@ -27,7 +26,8 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.testing.report import ConformanceReport, require, require_arrays, require_unchanged
 from dynslam_bench.testing.scenes import CornerSequence
 
-NEEDS: frozenset[str] = frozenset(get_args(Need))
+_TWO_RUNS = ("two runs differ", "all randomness has to come from state.seed")
+_TWO_RESETS = ("the verdict changes after a second reset()", "reset() keeps something of the sequence before")
 Steps = list[tuple[FrameBundle, FilterState]]
 Change = Callable[[FrameBundle, FilterState], tuple[FrameBundle, FilterState]]
 
@@ -48,17 +48,15 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     """Run all checks of `check_filter` and report each."""
     steps = filter_scene()
     report = ConformanceReport.of("filter", construct)
-    if not report.run("declaration", lambda: _declaration(construct())):
-        return report
-    if not report.run("results", lambda: _run(construct(), steps)):
-        return report
-    report.run("declared stats", lambda: _declared_stats(construct(), steps))
-    report.run("frames are left alone", lambda: _left_alone(construct(), steps))
-    report.run("determinism", lambda: _determinism(construct, steps))
-    report.run("two resets", lambda: _two_resets(construct(), steps))
-    for name, change in _DEGENERATE.items():
-        changed = [change(frame, state) for frame, state in steps]
-        report.run(name, lambda changed=changed: _run(construct(), changed))  # type: ignore[misc]
+    declared = report.run("declaration", lambda: _declaration(construct()))
+    if declared and report.run("results", lambda: _run(construct(), steps)):
+        report.run("declared stats", lambda: _declared_stats(construct(), steps))
+        report.run("frames are left alone", lambda: _left_alone(construct(), steps))
+        report.run("determinism", lambda: _repeated((construct(), construct()), steps, *_TWO_RUNS))
+        report.run("two resets", lambda: _repeated((construct(),) * 2, steps, *_TWO_RESETS))
+        for name, change in _DEGENERATE.items():
+            changed = [change(frame, state) for frame, state in steps]
+            report.run(name, lambda changed=changed: _run(construct(), changed))  # type: ignore[misc]
     return report
 
 
@@ -117,8 +115,8 @@ def filter_scene(frames: int = 4, *, points: int = 400, seed: int = 0) -> Steps:
     return steps
 
 
-def check_result(result: FilterResult, frame: FrameBundle) -> None:
-    """Check a filter's verdict on one frame.
+def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
+    """A filter's verdict on one frame, if it keeps the contract.
 
     Raises:
         ConformanceError: Something in it breaks the contract.
@@ -127,29 +125,25 @@ def check_result(result: FilterResult, frame: FrameBundle) -> None:
     require(isinstance(result, FilterResult), f"{where}apply() gave a {type(result).__name__}, not a FilterResult")
     cause = "the verdict is on all keypoints, not only on those that earlier filters kept"
     require_arrays(result, {"keep": (np.bool_, count), "weight": (np.float32, count)}, where, cause)
-    in_range = (result.weight >= 0) & (result.weight <= 1)
-    require(in_range.all(), f"{where}a weight lies outside [0, 1] or is no number")
+    require(((result.weight >= 0) & (result.weight <= 1)).all(), f"{where}a weight lies outside [0, 1] or is no number")
     bad = {key: value for key, value in result.stats.items() if not np.isfinite(value)}
     require(not bad, f"{where}stats hold values that are not finite: {bad}")
     if result.mask is not None:
         require_arrays(result, {"mask": (np.bool_, frame.depth.shape)}, where)
+    return result
 
 
 def _declaration(candidate: DynamicFilter) -> None:
     require(isinstance(candidate.name, str) and candidate.name, f"the name is {candidate.name!r}")
-    unknown = set(candidate.needs) - NEEDS
-    require(not unknown, f"unknown needs {sorted(unknown)}", f"known are {', '.join(sorted(NEEDS))}")
-    tags = get_args(Provenance)
+    known, tags = get_args(Need), get_args(Provenance)
+    unknown = sorted(candidate.needs - set(known))
+    require(not unknown, f"unknown needs {unknown}", f"known are {', '.join(sorted(known))}")
     require(candidate.provenance in tags, f"provenance is {candidate.provenance!r}", f"one of {', '.join(tags)}")
 
 
 def _run(candidate: DynamicFilter, steps: Steps) -> list[FilterResult]:
     candidate.reset(steps[0][1].camera)
-    results = []
-    for frame, state in steps:
-        results.append(candidate.apply(frame, state))
-        check_result(results[-1], frame)
-    return results
+    return [check_result(candidate.apply(frame, state), frame) for frame, state in steps]
 
 
 def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:
@@ -163,22 +157,13 @@ def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:
 def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
     candidate.reset(steps[0][1].camera)
     for frame, state in steps:
-        inputs: list[NDArray[Any]] = [frame.rgb, frame.depth, frame.xy, frame.z, state.keep]
-        require_unchanged(lambda: candidate.apply(frame, state), *inputs, what=f"frame {frame.index} or its state")  # noqa: B023
+        inputs = (frame.rgb, frame.depth, frame.xy, frame.z, state.keep)
+        require_unchanged(partial(candidate.apply, frame, state), *inputs, what=f"frame {frame.index} or its state")
 
 
-def _determinism(construct: Callable[[], DynamicFilter], steps: Steps) -> None:
-    cause = "all randomness has to come from state.seed"
-    _same(_run(construct(), steps), _run(construct(), steps), "two runs differ", cause)
-
-
-def _two_resets(candidate: DynamicFilter, steps: Steps) -> None:
-    cause = "reset() keeps something of the sequence before"
-    _same(_run(candidate, steps), _run(candidate, steps), "the verdict changes after a second reset()", cause)
-
-
-def _same(first: list[FilterResult], second: list[FilterResult], fault: str, cause: str) -> None:
-    for index, (a, b) in enumerate(zip(first, second, strict=True)):
+def _repeated(pair: tuple[DynamicFilter, DynamicFilter], steps: Steps, fault: str, cause: str) -> None:
+    """Run two filters, or one twice, which have to give the same."""
+    for index, (a, b) in enumerate(zip(*(_run(candidate, steps) for candidate in pair), strict=True)):
         same = np.array_equal(a.keep, b.keep) and np.array_equal(a.weight, b.weight)
         require(same, f"{fault} at frame {index}", cause)
 

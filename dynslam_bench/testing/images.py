@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import numpy as np
@@ -65,12 +66,10 @@ def features_report(
         require_unchanged(lambda: construct().extract(image), image, what="the image")
 
     report = ConformanceReport.of("extractor", construct)
-    if not report.run("construction", lambda: require_methods(construct(), "extract")):
-        return report
-    if not report.run("results", lambda: results(scene[0], least=20)):
-        return report
-    report.run("beside a mask", lambda: _masked_extraction(construct(), image))
-    _run_common(report, scene[0], left_alone, lambda: _extractor_determinism(construct, image, other), results)
+    built = report.run("construction", lambda: require_methods(construct(), "extract"))
+    if built and report.run("results", lambda: results(scene[0], least=20)):
+        report.run("beside a mask", lambda: _masked_extraction(construct(), image))
+        _run_common(report, scene[0], left_alone, lambda: _extractor_determinism(construct, image, other), results)
     return report
 
 
@@ -101,11 +100,9 @@ def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_byt
     """
     require(isinstance(keypoints, Keypoints), f"extract() gave a {type(keypoints).__name__}, not Keypoints")
     count, descriptors = len(keypoints.xy), keypoints.descriptors
-    scalar = (count,)
+    types = {"octave": np.int32, "angle": np.float32, "response": np.float32}
     require_arrays(
-        keypoints,
-        {"xy": (np.float32, (count, 2)), "octave": (np.int32, scalar), "angle": (np.float32, scalar)}
-        | {"response": (np.float32, scalar)},
+        keypoints, {"xy": (np.float32, (count, 2)), **{name: (kind, (count,)) for name, kind in types.items()}}
     )
     require(
         descriptors.dtype == np.uint8 and descriptors.ndim == 2 and len(descriptors) == count,
@@ -124,14 +121,17 @@ def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_byt
         "pixels of the full resolution, x first",
     )
     require((keypoints.octave >= 0).all(), "a pyramid level is negative")
-    degrees = (keypoints.angle >= 0) & (keypoints.angle < 360)
-    require(degrees.all(), "an angle lies outside [0, 360)", "degrees, not radians")
+    require(
+        ((keypoints.angle >= 0) & (keypoints.angle < 360)).all(),
+        "an angle lies outside [0, 360)",
+        "degrees, not radians",
+    )
 
 
 def _extractor_determinism(construct: Callable[[], FeatureExtractor], image: Image, other: Image) -> None:
-    first, second = construct(), construct()
+    first = construct()
     first.extract(other)  # an earlier image has no influence
-    a, b = first.extract(image), second.extract(image)
+    a, b = first.extract(image), construct().extract(image)
     require(
         np.array_equal(a.xy, b.xy) and np.array_equal(a.descriptors, b.descriptors),
         "the same image gives other keypoints",
@@ -190,21 +190,14 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         require(not result.valid[-3:].any(), "a point outside the reference image is valid in the target")
 
     report = ConformanceReport.of("flow", construct)
-    if not report.run("construction", lambda: require_methods(construct(), "prepare", "track")):
-        return report
-    if not report.run("results", lambda: results(second, grid)):
-        return report
-    report.run("no points", lambda: results(second, grid[:0]))
-    report.run("points outside", outside)
-    report.run("guesses", lambda: results(second, grid, guess))
-    report.run("a small shift is found", lambda: _flow_finds_shift(results, first, grid))
-    _run_common(
-        report,
-        scene[0],
-        left_alone,
-        lambda: _flow_determinism(construct, first, second, grid),
-        lambda frame: results(grey(frame), grid),
-    )
+    built = report.run("construction", lambda: require_methods(construct(), "prepare", "track"))
+    if built and report.run("results", lambda: results(second, grid)):
+        report.run("no points", lambda: results(second, grid[:0]))
+        report.run("points outside", outside)
+        report.run("guesses", lambda: results(second, grid, guess))
+        report.run("a small shift is found", lambda: _flow_finds_shift(results, first, grid))
+        determinism = partial(_flow_determinism, construct, first, second, grid)
+        _run_common(report, scene[0], left_alone, determinism, lambda frame: results(grey(frame), grid))
     return report
 
 
@@ -291,9 +284,8 @@ def segmenter_report(
         require_unchanged(lambda: construct().segment(frame), frame.rgb, frame.depth, what="the frame")
 
     report = ConformanceReport.of("segmenter", construct)
-    if not report.run("construction", lambda: require_methods(construct(), "segment")):
-        return report
-    if report.run("results", lambda: results(*inputs)):
+    built = report.run("construction", lambda: require_methods(construct(), "segment"))
+    if built and report.run("results", lambda: results(*inputs)):
         _run_common(report, inputs[0], left_alone, lambda: _segmenter_determinism(construct, inputs), results)
     return report
 
@@ -311,16 +303,23 @@ def check_instances(instances: Instances, frame: Frame) -> None:
         "a frame without objects is Instances.empty(height, width)",
     )
     count = len(instances.class_names)
-    masks = {"masks": (np.bool_, (count, *frame.depth.shape))}
-    require_arrays(instances, masks, where, "masks have to be at the frame's resolution and thresholded")
+    shape = (count, *frame.depth.shape)
+    require_arrays(
+        instances, {"masks": (np.bool_, shape)}, where, "masks have to be at the frame's resolution and thresholded"
+    )
     require_arrays(instances, {"boxes": (np.float32, (count, 4)), "scores": (np.float32, (count,))}, where)
-    scores = (instances.scores >= 0) & (instances.scores <= 1)
-    require(scores.all(), f"{where}a score lies outside [0, 1]", "logits, not scores")
-    names = [isinstance(name, str) and bool(name) for name in instances.class_names]
-    require(all(names), f"{where}a class has no name")
+    require(
+        ((instances.scores >= 0) & (instances.scores <= 1)).all(),
+        f"{where}a score lies outside [0, 1]",
+        "logits, not scores",
+    )
+    require(all(isinstance(name, str) and name for name in instances.class_names), f"{where}a class has no name")
     require(np.isfinite(instances.boxes).all(), f"{where}a box is not finite")
-    ordered = instances.boxes[:, :2] <= instances.boxes[:, 2:]
-    require(ordered.all(), f"{where}a box ends before it begins", "boxes are x0, y0, x1, y1, not x, y, w, h")
+    require(
+        (instances.boxes[:, :2] <= instances.boxes[:, 2:]).all(),
+        f"{where}a box ends before it begins",
+        "boxes are x0, y0, x1, y1, not x, y, w, h",
+    )
     for mask, box, name in zip(instances.masks, instances.boxes, instances.class_names, strict=True):
         rows, columns = np.nonzero(mask)
         within = (columns >= box[0] - 1) & (columns <= box[2] + 1) & (rows >= box[1] - 1) & (rows <= box[3] + 1)
@@ -330,8 +329,7 @@ def check_instances(instances: Instances, frame: Frame) -> None:
             f"{where}{outside:.0f} % of the mask of a {name} lie outside its box",
             "boxes of another resolution, or y before x",
         )
-    moving = instances.moving
-    require(moving is None or moving.shape == (count,), f"{where}moving does not fit the objects")
+    require(instances.moving is None or instances.moving.shape == (count,), f"{where}moving does not fit the objects")
 
 
 def _segmenter_determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> None:

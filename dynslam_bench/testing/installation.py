@@ -59,10 +59,9 @@ def _packages() -> list[Finding]:
         return [Finding("package", DISTRIBUTION, "not installed", True, "pip install . in the checkout")]
     extras: dict[str, list[str]] = {}
     for requirement in required:
-        name = re.split(r"[\s<>=!~;\[(]", requirement, maxsplit=1)[0]
-        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", requirement)
-        if extra is not None or ";" not in requirement:
-            extras.setdefault(extra.group(1) if extra else "", []).append(name)
+        match = re.match(r"([\w.-]+)[^;]*(?:$|;.*extra\s*==\s*['\"]([\w-]+)['\"])", requirement)
+        if match:
+            extras.setdefault(match[2] or "", []).append(match[1])
     packages = [_package("package", name, [name], "pip install --force-reinstall .") for name in extras.pop("")]
     return packages + [
         _package("extra", extra, names, install_hint(extra))

@@ -62,8 +62,19 @@ class ConformanceReport:
 
     def run(self, name: str, check: Callable[[], object]) -> bool:
         """Run one check; an exception of any kind is its outcome. True unless the check failed."""
-        self.checks.append(_outcome(name, check))
-        return self.checks[-1].status != "failed"
+        try:
+            check()
+            outcome = Check(name, "passed")
+        except NotApplicable as reason:
+            outcome = Check(name, "skipped", str(reason))
+        except ConformanceError as error:
+            outcome = Check(name, "failed", str(error))
+        except Exception as error:  # the subject's own code may raise anything: that is what is tested
+            outcome = Check(name, "failed", f"raised {type(error).__name__}: {error}")
+        except SystemExit as error:
+            outcome = Check(name, "failed", f"called sys.exit({error.code!r}) (a tracker raises, it never exits)")
+        self.checks.append(outcome)
+        return outcome.status != "failed"
 
     def alive(self) -> None:
         """Called while a check makes progress."""
@@ -77,20 +88,6 @@ class ConformanceReport:
         if self.failed:
             lines = "".join(f"\n  {check.name}: {check.message}" for check in self.failed)
             raise ConformanceError(f"{self.subject} fails {len(self.failed)} of {len(self.checks)} checks:{lines}")
-
-
-def _outcome(name: str, check: Callable[[], object]) -> Check:
-    try:
-        check()
-    except NotApplicable as reason:
-        return Check(name, "skipped", str(reason))
-    except ConformanceError as error:
-        return Check(name, "failed", str(error))
-    except Exception as error:  # the subject's own code may raise anything: that is what is tested
-        return Check(name, "failed", f"raised {type(error).__name__}: {error}")
-    except SystemExit as error:
-        return Check(name, "failed", f"called sys.exit({error.code!r}) (a tracker raises, it never exits)")
-    return Check(name, "passed")
 
 
 def require(condition: object, fault: str, cause: str = "") -> None:

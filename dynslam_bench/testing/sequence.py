@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,25 +35,26 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
     if not report.run("protocol", lambda: _protocol(sequence)):
         return report
     chosen = sorted(set(np.linspace(0, len(sequence) - 1, max(frames, 2)).astype(int).tolist()))
-    report.run("timestamps", lambda: _timestamps(sequence))
-    report.run("frames", lambda: _frames(sequence, chosen))
-    report.run("end of the sequence", lambda: _end(sequence))
-    report.run("reading twice", lambda: _twice(sequence, chosen[-1]))
-    report.run("ground truth", lambda: _ground_truth(sequence))
-    report.run("masks", lambda: _masks(sequence, chosen))
-    report.run("digest", lambda: _digest(sequence))
-    report.run("pickling", lambda: _pickling(sequence))
+    checks: dict[str, Callable[..., None]] = {
+        "timestamps": _timestamps,
+        "frames": partial(_frames, chosen=chosen),
+        "end of the sequence": _end,
+        "reading twice": partial(_twice, index=chosen[-1]),
+        "ground truth": _ground_truth,
+        "masks": partial(_masks, chosen=chosen),
+        "digest": _digest,
+        "pickling": _pickling,
+    }
+    for name, check in checks.items():
+        report.run(name, partial(check, sequence))
     return report
 
 
-_MEMBERS = (
-    *("id", "camera", "timestamps", "ground_truth", "masks", "fps", "license", "citation"),
-    *("digest", "__len__", "__getitem__"),
-)
+_MEMBERS = ("id", "camera", "timestamps", "ground_truth", "masks", "fps", "license", "citation", "digest", "__len__")
 
 
 def _protocol(sequence: Sequence) -> None:
-    missing = [name for name in _MEMBERS if not hasattr(sequence, name)]
+    missing = [name for name in (*_MEMBERS, "__getitem__") if not hasattr(sequence, name)]
     require(
         not missing, f"a {type(sequence).__name__} lacks {', '.join(missing)}", "see dynslam_bench.sequences.Sequence"
     )
@@ -73,13 +76,9 @@ def _timestamps(sequence: Sequence) -> None:
     intervals = np.diff(stamps)
     require((intervals > 0).all(), "timestamps are not strictly increasing", "the list is unsorted or has duplicates")
     require(sequence.fps > 0, f"fps is {sequence.fps}")
-    if len(intervals):
-        rate = 1 / float(np.median(intervals))
-        require(
-            1 / 3 < rate / sequence.fps < 3,
-            f"fps is {sequence.fps:g}, but the median rate is {rate:g} Hz",
-            "timestamps have to be in seconds",
-        )
+    rate = 1 / float(np.median(intervals)) if len(intervals) else sequence.fps
+    fault = f"fps is {sequence.fps:g}, but the median rate is {rate:g} Hz"
+    require(1 / 3 < rate / sequence.fps < 3, fault, "timestamps have to be in seconds")
 
 
 def _frames(sequence: Sequence, chosen: list[int]) -> None:
@@ -92,8 +91,11 @@ def _frames(sequence: Sequence, chosen: list[int]) -> None:
         require(frame.timestamp == stamp, f"{where}stamped {frame.timestamp!r}, but timestamps[{index}] is {stamp}")
         cause = "the camera's size is not the image's, or the image is grey"
         require_arrays(frame, {"rgb": (np.uint8, (*size, 3)), "depth": (np.float32, size)}, where, cause)
-        valid = np.isfinite(frame.depth) & (frame.depth >= 0)
-        require(valid.all(), f"{where}depth has values below 0 or not finite", "missing depth is 0")
+        require(
+            (np.isfinite(frame.depth) & (frame.depth >= 0)).all(),
+            f"{where}depth has values below 0 or not finite",
+            "missing depth is 0",
+        )
         if frame.depth.any():
             median = float(np.median(frame.depth[frame.depth > 0]))
             require(0.05 < median < 200, f"{where}the median depth is {median:g} m", "wrong depth_factor")

@@ -89,9 +89,7 @@ def run_tracker_checks(
     if spec is not None:
         report.run("spec", lambda: _spec(spec, settings))
     run = _Runner(report, spec or subject, settings, scene, frames, seed)
-    if not report.run("construction", lambda: _construction(run.construct)):
-        return
-    if not report.run("results", lambda: _results(run)):
+    if not (report.run("construction", lambda: _construction(run)) and report.run("results", lambda: _results(run))):
         return
     deterministic = spec is None or spec.deterministic
     turning_run = _Runner(report, spec or subject, settings, turning, len(turning), seed)
@@ -173,9 +171,12 @@ def _none_of(all_faults: Iterable[Fault], where: str) -> None:
 def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> None:
     require(spec.id and spec.label, "the spec has no id or label")
     default = spec.settings()
-    copy = build(spec.settings, json.loads(default.model_dump_json()))
     changed = "the default settings change when they are written as JSON and read again"
-    require(copy == default, changed, "a field's type does not survive JSON")
+    require(
+        build(spec.settings, json.loads(default.model_dump_json())) == default,
+        changed,
+        "a field's type does not survive JSON",
+    )
     for name, overrides in spec.presets.items():
         try:
             apply_overrides(default, overrides)
@@ -185,16 +186,16 @@ def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> N
         resolve_settings(spec, settings)
 
 
-def _construction(construct: Callable[[], Tracker]) -> None:
-    tracker = construct()
+def _construction(run: _Runner) -> None:
+    tracker = run.construct()
     require_methods(tracker, "reset", "track")
     _close(tracker)
 
 
 def _results(run: _Runner) -> None:
     states = [result.state for result in run.track(run.frames)]
-    cause = "on this scene features abound and depth is exact"
-    require("ok" in states, f"no frame of an easy scene was tracked: {states}", cause)
+    fault = f"no frame of an easy scene was tracked: {states}"
+    require("ok" in states, fault, "on this scene features abound and depth is exact")
 
 
 def _same_keys(run: _Runner) -> None:
@@ -267,10 +268,10 @@ def _hard_frame(run: _Runner, name: str) -> None:
 def _final(run: _Runner, count: int | None = None) -> None:
     tracker, frames = run.construct(), run.frames[:count]
     run.track(frames, tracker)
-    finalize = getattr(tracker, "finalize", None)
-    final = finalize() if callable(finalize) else None
+    finalises = callable(getattr(tracker, "finalize", None))
+    final = tracker.finalize() if finalises else None
     _close(tracker)
-    if not callable(finalize):
+    if not finalises:
         raise NotApplicable("the tracker has no finalize()")
     _none_of(trajectory_faults(final), "finalize() gave")
     assert isinstance(final, Trajectory)
@@ -323,10 +324,8 @@ def _online_settings(run: _Runner, spec: TrackerSpec | None, settings: Settings 
     for first in (0, 1):
         ends = {}
         for number, parameter in enumerate(online, first):
-            pair = (
-                (parameter.choices[0], parameter.choices[-1]) if parameter.choices else (parameter.low, parameter.high)
-            )
-            ends[parameter.name] = pair[number % 2]
+            values = parameter.choices or (parameter.low, parameter.high)
+            ends[parameter.name] = values[-(number % 2)]
         try:
             changed = apply_overrides(start, ends)
             built = run.track(run.frames, run.construct(changed))
@@ -339,7 +338,7 @@ def _online_settings(run: _Runner, spec: TrackerSpec | None, settings: Settings 
         at = first_difference(fresh, run.track(run.frames, tracker))
         fault = f"after an episode configured to {what}, reset() does not bring back the settings: {at}"
         require(not at, fault, "remember the settings that it was built with, and put them into force in reset()")
-        has_effect = has_effect or bool(first_difference(fresh, built))
+        has_effect |= bool(first_difference(fresh, built))
         if first_difference(fresh[half:], built[half:]):
             late_effects.append(first_difference(fresh, run.track(run.frames, tracker, changed, half)))
     fault = f"configure() in mid-episode changes nothing, although building with {names} does"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from hashlib import sha256
 from importlib import import_module
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
-from dynslam_bench.core.errors import DynslamError, PluginError, TrackerError
-from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.errors import PluginError, TrackerError
+from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.settings import Settings, apply_overrides
 from dynslam_bench.trackers.adapters.specs import ADAPTERS
 
@@ -33,11 +33,9 @@ KINDS = {
 
 def all_specs() -> list[TrackerSpec]:
     """The specs of all built-in trackers; imports neither torch nor OpenCV."""
-    specs = list(ADAPTERS)
-    for name in SYSTEMS:
-        module = import_module(f"dynslam_bench.trackers.systems.{name}")
-        specs += getattr(module, "SPECS", None) or [module.SPEC]
-    return specs
+    modules = [import_module(f"dynslam_bench.trackers.systems.{name}") for name in SYSTEMS]
+    systems = [spec for module in modules for spec in getattr(module, "SPECS", None) or [module.SPEC]]
+    return [*ADAPTERS, *systems]
 
 
 def tracker_groups() -> dict[str, list[list[TrackerSpec]]]:
@@ -81,16 +79,14 @@ def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
     """The spec of ``id:value``; a named file's content becomes part of the version, and so of a run's identity."""
     if not value.strip():
         raise PluginError(f"'{spec.id}:' lacks its {spec.parameter}", f"write {spec.id}:{spec.parameter.upper()}")
-    version = spec.version
     path = Path(value).expanduser()
-    if path.is_file():
-        version += "+" + sha256(path.read_bytes()).hexdigest()[:12]
+    content = f"+{sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else ""
     return replace(
         spec,
         id=f"{spec.id}:{value}",
-        label=f"{spec.label}: {path.name if path.is_file() else value}",
+        label=f"{spec.label}: {path.name if content else value}",
         bound={**spec.bound, spec.parameter: value},
-        version=version,
+        version=spec.version + content,
         parameter="",
     )
 
@@ -131,17 +127,12 @@ def build_tracker(
     missing = spec.missing()
     if missing:
         raise TrackerError(f"tracker '{spec.id}' needs a package that is not installed", "; ".join(missing))
-    factory = load_object(spec.entry_point)
-    try:
-        takes_context = "context" in inspect.signature(factory).parameters
-        tracker = factory(settings, **({"context": context or TrackerContext()} if takes_context else {}))
-    except DynslamError:
-        raise
-    except Exception as error:
-        raise TrackerError(f"tracker '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
-    if not isinstance(tracker, Tracker):
-        raise TrackerError(f"'{spec.entry_point}' gave a {type(tracker).__name__} without reset() and track()")
-    return tracker
+
+    def construct(build: Callable[..., object]) -> object:
+        takes_context = "context" in inspect.signature(build).parameters
+        return build(settings, context=context or TrackerContext()) if takes_context else build(settings)
+
+    return build_plugin("tracker", spec, Tracker, TrackerError, construct)  # type: ignore[type-abstract]
 
 
 def epipolar_skipped(tracker: str) -> dict[str, float]:

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout tha
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.carry import carry_dense, carry_sparse
-from dynslam_bench.segmentation.networks.backbone import NetworkConfig, resnet18_config
+from dynslam_bench.segmentation.networks.backbone import RESNET18, NetworkConfig
 from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
 from dynslam_bench.segmentation.networks.network import MaskRCNN
@@ -75,7 +75,7 @@ def main() -> None:
     for side in (480, 800):
         network = untrained(NetworkConfig(), side, arguments.threads, arguments.objects)
         add(f"Mask R-CNN, ResNet-50, CFPN, shorter side {side}", network)
-    network = untrained(resnet18_config(), 480, arguments.threads, arguments.objects)
+    network = untrained(RESNET18, 480, arguments.threads, arguments.objects)
     add("Mask R-CNN, ResNet-18, CFPN, shorter side 480", network)
     if embedded_weights() is not None:
         add(

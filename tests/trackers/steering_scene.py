@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from quick_dense import quick
@@ -14,6 +15,7 @@ from dynslam_bench.core.settings import Settings, parameters
 from dynslam_bench.segmentation.build_segmenter import SegmenterContext, SegmenterSpec
 from dynslam_bench.segmentation.recorded import instances_of
 from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.testing.tracker import first_difference
 from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.registry import resolve_settings
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
@@ -61,9 +63,7 @@ class Erring:
         true = instances_of(self._masks[frame.index], where="the scene")
         draw = np.random.default_rng([3, frame.index]).uniform(size=(2, len(true)))
         scores = np.where(draw[0] < 0.25, 0.15 + 0.3 * draw[1], 0.55 + 0.4 * draw[1])
-        found = np.flatnonzero(draw[1] > 0.15)
-        names = tuple(true.class_names[index] for index in found)
-        return Instances(true.masks[found], true.boxes[found], names, scores[found].astype(np.float32))
+        return replace(true, scores=scores.astype(np.float32), moving=None).select(draw[1] > 0.15)
 
 
 def build_erring(settings: Settings, context: SegmenterContext) -> Erring:
@@ -100,20 +100,6 @@ def play(
         yield tracker.track(frame)
 
 
-def differing(first: TrackResult, second: TrackResult) -> str:
-    """The first thing in which two results differ, bit for bit; empty if in none."""
-    if first.state != second.state:
-        return f"states {first.state} and {second.state}"
-    for name in ("T_world_cam", "keypoints_xy", "keypoints_keep", "dynamic_mask"):
-        if not np.array_equal(getattr(first, name), getattr(second, name)):
-            return name
-    changed = [key for key in {**first.stats, **second.stats} if first.stats.get(key) != second.stats.get(key)]
-    return f"stats {changed[:4]}" if changed else ""
-
-
 def difference(first: Iterable[TrackResult], second: Iterable[TrackResult]) -> str:
-    """The first thing in which two episodes of the same length differ, bit for bit; empty if in none."""
-    for index, (a, b) in enumerate(zip(first, second, strict=True)):
-        if found := differing(a, b):
-            return f"frame {index}: {found}"
-    return ""
+    """The first thing in which two episodes differ, bit for bit; empty if in none."""
+    return first_difference(list(first), list(second))

@@ -12,7 +12,7 @@ from itertools import islice
 import numpy as np
 import pytest
 from quick_dense import quick
-from steering_scene import FRAMES, SmallScene, construct, difference, differing, play, settings_for
+from steering_scene import FRAMES, SmallScene, construct, difference, play, settings_for
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
@@ -148,7 +148,7 @@ def until_it_acts(unsteered: list[TrackResult], episode: Iterator[TrackResult]) 
     results = []
     for before, result in zip(unsteered, episode, strict=True):
         results.append(result)
-        if differing(before, result):
+        if difference([before], [result]):
             return results + list(islice(episode, AFTER))
     return []
 

@@ -88,19 +88,15 @@ class NetworkConfig(BaseModel):
         return (self.stem * expansion, 2 * self.stem * expansion, 4 * self.stem * expansion, 8 * self.stem * expansion)
 
 
-def embedded_config(*, cfpn: bool = True) -> NetworkConfig:
-    """The small network of this package: half-width ResNet-18, 64-channel pyramid, 320 x 240 input, persons only."""
-    return NetworkConfig(
-        blocks=(2, 2, 2, 2), bottleneck=False, stem=32, channels=64, cfpn=cfpn, classes=("person",),
-        anchor_sizes=(16.0, 32.0, 64.0, 128.0, 224.0), anchor_ratios=(1.0, 2.0, 3.0), box_hidden=256,
-        mask_channels=64, mask_layers=4, mask_pool=14, canonical=112.0, mask_canonical=224.0, min_side=240,
-        max_side=427, pre_nms=200, post_nms=100, max_detections=20, exact_paste=True, norm="batch",
-    )  # fmt: skip
-
-
-def resnet18_config(classes: tuple[str, ...] = ("person",), *, cfpn: bool = True) -> NetworkConfig:
-    """Mask R-CNN on a full-width ResNet-18."""
-    return NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, cfpn=cfpn, classes=classes, norm="batch")
+EMBEDDED = NetworkConfig(
+    blocks=(2, 2, 2, 2), bottleneck=False, stem=32, channels=64, classes=("person",),
+    anchor_sizes=(16.0, 32.0, 64.0, 128.0, 224.0), anchor_ratios=(1.0, 2.0, 3.0), box_hidden=256, mask_channels=64,
+    canonical=112.0, min_side=240, max_side=427, pre_nms=200, post_nms=100, max_detections=20, exact_paste=True,
+    norm="batch",
+)  # fmt: skip
+"""The small network of this package: half-width ResNet-18, 64-channel pyramid, 320 x 240 input, persons only."""
+RESNET18 = NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, classes=("person",), norm="batch")
+"""Mask R-CNN on a full-width ResNet-18."""
 
 
 def initialise(module: nn.Module, weights: Callable[[Tensor], object]) -> None:
@@ -150,9 +146,10 @@ class ResidualBlock(nn.Module):
             self.add_module(f"conv{number}", _conv(channels, wanted, kernel, step))
             self.add_module(f"bn{number}", _norm(wanted, config))
             channels = wanted
-        self.downsample: nn.Module | None = None
-        if stride > 1 or inputs != outputs:
-            self.downsample = nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config))
+        shortcut = stride > 1 or inputs != outputs
+        self.downsample = (
+            nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config)) if shortcut else nn.Identity()
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """``[B, inputs, H, W]`` to ``[B, outputs, H / stride, W / stride]``."""
@@ -161,7 +158,7 @@ class ResidualBlock(nn.Module):
             y = self.get_submodule(f"bn{number}")(self.get_submodule(f"conv{number}")(y))
             if number < self.convolutions:
                 y = functional.relu(y, inplace=True)
-        return functional.relu(y + (x if self.downsample is None else self.downsample(x)), inplace=True)
+        return functional.relu(y + self.downsample(x), inplace=True)
 
 
 class Trunk(nn.Module):

@@ -18,18 +18,13 @@ NEGATIVE, IGNORED = -1, -2
 """Values of `match` for boxes without an object."""
 
 
-def area(boxes: Tensor) -> Tensor:
-    """Areas ``[N]`` of boxes ``[N, 4]``."""
-    return (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-
-
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
     """Intersection over union ``[N, M]`` of boxes ``[N, 4]`` and ``[M, 4]``; 0 where both are empty."""
-    low = torch.maximum(a[:, None, :2], b[None, :, :2])
-    high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
-    inter = (high - low).clamp_(min=0).prod(dim=2)
-    union = area(a)[:, None] + area(b)[None, :] - inter
-    return torch.where(union > 0, inter / union.clamp(min=1e-12), inter.new_zeros(()))
+    shared = torch.minimum(a[:, None, 2:], b[None, :, 2:]) - torch.maximum(a[:, None, :2], b[None, :, :2])
+    width, height = shared.clamp(min=0).unbind(dim=2)
+    inter = width * height
+    area_a, area_b = ((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1]) for boxes in (a, b))
+    return inter / (area_a[:, None] + area_b[None] - inter).clamp(min=1e-12)
 
 
 def nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
@@ -48,11 +43,9 @@ def nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
         Indices of the boxes that stay, best first.
     """
     order = scores.argsort(descending=True, stable=True)
-    if order.numel() < 2:
-        return order
     over = torch.triu(box_iou(boxes[order], boxes[order]) > threshold, diagonal=1).to(torch.float32)
-    keep = torch.ones_like(over[0])
-    for _ in range(order.numel()):
+    keep = over.new_ones(len(order))
+    for _ in range(len(order)):
         new = ((keep @ over) == 0).to(torch.float32)
         if torch.equal(new, keep):
             break
@@ -115,9 +108,7 @@ def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: b
         return torch.full((len(boxes),), NEGATIVE, device=boxes.device)
     overlap = box_iou(truth, boxes)
     best, index = overlap.max(dim=0)
-    result = index.clone()
-    result[best < high] = IGNORED
-    result[best < low] = NEGATIVE
+    result = index.masked_fill(best < high, IGNORED).masked_fill(best < low, NEGATIVE)
     if keep_best:
         top = overlap.max(dim=1, keepdim=True).values
         forced = ((overlap == top) & (overlap > 0)).any(dim=0)
@@ -134,14 +125,13 @@ def sample(matched: Tensor, *, count: int, positive_share: float, generator: tor
         positive_share: Largest share of positive ones.
         generator: Draws.
     """
-    positive = torch.nonzero(matched >= 0)[:, 0]
-    negative = torch.nonzero(matched == NEGATIVE)[:, 0]
-    positives = min(len(positive), int(count * positive_share))
-    negatives = min(len(negative), count - positives)
-    return _draw(positive, positives, generator), _draw(negative, negatives, generator)
+    positive = _draw(matched >= 0, int(count * positive_share), generator)
+    return positive, _draw(matched == NEGATIVE, count - len(positive), generator)
 
 
-def _draw(index: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    if count == len(index):
+def _draw(candidates: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Indices of at most `count` of the boxes where `candidates` is true."""
+    index = torch.nonzero(candidates)[:, 0]
+    if count >= len(index):
         return index
     return index[torch.randperm(len(index), generator=generator)[:count].to(index.device)]

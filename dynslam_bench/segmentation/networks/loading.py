@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -66,7 +67,7 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     path = path.expanduser()
     try:
         with path.open("rb") as file:
-            size = len(file.read(1)) and path.stat().st_size
+            size = file.seek(0, os.SEEK_END)
     except OSError as error:
         raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
     try:
@@ -153,8 +154,7 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         "ratios": "rpn.head.cls_logits.weight",
         "mask_channels": "roi_heads.mask_head.0.0.weight",
     }
-    missing = [key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)]
-    if missing:
+    if missing := [key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)]:
         raise SegmentationError(
             f"{path} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
             f"for example {_some(state)})"
@@ -197,8 +197,7 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) ->
 
 
 def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:
-    own = _weights(network)
-    has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
+    own, has_cfpn = _weights(network), any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
     unknown = [key for key in state if key not in own]
     shapes = [

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -15,10 +13,10 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.segmenter import Instances, SegmenterContext
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.postprocess import pick
 from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings, expand_classes
 
 
@@ -48,19 +46,17 @@ class MaskRCNNSegmenter:
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame; none is an empty result."""
         height, width = frame.rgb.shape[:2]
-        with torch_threads(self.threads):
+        with pinned_threads(torch.get_num_threads, torch.set_num_threads, self.threads):
             image = torch.from_numpy(np.ascontiguousarray(frame.rgb)).to(self.device).permute(2, 0, 1).float() / 255
             detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
             boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
         config, wanted = self.network.config, expand_classes(self.settings.classes)
         names = [config.classes[label - 1] for label in labels]
         masks = np.zeros((len(names), height, width), bool)
-        for index in (index for index, name in enumerate(names) if name in wanted):
-            masks[index] = paste(
-                planes[index], boxes[index], height, width, self.settings.mask_threshold, exact=config.exact_paste
-            )
-        instances = Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32))
-        return pick(instances, np.asarray(masks.any(axis=(1, 2))))
+        for mask, plane, box, name in zip(masks, planes, boxes, names, strict=True):
+            if name in wanted:
+                mask[:] = paste(plane, box, height, width, self.settings.mask_threshold, exact=config.exact_paste)
+        return Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32)).visible()
 
 
 def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
@@ -121,14 +117,10 @@ def paste(
     if exact:
         return _paste_exactly(plane, box, height, width, threshold)
     side = plane.shape[0]
-    padded = np.zeros((side + 2, side + 2), np.float32)
-    padded[1:-1, 1:-1] = plane
-    centre = (box[:2] + box[2:]) / 2
-    half = (box[2:] - box[:2]) / 2 * ((side + 2) / side)
-    x0, y0 = (int(value) for value in np.trunc(centre - half))
-    x1, y1 = (int(value) for value in np.trunc(centre + half))
-    columns, rows = max(x1 - x0 + 1, 1), max(y1 - y0 + 1, 1)
-    patch = cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    centre, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * ((side + 2) / side)
+    (x0, y0), (x1, y1) = (np.trunc(corner).astype(int).tolist() for corner in (centre - half, centre + half))
+    size = (max(x1 - x0 + 1, 1), max(y1 - y0 + 1, 1))
+    patch = cv2.resize(np.pad(plane, 1), size, interpolation=cv2.INTER_LINEAR)
     mask = np.zeros((height, width), bool)
     left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1 + 1, width), min(y1 + 1, height)
     if left < right and top < bottom:
@@ -154,14 +146,3 @@ def _paste_exactly(
     inside = ((rows >= box[1]) & (rows <= box[3]))[:, None] & ((columns >= box[0]) & (columns <= box[2]))[None]
     mask[top:bottom, left:right] = (patch >= threshold) & inside
     return mask
-
-
-@contextmanager
-def torch_threads(threads: int) -> Iterator[None]:
-    """Pin torch's thread count while the block runs (it is one number for the whole process)."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -8,6 +8,7 @@ one vectorised call for all boxes, levels and channels.
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -31,6 +32,8 @@ MEAN = (0.485, 0.456, 0.406)
 DEVIATION = (0.229, 0.224, 0.225)
 MIN_PROPOSAL_PX = 1e-3
 BOX_POOL = 7
+SAMPLES = 2
+"""Sampling points a side of a bin of `roi_align`."""
 MIN_BOX_PX = 1e-2
 POSITIVE_SHARE = 0.25
 
@@ -138,18 +141,16 @@ def rpn_loss(
         truths: Boxes ``[G, 4]`` of each image.
         generator: Draws the sample.
     """
-    every = torch.cat(anchors)
-    all_logits = torch.cat(logits, dim=1).float()
-    all_codes = torch.cat(codes, dim=1).float()
+    every, total = torch.cat(anchors), 0
+    all_logits, all_codes = torch.cat(logits, dim=1).float(), torch.cat(codes, dim=1).float()
     objectness, regression = [], []
-    total = 0
     for image, truth in enumerate(truths):
         matched = match(every, truth, high=0.7, low=0.3, keep_best=True)
         positive, negative = sample(matched, count=256, positive_share=0.5, generator=generator)
         index = torch.cat([positive, negative])
         label = (matched[index] >= 0).float()
         objectness.append(functional.binary_cross_entropy_with_logits(all_logits[image, index], label, reduction="sum"))
-        wanted = encode(truth[matched[positive]], every[positive], RPN_WEIGHTS) if len(positive) else every[:0]
+        wanted = encode(truth[matched[positive]], every[positive], RPN_WEIGHTS)
         regression.append(functional.smooth_l1_loss(all_codes[image, positive], wanted, beta=1 / 9, reduction="sum"))
         total += len(index)
     return torch.stack(objectness).sum() / max(total, 1), torch.stack(regression).sum() / max(total, 1)
@@ -165,9 +166,7 @@ def levels_of(boxes: Tensor, canonical: float, count: int) -> Tensor:
     return (level.clamp(2, count + 1) - 2).long()
 
 
-def roi_align(
-    features: list[Tensor], boxes: list[Tensor], image_height: int, size: int, *, canonical: float, samples: int = 2
-) -> Tensor:
+def roi_align(features: list[Tensor], boxes: list[Tensor], image_height: int, size: int, *, canonical: float) -> Tensor:
     """Features of boxes, each from the pyramid level that fits its size.
 
     Args:
@@ -176,7 +175,6 @@ def roi_align(
         image_height: Of the network's input; gives the levels' scales.
         size: Bins a side.
         canonical: Box side that goes to the third level.
-        samples: Sampling points a side of a bin.
 
     Returns:
         ``[sum K_b, C, size, size]``; samples outside the feature map count as 0 (beyond one cell), as in the original.
@@ -187,8 +185,6 @@ def roi_align(
     image = torch.repeat_interleave(
         torch.arange(batch, device=device), torch.tensor([len(b) for b in boxes], device=device)
     )
-    if not len(rois):
-        return features[0].new_zeros((0, channels, size, size))
     table = torch.cat([level.permute(0, 2, 3, 1).reshape(-1, channels) for level in features])
     level = levels_of(rois, canonical, len(features))
     heights = torch.tensor([f.shape[2] for f in features], device=device)[level]
@@ -197,11 +193,11 @@ def roi_align(
     base = cells.cumsum(dim=0)[level] + image * heights * widths
     scales = torch.tensor([level_scale(f.shape[2], image_height) for f in features], device=device)[level]
     scaled = rois.to(torch.float32) * scales[:, None]
-    rows, row_weights = _axis(scaled[:, 1], scaled[:, 3], heights, size, samples)
-    columns, column_weights = _axis(scaled[:, 0], scaled[:, 2], widths, size, samples)
+    rows, row_weights = _axis(scaled[:, 1], scaled[:, 3], heights, size)
+    columns, column_weights = _axis(scaled[:, 0], scaled[:, 2], widths, size)
     index = (base[:, None, None] + rows * widths[:, None, None])[:, :, None, :, None] + columns[:, None, :, None, :]
     weight = row_weights[:, :, None, :, None] * column_weights[:, None, :, None, :]
-    taps = (2 * samples) ** 2
+    taps = (2 * SAMPLES) ** 2
     bags = functional.embedding_bag(
         index.reshape(-1, taps), table, mode="sum", per_sample_weights=weight.reshape(-1, taps).to(table.dtype)
     )
@@ -213,23 +209,20 @@ def level_scale(level_height: int, image_height: int) -> float:
     return float(2.0 ** torch.tensor(level_height / image_height).log2().round().item())
 
 
-def _axis(low: Tensor, high: Tensor, length: Tensor, size: int, samples: int) -> tuple[Tensor, Tensor]:
-    """Cells ``[K, size, 2 samples]`` along one axis that each bin's samples touch, and their weights."""
+def _axis(low: Tensor, high: Tensor, length: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Cells ``[K, size, 2 SAMPLES]`` along one axis that each bin's samples touch, and their weights."""
     extent = (high - low).clamp(min=1.0)
-    step = (torch.arange(size * samples, device=low.device, dtype=torch.float32) + 0.5) / (size * samples)
+    step = (torch.arange(size * SAMPLES, device=low.device, dtype=torch.float32) + 0.5) / (size * SAMPLES)
     # bin by bin, as the original adds them up: start + bin * bin_size + (sample + .5) * bin_size / samples
     at = low[:, None] + step * extent[:, None]
     last = (length - 1)[:, None].to(torch.float32)
     inside = (at >= -1.0) & (at <= last + 1.0)
     at = torch.minimum(at.clamp(min=0.0), last)
     floor = at.floor()
-    fraction = at - floor
-    upper = torch.minimum(floor + 1, last)
-    scale = inside / samples
-    cells = torch.stack([floor, upper], dim=2).long()
+    fraction, scale = at - floor, inside / SAMPLES
+    cells = torch.stack([floor, torch.minimum(floor + 1, last)], dim=2).long()
     weights = torch.stack([(1 - fraction) * scale, fraction * scale], dim=2)
-    count = len(low)
-    return cells.reshape(count, size, 2 * samples), weights.reshape(count, size, 2 * samples)
+    return cells.reshape(len(low), size, 2 * SAMPLES), weights.reshape(len(low), size, 2 * SAMPLES)
 
 
 class Detections(NamedTuple):
@@ -254,17 +247,12 @@ def _initialise(weight: Tensor) -> None:
         nn.init.kaiming_normal_(weight, mode="fan_out", nonlinearity="relu")
 
 
-class TwoMLPHead(nn.Module):
-    """Two fully connected layers on the pooled features of a box."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        self.fc6 = nn.Linear(config.channels * BOX_POOL**2, config.box_hidden)
-        self.fc7 = nn.Linear(config.box_hidden, config.box_hidden)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``[K, C, 7, 7]`` to ``[K, hidden]``."""
-        return functional.relu(self.fc7(functional.relu(self.fc6(x.flatten(1)))))
+def box_head(config: NetworkConfig) -> nn.Sequential:
+    """Two fully connected layers on the pooled features of a box: ``[K, C, 7, 7]`` to ``[K, hidden]``."""
+    fc6 = nn.Linear(config.channels * BOX_POOL**2, config.box_hidden)
+    fc7 = nn.Linear(config.box_hidden, config.box_hidden)
+    layers = {"flatten": nn.Flatten(), "fc6": fc6, "relu6": nn.ReLU(), "fc7": fc7, "relu7": nn.ReLU()}
+    return nn.Sequential(OrderedDict(layers))
 
 
 class BoxPredictor(nn.Module):
@@ -280,20 +268,13 @@ class BoxPredictor(nn.Module):
         return self.cls_score(x), self.bbox_pred(x)
 
 
-class MaskPredictor(nn.Module):
-    """Doubles the resolution and gives one logit a class and pixel."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        self.conv5_mask = nn.ConvTranspose2d(config.mask_channels, config.mask_channels, 2, 2)
-        self.mask_fcn_logits = nn.Conv2d(config.mask_channels, len(config.classes) + 1, 1)
-        _initialise(self.conv5_mask.weight)
-        _initialise(self.mask_fcn_logits.weight)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """``[K, C, m, m]`` to logits ``[K, n + 1, 2m, 2m]``."""
-        result: Tensor = self.mask_fcn_logits(functional.relu(self.conv5_mask(x)))
-        return result
+def mask_predictor(config: NetworkConfig) -> nn.Sequential:
+    """Doubles the resolution and gives one logit a class and pixel: ``[K, C, m, m]`` to ``[K, n + 1, 2m, 2m]``."""
+    double = nn.ConvTranspose2d(config.mask_channels, config.mask_channels, 2, 2)
+    logits = nn.Conv2d(config.mask_channels, len(config.classes) + 1, 1)
+    _initialise(double.weight)
+    _initialise(logits.weight)
+    return nn.Sequential(OrderedDict(conv5_mask=double, relu=nn.ReLU(), mask_fcn_logits=logits))
 
 
 def mask_head(config: NetworkConfig) -> nn.Sequential:
@@ -314,10 +295,10 @@ class RoIHeads(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.box_head = TwoMLPHead(config)
+        self.box_head = box_head(config)
         self.box_predictor = BoxPredictor(config)
         self.mask_head = mask_head(config)
-        self.mask_predictor = MaskPredictor(config)
+        self.mask_predictor = mask_predictor(config)
 
     def detect(
         self,
@@ -394,7 +375,7 @@ class RoIHeads(nn.Module):
             hits, boxes = matched[positive], candidates[positive]
             rois.append(torch.cat([boxes, candidates[negative]]))
             classes.append(torch.cat([label[hits], label.new_zeros(len(negative))]))
-            codes.append(encode(truth[hits], boxes, BOX_WEIGHTS) if len(hits) else truth[:0])
+            codes.append(encode(truth[hits], boxes, BOX_WEIGHTS))
             positives.append(boxes)
             targets.append(crop_masks(mask[hits], boxes, 2 * self.config.mask_pool))
         pooled = roi_align(levels, rois, image_height, BOX_POOL, canonical=self.config.canonical)
@@ -417,8 +398,6 @@ class RoIHeads(nn.Module):
 
 def crop_masks(masks: Tensor, boxes: Tensor, size: int) -> Tensor:
     """Targets of the mask branch: bool ``[K, H, W]`` masks inside their boxes as ``[K, size, size]`` in [0, 1]."""
-    if not len(masks):
-        return torch.zeros((0, size, size), device=masks.device)
     height, width = masks.shape[1:]
     step = (torch.arange(size, device=boxes.device, dtype=torch.float32) + 0.5) / size
     x = boxes[:, 0, None] + step * (boxes[:, 2] - boxes[:, 0])[:, None]
@@ -522,8 +501,7 @@ class MaskRCNN(nn.Module):
     def fuse(self) -> MaskRCNN:
         """Fold every batch normalisation into its convolution, in place, for faster inference; outputs stay equal."""
         for module in list(self.backbone.body.modules()):
-            children = list(module.named_children())
-            for (_, conv), (name, norm) in pairwise(children):
+            for (_, conv), (name, norm) in pairwise(list(module.named_children())):
                 if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
                     _fold(conv, norm)
                     setattr(module, name, nn.Identity())
@@ -536,9 +514,10 @@ def normalise(images: Tensor) -> Tensor:
     return (images - mean) / images.new_tensor(DEVIATION).reshape(1, 3, 1, 1)
 
 
+@torch.no_grad()
 def _fold(conv: nn.Conv2d, norm: nn.BatchNorm2d) -> None:
+    """Fold a batch normalisation into the convolution before it, in place."""
     assert norm.running_mean is not None and norm.running_var is not None
-    with torch.no_grad():
-        scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
-        conv.weight.mul_(scale.reshape(-1, 1, 1, 1))
-        conv.bias = nn.Parameter(norm.bias - norm.running_mean * scale)
+    scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
+    conv.weight.mul_(scale.reshape(-1, 1, 1, 1))
+    conv.bias = nn.Parameter(norm.bias - norm.running_mean * scale)

@@ -18,13 +18,14 @@ from torch.nn import functional
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.segmentation.networks.boxes import BOX_WEIGHTS, RPN_WEIGHTS, clip, decode
+from dynslam_bench.segmentation.networks.boxes import BOX_WEIGHTS, RPN_WEIGHTS, box_iou, clip, decode
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import (
     BOX_POOL,
     MIN_BOX_PX,
     MIN_PROPOSAL_PX,
+    SAMPLES,
     MaskRCNN,
     anchors_of,
     level_scale,
@@ -44,8 +45,6 @@ CANDIDATES = 400
 """Classified boxes that enter the last suppression, the best first."""
 CHUNK = 100
 """Boxes whose features are gathered at a time, which bounds the memory."""
-SAMPLES = 2
-"""Sampling points a side of a bin, as in `roi_align`."""
 
 
 @dataclass(frozen=True)
@@ -202,9 +201,8 @@ class StaticMaskRCNN(nn.Module):
         """
         levels, mask_levels = self.network.backbone(self.network.prepare(image[0])[0])
         boxes, labels, scores = self._classified(levels[:4], *self._proposals(levels))
-        config = self.network.config
+        config, heads = self.network.config, self.network.roi_heads
         pooled = self._pooled(mask_levels, boxes, config.mask_pool, config.mask_canonical)
-        heads = self.network.roi_heads
         logits = heads.mask_predictor(heads.mask_head(pooled))
         chosen = labels[:, None, None, None].expand(-1, 1, *logits.shape[2:])
         planes = torch.gather(logits, 1, chosen)[:, 0].sigmoid()
@@ -221,7 +219,7 @@ class StaticMaskRCNN(nn.Module):
             box = clip(decode(codes, anchors, RPN_WEIGHTS)[:, 0], *self.size)
             large = ((box[:, 2:] - box[:, :2]) >= MIN_PROPOSAL_PX).all(dim=1).to(box.dtype)
             boxes.append(box)
-            scores.append(best.sigmoid() * unsuppressed(overlap(box) > config.rpn_nms, large))
+            scores.append(best.sigmoid() * unsuppressed(box_iou(box, box) > config.rpn_nms, large))
         count = min(config.post_nms, sum(map(len, scores)))
         score, order = torch.cat(scores).topk(count)
         return torch.cat(boxes).index_select(0, order), (score > 0).to(score.dtype)
@@ -238,7 +236,7 @@ class StaticMaskRCNN(nn.Module):
         passed = scores * valid[:, None] * ((scores > self.score) & large).to(scores.dtype)
         best, order = passed.reshape(-1).topk(min(CANDIDATES, passed.numel()))
         box, label = boxes.reshape(-1, 4).index_select(0, order), order % classes + 1
-        over = (overlap(box) > self.iou) & (label[:, None] == label[None, :])
+        over = (box_iou(box, box) > self.iou) & (label[:, None] == label[None, :])
         kept, order = (best * unsuppressed(over, (best > 0).to(best.dtype))).topk(min(config.max_detections, len(best)))
         return box.index_select(0, order), label.index_select(0, order), kept
 
@@ -278,20 +276,11 @@ def unsuppressed(over: Tensor, valid: Tensor) -> Tensor:
         over: Bool ``[N, N]``, which overlap too much.
         valid: ``[N]``: 0 for padding, which suppresses nothing.
     """
-    before = torch.ones(len(valid), len(valid)).tril(diagonal=-1)
-    better = over.to(valid.dtype) * before
+    better = over.to(valid.dtype) * torch.ones(len(valid), len(valid)).tril(diagonal=-1)
     keep = column = valid[:, None]
     for _ in range(ROUNDS):
         keep = column * (better @ keep < 0.5).to(valid.dtype)
     return keep[:, 0]
-
-
-def overlap(boxes: Tensor) -> Tensor:
-    """IoU ``[N, N]`` of boxes ``[N, 4]``; 0 where neither has an area."""
-    low, high, size = boxes[:, :2], boxes[:, 2:], boxes[:, 2:] - boxes[:, :2]
-    shared = (torch.minimum(high[:, None], high[None]) - torch.maximum(low[:, None], low[None])).clamp(min=0)
-    inter, area = shared[:, :, 0] * shared[:, :, 1], size[:, 0] * size[:, 1]
-    return inter / (area[:, None] + area[None] - inter).clamp(min=1e-12)
 
 
 def _bins(low: Tensor, high: Tensor, length: int, size: int) -> Tensor:

@@ -8,11 +8,15 @@ An ONNX file is one protocol-buffer message. Only the few fields below are decod
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from dynslam_bench.core.errors import SegmentationError
+
+Fields: TypeAlias = dict[int, list[Any]]
+"""Values of a message, each an integer or a memoryview, by field number."""
+_NOTHING = memoryview(b"")
 
 
 @dataclass(frozen=True)
@@ -48,72 +52,60 @@ def read_header(path: Path) -> OnnxHeader:
             f"cannot read the network {path}: {error.strerror}", "give the path of an .onnx file"
         ) from error
     try:
-        graph = _first(memoryview(data), 7)
-        initialised = {_text(tensor, 8) for tensor in _messages(graph, 5)}
-        inputs = tuple(_tensor(value) for value in _messages(graph, 11) if _text(value, 1) not in initialised)
-        outputs = tuple(_tensor(value) for value in _messages(graph, 12))
-        metadata = {_text(entry, 1): _text(entry, 2) for entry in _messages(memoryview(data), 14)}
+        model = _fields(memoryview(data))
+        graph = _message(model, 7)
+        initialised = {_text(_fields(tensor), 8) for tensor in graph.get(5, ())}
+        inputs, outputs = (tuple(_tensor(_fields(value)) for value in graph.get(number, ())) for number in (11, 12))
+        inputs = tuple(tensor for tensor in inputs if tensor.name not in initialised)
+        metadata = {_text(entry, 1): _text(entry, 2) for entry in map(_fields, model.get(14, ()))}
         if not inputs or not outputs:
             raise ValueError(f"it declares {len(inputs)} inputs and {len(outputs)} outputs")
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, TypeError, AttributeError) as error:  # also a field of another type
         raise SegmentationError(
             f"{path} is not an ONNX model ({len(data)} bytes): {error}", "the file is truncated or of another format"
         ) from error
     return OnnxHeader(inputs, outputs, metadata)
 
 
-def _tensor(data: memoryview) -> TensorInfo:
-    shape = _first(_first(_first(data, 2), 1), 2)
-    return TensorInfo(_text(data, 1), tuple(_dimension(value) for value in _messages(shape, 1)))
+def _tensor(value: Fields) -> TensorInfo:
+    shape = _message(_message(_message(value, 2), 1), 2)
+    sizes = [_fields(dimension).get(1, [0])[-1] for dimension in shape.get(1, ())]
+    return TensorInfo(_text(value, 1), tuple(size if 0 < size < 1 << 62 else None for size in sizes))
 
 
-def _dimension(data: memoryview) -> int | None:
-    sizes = [value for number, value in _fields(data) if number == 1 and isinstance(value, int)]
-    return sizes[-1] if sizes and 0 < sizes[-1] < 1 << 62 else None
+def _message(fields: Fields, number: int) -> Fields:
+    return _fields(fields.get(number, [_NOTHING])[0])
 
 
-def _messages(data: memoryview, wanted: int) -> list[memoryview]:
-    """The length-delimited values of a field number: messages and texts."""
-    return [value for number, value in _fields(data) if number == wanted and isinstance(value, memoryview)]
+def _text(fields: Fields, number: int) -> str:
+    text: str = fields.get(number, [_NOTHING])[0].tobytes().decode()
+    return text
 
 
-def _first(data: memoryview, wanted: int) -> memoryview:
-    return next(iter(_messages(data, wanted)), memoryview(b""))
-
-
-def _text(data: memoryview, wanted: int) -> str:
-    return bytes(_first(data, wanted)).decode()
-
-
-def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """The (field number, value) pairs of a message; fixed-size values come as their raw bytes."""
+def _fields(data: memoryview) -> Fields:
+    """The values of a message by field number: integers, and the bytes of everything else."""
+    fields: Fields = {}
     position = 0
     while position < len(data):
         key, position = _varint(data, position)
         kind = key & 7
-        if kind == 0:
-            value, position = _varint(data, position)
-            yield key >> 3, value
-            continue
-        if kind not in (1, 2, 5):
+        if kind not in (0, 1, 2, 5):
             raise ValueError(f"unknown wire type {kind}")
-        size = 8 if kind == 1 else 4
-        if kind == 2:
-            size, position = _varint(data, position)
-        if position + size > len(data):
-            raise ValueError(f"a field of {size} bytes ends beyond the file")
-        yield key >> 3, data[position : position + size]
-        position += size
+        value, begin = _varint(data, position) if kind in (0, 2) else ({1: 8, 5: 4}[kind], position)
+        position = begin if kind == 0 else begin + value
+        if position > len(data):
+            raise ValueError(f"a field of {value} bytes ends beyond the file")
+        fields.setdefault(key >> 3, []).append(value if kind == 0 else data[begin:position])
+    return fields
 
 
 def _varint(data: memoryview, position: int) -> tuple[int, int]:
-    result = shift = 0
-    while True:
+    """The number that begins at a position, and the position after it."""
+    result = 0
+    for shift in range(0, 70, 7):
         byte = data[position]
         position += 1
         result |= (byte & 127) << shift
         if byte < 128:
             return result, position
-        shift += 7
-        if shift > 63:
-            raise ValueError("a number is longer than ten bytes")
+    raise ValueError("a number is longer than ten bytes")

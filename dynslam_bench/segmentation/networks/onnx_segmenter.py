@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -25,8 +24,9 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.segmenter import Instances, SegmenterContext
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.onnx_header import OnnxHeader, TensorInfo, read_header
-from dynslam_bench.segmentation.postprocess import boxes_of, pick
+from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, NMS_IOU, VOC_NAMES, SegmentationSettings
 
 Float: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
@@ -36,6 +36,13 @@ _SCALINGS = {
     "imagenet": ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)),
 }
 """Mean and divisor of the RGB channels of a 0..255 image."""
+_SEMANTIC_NAMES = {
+    len(VOC_NAMES): dict(enumerate(VOC_NAMES)),
+    len(COCO_NAMES) + 1: dict(enumerate(("background", *COCO_NAMES))),
+    91: {0: "background", **COCO_IDS},
+    2: {0: "background", 1: "person"},
+}
+"""Names of the classes of a semantic network by their number."""
 PAD = 114
 STRIDE = 32
 """An open input size is padded to a multiple of this."""
@@ -109,7 +116,7 @@ class OnnxSegmenter:
         mean, divisor = _SCALINGS[scaling]
         scaled = (image.astype(np.float32) - np.array(mean, np.float32)) / np.array(divisor, np.float32)
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
-        with opencv_threads(self.threads):
+        with pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads):
             try:
                 self._net.setInput(blob, self._input)
                 outputs = self._net.forward(names)
@@ -154,10 +161,8 @@ def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> 
     height, width = rgb.shape[:2]
     if (height, width) == size:
         return rgb, Placement(size, size)
-    rows, columns = size
-    if keep_aspect:
-        ratio = min(size[0] / height, size[1] / width)
-        rows, columns = max(1, round(height * ratio)), max(1, round(width * ratio))
+    ratio = min(size[0] / height, size[1] / width)
+    rows, columns = (max(1, round(height * ratio)), max(1, round(width * ratio))) if keep_aspect else size
     top, left = (size[0] - rows) // 2, (size[1] - columns) // 2
     canvas = np.full((*size, 3), PAD, np.uint8)
     canvas[top : top + rows, left : left + columns] = cv2.resize(
@@ -165,17 +170,6 @@ def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> 
     ).reshape(rows, columns, 3)
     place = Placement((height, width), size, (columns / width, rows / height), (float(left), float(top)))
     return canvas, place
-
-
-@contextmanager
-def opencv_threads(threads: int) -> Iterator[None]:
-    """Pin OpenCV's thread count while the block runs (it is one number for the whole process)."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(threads)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def _input_size(header: OnnxHeader, path: Path) -> tuple[int, int] | None:
@@ -235,56 +229,35 @@ def detect_layout(
     if {"boxes", "labels", "scores", "masks"} <= set(by_name):
         order = tuple(by_name[key].name for key in ("boxes", "labels", "scores", "masks"))
         return Layout("instances", order, names or COCO_IDS)
-    rank3 = [output for output in outputs if len(output.shape) == 3 and _known(output.shape)]
-    rank4 = [output for output in outputs if len(output.shape) == 4 and _known(output.shape[1:])]
-    if rank3 and rank4:
-        yolo = _yolo(rank3, rank4, names)
-        if yolo is not None:
-            return yolo
+    rank3 = [output for output in outputs if len(output.shape) == 3 and None not in output.shape]
+    rank4 = [output for output in outputs if len(output.shape) == 4 and None not in output.shape[1:]]
+    if rank3 and rank4 and (yolo := _yolo(rank3[0], rank4[-1], names)):
+        return yolo
     if rank4 and not rank3:
         full = max(rank4, key=lambda output: (output is rank4[0], math.prod(s or 1 for s in output.shape[1:])))
         classes = int(full.shape[1] or 0)
-        labels = names or _semantic_names(classes)
+        labels = names or _SEMANTIC_NAMES.get(classes)
         if labels is not None and classes >= 2:
             return Layout("semantic", (full.name,), labels, aligned=_aligned(full.shape[2:], size))
         raise _unknown(outputs, where, f"{classes} semantic classes without names in the file's metadata")
     raise _unknown(outputs, where, "no known layout fits")
 
 
-def _yolo(rank3: list[TensorInfo], rank4: list[TensorInfo], names: dict[int, str] | None) -> Layout | None:
-    detections, prototypes = rank3[0], rank4[-1]
+def _yolo(detections: TensorInfo, prototypes: TensorInfo, names: dict[int, str] | None) -> Layout | None:
     coefficients = int(prototypes.shape[1] or 0)
-    sizes = [int(size or 0) for size in detections.shape[1:]]
-    for channels_first, channels in ((True, sizes[0]), (False, sizes[1])):
-        if channels >= max(sizes):
-            continue  # there are far more candidates than channels
-        for objectness in (0, 1):
-            classes = channels - 4 - objectness - coefficients
-            usual = {len(COCO_NAMES): dict(enumerate(COCO_NAMES)), 1: {0: "person"}}
-            labels = usual.get(classes) if names is None else names
-            if labels is not None and len(labels) == classes:
-                return Layout("yolo", (detections.name, prototypes.name), labels, channels_first, objectness)
+    first, second = (int(size or 0) for size in detections.shape[1:])
+    for objectness in (0, 1):  # there are far more candidates than channels
+        classes = min(first, second) - 4 - objectness - coefficients
+        labels = names or {len(COCO_NAMES): dict(enumerate(COCO_NAMES)), 1: {0: "person"}}.get(classes, {})
+        if first != second and labels and len(labels) == classes:
+            return Layout("yolo", (detections.name, prototypes.name), labels, first < second, objectness)
     return None
-
-
-def _known(shape: Sequence[int | None]) -> bool:
-    return all(size is not None for size in shape)
 
 
 def _aligned(cells: Sequence[int | None], size: tuple[int, int]) -> bool:
     return all(
         c is not None and 1 < c < length and (length - 1) % (c - 1) == 0 for c, length in zip(cells, size, strict=True)
     )
-
-
-def _semantic_names(classes: int) -> dict[int, str] | None:
-    usual = {
-        len(VOC_NAMES): dict(enumerate(VOC_NAMES)),
-        len(COCO_NAMES) + 1: dict(enumerate(("background", *COCO_NAMES))),
-        91: {0: "background", **COCO_IDS},
-        2: {0: "background", 1: "person"},
-    }
-    return usual.get(classes)
 
 
 def _metadata_names(metadata: Mapping[str, str], where: str) -> dict[int, str] | None:
@@ -385,10 +358,10 @@ def _keep(
 ) -> NDArray[np.intp]:
     """Indices of the wanted detections that non-maximum suppression within each class keeps, best first."""
     keep = np.flatnonzero((scores >= floor) & np.isin(labels, _wanted(layout, settings)))
-    keep = keep[np.argsort(-scores[keep], kind="stable")][:MAX_CANDIDATES]
-    corners = boxes[keep]
     if not keep.size:
         return keep
+    keep = keep[np.argsort(-scores[keep], kind="stable")][:MAX_CANDIDATES]
+    corners = boxes[keep]
     extent = float(corners.max() - min(float(corners.min()), 0.0)) + 1.0
     shifted = corners + labels[keep, None].astype(np.float32) * extent  # classes do not overlap any more
     sized = np.concatenate([shifted[:, :2], shifted[:, 2:] - shifted[:, :2]], axis=1)
@@ -436,8 +409,7 @@ def _paste(
     shift, stretch = np.tile(offset, 2).astype(np.float32), np.tile(scale, 2).astype(np.float32)
     in_frame = np.clip((boxes - shift) / stretch, 0, np.array([width, height] * 2)).astype(np.float32)
     names = tuple(layout.names[int(number)] for number in labels)
-    instances = Instances(masks, in_frame, names, scores.astype(np.float32))
-    return pick(instances, np.asarray(masks.any(axis=(1, 2))))
+    return Instances(masks, in_frame, names, scores.astype(np.float32)).visible()
 
 
 def _decode_semantic(

@@ -17,7 +17,7 @@ from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.segmentation.training.labelled_images import LabelledImages, open_labelled
+from dynslam_bench.segmentation.training.labelled_images import open_labelled
 
 THRESHOLDS: tuple[float, ...] = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
 RECALL_POINTS = np.linspace(0, 1, 101)
@@ -190,20 +190,20 @@ class SegmenterScore(Record):
 
 def evaluate_segmenter(
     settings: SegmentationSettings,
-    data: str | LabelledImages,
+    data: str,
     *,
     output: Path | None = None,
     device: str = "cpu",
     threads: int = 1,
     min_area: int = 0,
     limit: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], object] = lambda *_: None,
 ) -> SegmenterScore:
     """Run a segmenter over labelled images and measure its masks.
 
     Args:
         settings: The segmenter and its thresholds; the network's own masks are measured, without dilation and repair.
-        data: A set or the text that names one (`open_labelled`).
+        data: Names a set of labelled images (`open_labelled`).
         output: A JSON file for the result.
         device: ``cpu`` or ``cuda:N``.
         threads: Threads the network may use.
@@ -214,7 +214,7 @@ def evaluate_segmenter(
     Raises:
         SegmentationError: The segmenter or the data are not available.
     """
-    images = open_labelled(data) if isinstance(data, str) else data
+    images = open_labelled(data)
     low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP takes weak detections as well
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
     if segmenter is None:
@@ -232,8 +232,7 @@ def evaluate_segmenter(
         for name, tally in tallies.items():
             predicted = detections.of_classes([name])
             tally.add(image.masks[[kind == name for kind in image.class_names]], predicted.masks, predicted.scores)
-        if progress is not None:
-            progress(done, len(chosen))
+        progress(done, len(chosen))
     qualities = {name: tally.quality() for name, tally in tallies.items()}
     there = [quality for quality in qualities.values() if quality["truths"]]
     score = SegmenterScore(

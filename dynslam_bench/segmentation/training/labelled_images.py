@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts.sequence import Sequence as RgbdSequence
 from dynslam_bench.core.errors import SegmentationError, did_you_mean
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.reading import TABLE_BYTES, read_json, read_lines
@@ -48,7 +49,37 @@ class LabelledImage:
     class_names: tuple[str, ...]
 
 
-class CocoImages:
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledImages(Generic[T]):
+    """A set of labelled images, decoded or rendered on access.
+
+    Attributes:
+        name: Stands in records.
+        version: Changes when the content changes under the same name.
+        entries: What the images are read from.
+        read: Reads an image.
+    """
+
+    name: str
+    version: str
+    entries: Sequence[T]
+    read: Callable[[T], LabelledImage]
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __getitem__(self, index: int) -> LabelledImage:
+        return self.read(self.entries[index])
+
+
+CocoEntry: TypeAlias = tuple[Path, list[tuple[str, Any]]]
+"""An image of a COCO file, and the class and segmentation of each object."""
+
+
+def coco_images(annotations: Path, images: Path | None = None) -> LabelledImages[CocoEntry]:
     """Images of a COCO annotation file (``images``, ``annotations``, ``categories``); crowds are left out.
 
     Polygons and uncompressed and compressed run lengths are understood.
@@ -60,47 +91,36 @@ class CocoImages:
     Raises:
         SegmentationError: The file is missing or not in COCO's format.
     """
-
-    def __init__(self, annotations: Path, images: Path | None = None) -> None:
-        self.path = annotations.expanduser()
-        folder = images.expanduser() if images is not None else self.path.parent
-        content = read_json(self.path, limit=TABLE_BYTES, kind=SegmentationError)
-        try:
-            names = {int(entry["id"]): str(entry["name"]) for entry in content["categories"]}
-            shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
-            for entry in content["annotations"]:
-                if not entry.get("iscrowd"):
-                    shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
-            images_named = [(str(entry["file_name"]), int(entry["id"])) for entry in content["images"]]
-        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-            raise SegmentationError(
-                f"{self.path} is not in COCO's annotation format: {type(error).__name__} {str(error)[:200]}",
-                "it needs images, annotations and categories",
-            ) from error
-        if not images_named:
-            raise SegmentationError(f"{self.path} lists no images")
-        self._entries = [
-            (inside(folder, name, where=str(self.path), kind=SegmentationError), shapes[number])
-            for name, number in images_named
-        ]
-        self.name = f"coco:{self.path.name}"
-
-    @property
-    def version(self) -> str:
-        """Digest of the files' names and sizes."""
-        return _files_digest([self.path, *(image for image, _ in self._entries)])
-
-    def __len__(self) -> int:
-        return len(self._entries)
-
-    def __getitem__(self, index: int) -> LabelledImage:
-        path, shapes = self._entries[index]
-        rgb = _read(path)
-        masks = [_coco_mask(shape, rgb.shape[:2], path) for _, shape in shapes]
-        return _labelled(rgb, masks, [name for name, _ in shapes])
+    path = annotations.expanduser()
+    folder = images.expanduser() if images is not None else path.parent
+    content = read_json(path, limit=TABLE_BYTES, kind=SegmentationError)
+    try:
+        names = {int(entry["id"]): str(entry["name"]) for entry in content["categories"]}
+        shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
+        for entry in content["annotations"]:
+            if not entry.get("iscrowd"):
+                shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
+        files = [(str(entry["file_name"]), shapes[int(entry["id"])]) for entry in content["images"]]
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+        raise SegmentationError(
+            f"{path} is not in COCO's annotation format: {type(error).__name__} {str(error)[:200]}",
+            "it needs images, annotations and categories",
+        ) from error
+    if not files:
+        raise SegmentationError(f"{path} lists no images")
+    entries = [(inside(folder, name, where=str(path), kind=SegmentationError), objects) for name, objects in files]
+    version = _files_digest([path, *(image for image, _ in entries)])
+    return LabelledImages(f"coco:{path.name}", version, entries, _read_coco)
 
 
-class YoloImages:
+def _read_coco(entry: CocoEntry) -> LabelledImage:
+    path, objects = entry
+    rgb = _read(path)
+    masks = [_coco_mask(segmentation, rgb.shape[:2], path) for _, segmentation in objects]
+    return _labelled(rgb, masks, [name for name, _ in objects])
+
+
+def yolo_images(folder: Path) -> LabelledImages[Path]:
     """Images with YOLO polygon labels: ``images/**/NAME.jpg`` beside ``labels/**/NAME.txt``.
 
     A label's line is ``class x1 y1 x2 y2 ...`` with COCO's class numbers from 0 and coordinates in [0, 1]. An image
@@ -112,30 +132,24 @@ class YoloImages:
     Raises:
         SegmentationError: The folder or its images are missing.
     """
+    folder = folder.expanduser()
+    root, labels = folder / "images", folder / "labels"
+    images = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not images:
+        raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder.expanduser()
-        self.name, root = f"yolo:{self.folder.name}", self.folder / "images"
-        self._images = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
-        if not self._images:
-            raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
+    def read(path: Path) -> LabelledImage:
+        return _read_yolo(path, labels / path.relative_to(root).with_suffix(".txt"))
 
-    @property
-    def version(self) -> str:
-        """Digest of the files' names and sizes."""
-        return _files_digest([*self._images, *sorted((self.folder / "labels").rglob("*.txt"))])
+    return LabelledImages(f"yolo:{folder.name}", _files_digest([*images, *sorted(labels.rglob("*.txt"))]), images, read)
 
-    def __len__(self) -> int:
-        return len(self._images)
 
-    def __getitem__(self, index: int) -> LabelledImage:
-        path = self._images[index]
-        rgb = _read(path)
-        label = self.folder / "labels" / path.relative_to(self.folder / "images").with_suffix(".txt")
-        masks, names = [], []
-        for number, line in enumerate(read_lines(label, kind=SegmentationError) if label.is_file() else [], 1):
-            if not line.strip():
-                continue
+def _read_yolo(path: Path, label: Path) -> LabelledImage:
+    rgb = _read(path)
+    masks, names = [], []
+    lines = read_lines(label, kind=SegmentationError) if label.is_file() else []
+    for number, line in enumerate(lines, 1):
+        if line.strip():
             try:
                 kind, *points = line.split()
                 names.append(dict(enumerate(COCO_NAMES))[int(kind)])
@@ -145,7 +159,7 @@ class YoloImages:
                     f"{label} line {number} is no polygon label: {error}", "expected class x1 y1 x2 y2 ..."
                 ) from error
             masks.append(_fill([polygon], rgb.shape[:2]))
-        return _labelled(rgb, masks, names)
+    return _labelled(rgb, masks, names)
 
 
 def _files_digest(paths: list[Path]) -> str:
@@ -165,9 +179,7 @@ def _labelled(rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: lis
 def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Pixels at least half covered by the union of polygons (x, y in pixels, the image's corner is 0, 0)."""
     mask = np.zeros(shape, bool)
-    for polygon in polygons:
-        if len(polygon) < 3:
-            continue
+    for polygon in (polygon for polygon in polygons if len(polygon) >= 3):
         low = np.maximum(np.floor(polygon.min(axis=0)), 0).astype(int)
         high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int)
         if (high <= low).any():
@@ -243,7 +255,7 @@ VARIANTS: tuple[dict[str, object], ...] = (
 """Renderer options that a share of the training frames is rendered with."""
 
 
-class SequenceFrames:
+def sequence_frames(sequence_id: str) -> LabelledImages[int]:
     """Every frame of a sequence that has masks.
 
     Args:
@@ -252,26 +264,14 @@ class SequenceFrames:
     Raises:
         SegmentationError: It has no masks.
     """
-
-    def __init__(self, sequence_id: str) -> None:
-        self.sequence = open_sequence(sequence_id)
-        self.name = self.sequence.id
-        if self.sequence.masks is None:
-            raise SegmentationError(f"sequence '{self.name}' has no masks to train on or compare with")
-
-    @property
-    def version(self) -> str:
-        """Digest of the sequence's content."""
-        return self.sequence.digest()
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def __getitem__(self, index: int) -> LabelledImage:
-        return labelled_frame(self.sequence, index)
+    sequence = open_sequence(sequence_id)
+    if sequence.masks is None:
+        raise SegmentationError(f"sequence '{sequence.id}' has no masks to train on or compare with")
+    frames = range(len(sequence))
+    return LabelledImages(sequence.id, sequence.digest(), frames, partial(_labelled_frame, sequence))
 
 
-class RenderedFrames:
+def rendered_frames(text: str = "") -> LabelledImages[int]:
     """Frames drawn at random from rendered sequences.
 
     Args:
@@ -282,44 +282,36 @@ class RenderedFrames:
     Raises:
         SegmentationError: Unknown option, or a value that does not fit.
     """
-
-    version = f"renderer {RENDERER_VERSION}"
-
-    def __init__(self, text: str = "") -> None:
-        values = {"scenes": "0-99", "frames": "2", "length": "600", "options": "0", "seed": "0"}
-        for part in filter(None, text.split(",")):
-            key, separator, value = part.partition("=")
-            if key not in values or not separator:
-                raise SegmentationError(f"synthetic: unknown option '{part}'", "known: " + ", ".join(values))
-            values[key] = value
-        try:
-            first, _, last = values["scenes"].partition("-")
-            self.scenes = range(int(first), int(last or first) + 1)
-            self.frames, self.length, self.seed = (int(values[key]) for key in ("frames", "length", "seed"))
-            self.options = float(values["options"])
-        except ValueError as error:
-            raise SegmentationError(f"synthetic: '{text}' is not understood: {error}") from error
-        if not self.scenes or self.scenes[0] < 0 or self.scenes[-1] > 199 or not 1 <= self.frames <= self.length:
-            raise SegmentationError(
-                f"synthetic: '{text}' asks for scenes or frames that do not exist", "scenes 0-199, at least one frame"
-            )
-        self.name = (
-            f"synthetic:scenes={self.scenes.start}-{self.scenes.stop - 1},frames={self.frames},"
-            f"length={self.length},options={self.options:g},seed={self.seed}"
+    values = {"scenes": "0-99", "frames": "2", "length": "600", "options": "0", "seed": "0"}
+    for part in filter(None, text.split(",")):
+        key, separator, value = part.partition("=")
+        if key not in values or not separator:
+            raise SegmentationError(f"synthetic: unknown option '{part}'", "known: " + ", ".join(values))
+        values[key] = value
+    try:
+        first, _, last = values["scenes"].partition("-")
+        scenes = range(int(first), int(last or first) + 1)
+        frames, length, seed = (int(values[key]) for key in ("frames", "length", "seed"))
+        options = float(values["options"])
+    except ValueError as error:
+        raise SegmentationError(f"synthetic: '{text}' is not understood: {error}") from error
+    if not scenes or scenes[0] < 0 or scenes[-1] > 199 or not 1 <= frames <= length:
+        raise SegmentationError(
+            f"synthetic: '{text}' asks for scenes or frames that do not exist", "scenes 0-199, at least one frame"
         )
+    name = f"scenes={scenes[0]}-{scenes[-1]},frames={frames},length={length},options={options:g},seed={seed}"
 
-    def __len__(self) -> int:
-        return len(self.scenes) * len(REPLICA_IDS) * self.frames
-
-    def __getitem__(self, index: int) -> LabelledImage:
-        order, draw = divmod(range(len(self))[index], self.frames)
+    def read(index: int) -> LabelledImage:
+        order, draw = divmod(index, frames)
         scene, motion = divmod(order, len(REPLICA_IDS))
-        sequence_id = f"{REPLICA_IDS[motion]}@{self.scenes[scene]}?frames={self.length}"
-        rng = stream(self.seed, "frames", sequence_id)
-        frame = int(rng.choice(self.length, self.frames, replace=False)[draw])
-        rng = stream(self.seed, "variant", sequence_id, draw)
-        variant = int(rng.integers(len(VARIANTS))) if rng.random() < self.options else None
-        return labelled_frame(_rendered(sequence_id, variant), frame)
+        sequence_id = f"{REPLICA_IDS[motion]}@{scenes[scene]}?frames={length}"
+        frame = int(stream(seed, "frames", sequence_id).choice(length, frames, replace=False)[draw])
+        rng = stream(seed, "variant", sequence_id, draw)
+        variant = int(rng.integers(len(VARIANTS))) if rng.random() < options else None
+        return _labelled_frame(_rendered(sequence_id, variant), frame)
+
+    count = len(scenes) * len(REPLICA_IDS) * frames
+    return LabelledImages(f"synthetic:{name}", f"renderer {RENDERER_VERSION}", range(count), read)
 
 
 @lru_cache(maxsize=1)  # neighbours in the order share a sequence
@@ -328,25 +320,20 @@ def _rendered(sequence_id: str, variant: int | None) -> SyntheticSequence:
     return SyntheticSequence(parse_synthetic_id(sequence_id), None, settings, threads=1)
 
 
-def labelled_frame(sequence: Sequence, index: int) -> LabelledImage:
+def _labelled_frame(sequence: RgbdSequence, index: int) -> LabelledImage:
     """A frame and its exact masks."""
     assert sequence.masks is not None
     instances = instances_of(sequence.masks[index], where=f"{sequence.id} frame {index}")
     return LabelledImage(np.ascontiguousarray(sequence[index].rgb), instances.masks, instances.class_names)
 
 
-LabelledImages: TypeAlias = CocoImages | YoloImages | SequenceFrames | RenderedFrames
-"""Sets of labelled images, decoded or rendered on access.
-
-``name`` stands in records; ``version`` changes when the content changes under the same name.
-"""
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
 
 
-def open_labelled(text: str) -> LabelledImages:
+def open_labelled(text: str) -> LabelledImages[Any]:
     """The set that a text names.
 
-    ``synthetic:scenes=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences (`RenderedFrames`),
+    ``synthetic:scenes=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences (`rendered_frames`),
     ``sequence:ID`` every frame of one sequence that has masks, ``coco:FILE[:IMAGES]`` a COCO annotation file,
     ``yolo:DIR`` a folder with ``images/`` and ``labels/``.
 
@@ -356,12 +343,12 @@ def open_labelled(text: str) -> LabelledImages:
     kind, _, rest = text.partition(":")
     path, _, images = rest.partition(":")
     if kind == "synthetic":
-        return RenderedFrames(rest)
+        return rendered_frames(rest)
     if kind == "sequence" and rest:
-        return SequenceFrames(rest)
+        return sequence_frames(rest)
     if kind == "coco" and rest:
-        return CocoImages(Path(path), Path(images) if images else None)
+        return coco_images(Path(path), Path(images) if images else None)
     if kind == "yolo" and rest:
-        return YoloImages(Path(rest))
+        return yolo_images(Path(rest))
     hint = did_you_mean(kind, ["synthetic", "sequence", "coco", "yolo"])
     raise SegmentationError(f"'{text}' names no set of labelled images; the forms are {FORMS}", hint)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +26,6 @@ MIN_VISIBLE_PX = 16
 """Objects with fewer pixels at the network's input size are not learned."""
 
 _AGAIN = "delete the folder, they are prepared again"
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +60,9 @@ class PreparedImages:
 
     def __init__(self, folder: Path, classes: Sequence[str]) -> None:
         try:
-            self.images: NDArray[np.uint8] = np.load(folder / "images.npy", mmap_mode="r", allow_pickle=False)
-            self.labels: NDArray[np.uint8] = np.load(folder / "labels.npy", mmap_mode="r", allow_pickle=False)
+            self.images, self.labels = (
+                np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("images", "labels")
+            )
         except Exception as error:  # numpy raises many types for a damaged header
             raise SegmentationError(f"the prepared images in {folder} are damaged: {error}", _AGAIN) from error
         self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
@@ -72,15 +73,11 @@ class PreparedImages:
     def __len__(self) -> int:
         return len(self.images)
 
-    def __getitem__(self, index: int) -> Example:
-        return self._example(np.array(self.images[index]), np.array(self.labels[index]), self.names[index])
-
-    def varied(self, index: int, rng: np.random.Generator) -> Example:
-        """The image with random scale, place, mirror image, colour, noise and blur."""
-        rgb, labels = vary(np.array(self.images[index]), np.array(self.labels[index]), rng)
-        return self._example(rgb, labels, self.names[index])
-
-    def _example(self, rgb: NDArray[np.uint8], labels: NDArray[np.uint8], names: list[str]) -> Example:
+    def example(self, index: int, rng: np.random.Generator | None = None) -> Example:
+        """An image; with a generator at random scale, place, mirror image, colour, noise and blur."""
+        rgb, labels, names = np.array(self.images[index]), np.array(self.labels[index]), self.names[index]
+        if rng is not None:
+            rgb, labels = vary(rgb, labels, rng)
         numbers = [k + 1 for k, name in enumerate(names) if name in self.classes]
         masks = labels[None] == np.array(numbers, np.uint8).reshape(-1, 1, 1)
         visible = np.count_nonzero(masks, axis=(1, 2)) >= MIN_VISIBLE_PX
@@ -88,7 +85,13 @@ class PreparedImages:
         return Example(rgb, masks[visible], boxes_of(masks[visible]), classes[visible])
 
 
-def prepare(source: LabelledImages, folder: Path, height: int, width: int, progress: Progress | None = None) -> Path:
+def prepare(
+    source: LabelledImages[Any],
+    folder: Path,
+    height: int,
+    width: int,
+    progress: Callable[[int, int], object] = lambda *_: None,
+) -> Path:
     """Write a set at one size; an existing set is not written again.
 
     Args:
@@ -112,10 +115,7 @@ def prepare(source: LabelledImages, folder: Path, height: int, width: int, progr
         for index in range(len(source)):
             images[index], labels[index], present = shrink(source[index], height, width)
             names.append(present)
-            if progress is not None:
-                progress(index + 1, len(source))
-        images.flush()
-        labels.flush()
+            progress(index + 1, len(source))
         (work / "names.json").write_text(json.dumps(names))
     return target
 
@@ -179,8 +179,7 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
         value = value * (1 - ramp * np.float32(rng.uniform(0, 0.6))) + ramp * np.float32(rng.uniform(0, 0.5))
     if rng.random() < 0.25:
         length, angle = int(rng.integers(3, 10)), rng.uniform(0, np.pi)
-        kernel = np.zeros((length, length), np.float32)
-        half = (length - 1) / 2
+        kernel, half = np.zeros((length, length), np.float32), (length - 1) / 2
         for t in np.linspace(-half, half, 4 * length):
             kernel[round(half + t * np.sin(angle)), round(half + t * np.cos(angle))] = 1
         value = np.asarray(cv2.filter2D(value, -1, kernel / kernel.sum()), np.float32)
@@ -201,7 +200,7 @@ def batch_of(sets: list[PreparedImages], settings: TrainSettings, step: int) -> 
         number = int(_permutation(total, settings.seed, epoch)[place])
         chosen = int(np.searchsorted(ends, number, side="right"))
         number -= int(ends[chosen]) - len(sets[chosen])
-        examples.append(sets[chosen].varied(number, stream(settings.seed, "vary", position)))
+        examples.append(sets[chosen].example(number, stream(settings.seed, "vary", position)))
     return examples
 
 

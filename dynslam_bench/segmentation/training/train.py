@@ -18,9 +18,10 @@ from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import replacing, write_atomic
 from dynslam_bench.core.reading import read_json
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
-from dynslam_bench.segmentation.networks.backbone import NetworkConfig, embedded_config, resnet18_config
+from dynslam_bench.segmentation.networks import pinned_threads
+from dynslam_bench.segmentation.networks.backbone import EMBEDDED, RESNET18, NetworkConfig
 from dynslam_bench.segmentation.networks.loading import load_strictly, read_checkpoint, read_weights, save_network
-from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import paste, torch_threads
+from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import paste
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.settings import COCO_NAMES, PRESETS
 from dynslam_bench.segmentation.training.labelled_images import open_labelled
@@ -41,7 +42,7 @@ def train(
     device: str = "cpu",
     threads: int = 1,
     resume: bool = True,
-    progress: Callable[[TrainProgress], None] | None = None,
+    progress: Callable[[TrainProgress], object] = lambda _: None,
 ) -> TrainResult:
     """Train a network.
 
@@ -61,7 +62,6 @@ def train(
     Raises:
         SegmentationError: The data or the initial weights do not fit, or `output` holds a run with other settings.
     """
-    report = progress or (lambda _: None)
     config = network_config(settings)
     height, width = config.min_side, round(config.min_side * 4 / 3)  # as the frames of most sequences
     output.mkdir(parents=True, exist_ok=True)
@@ -72,16 +72,16 @@ def train(
     def load(text: str) -> PreparedImages:
         folder = prepare(
             open_labelled(text), data_cache or output / "data", height, width,
-            lambda done, total: report(TrainProgress("data", done, total, {})),
+            lambda done, total: progress(TrainProgress("data", done, total, {})),
         )  # fmt: skip
         return PreparedImages(folder, config.classes)
 
     sets, validation = [load(text) for text in settings.data], load(settings.validation)
-    with torch_threads(threads):
+    with pinned_threads(torch.get_num_threads, torch.set_num_threads, threads):
         run = TrainingRun(settings, config, output, device)
         if resume and (output / "last.pt").is_file():
             run.restore()
-        return run.run(sets, validation, report)
+        return run.run(sets, validation, progress)
 
 
 def network_config(settings: TrainSettings) -> NetworkConfig:
@@ -90,19 +90,15 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
     Raises:
         SegmentationError: A class name is unknown or named twice.
     """
-    names: list[str] = []
-    for part in settings.classes.split(","):
-        names.extend(PRESETS.get(part.strip(), (part.strip(),)))
+    parts = [part.strip() for part in settings.classes.split(",")]
+    names = [name for part in parts for name in PRESETS.get(part, (part,))]
     unknown = [name for name in names if name not in COCO_NAMES]
     if unknown or len(set(names)) != len(names):
         reason = f"'{unknown[0]}' is no COCO class" if unknown else "one is named twice"
         raise SegmentationError(f"the classes '{settings.classes}' cannot be learned: {reason}")
-    if settings.network == "embedded":
-        return embedded_config(cfpn=settings.cfpn).model_copy(update={"classes": tuple(names)})
-    config = resnet18_config(tuple(names), cfpn=settings.cfpn)
-    if settings.network == "resnet50":
-        config = config.model_copy(update={"blocks": (3, 4, 6, 3), "bottleneck": True, "norm": "frozen"})
-    return config.model_copy(update={"min_side": 480, "max_side": 800})
+    shape = {"embedded": EMBEDDED, "resnet18": RESNET18, "resnet50": NetworkConfig()}[settings.network]
+    sides = {} if settings.network == "embedded" else {"min_side": 480, "max_side": 800}
+    return shape.model_copy(update={"classes": tuple(names), "cfpn": settings.cfpn, **sides})
 
 
 def _check_settings(settings: TrainSettings, path: Path) -> None:
@@ -150,7 +146,7 @@ class TrainingRun:
         self.recent: dict[str, list[float]] = {name: [] for name in LOSSES}
 
     def run(
-        self, sets: list[PreparedImages], validation: PreparedImages, report: Callable[[TrainProgress], None]
+        self, sets: list[PreparedImages], validation: PreparedImages, report: Callable[[TrainProgress], object]
     ) -> TrainResult:
         """Learn until the last step."""
         settings, total = self.settings, self.settings.iterations
@@ -189,8 +185,7 @@ class TrainingRun:
             losses = self.network.losses(images, boxes, labels, masks, generator, settings.proposals)
         total = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(total):
-            reason = f"training diverged at step {self.step}: the loss is {float(total)}"
-            raise SegmentationError(reason, "lower the learning rate")
+            raise SegmentationError(f"training diverged at step {self.step}: the loss is {float(total)}")
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -298,7 +293,7 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
     best: list[float] = []
     counts = MaskCounts()
     for index in range(len(images)):
-        example = images[index]
+        example = images.example(index)
         height, width = example.rgb.shape[:2]
         image = torch.from_numpy(example.rgb).to(device).permute(2, 0, 1).float() / 255
         boxes, labels, _, planes = (part.cpu().numpy() for part in network.detect(image, score=CONFIDENCE))

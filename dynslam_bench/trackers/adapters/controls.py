@@ -106,9 +106,8 @@ def relative_motion(
     """
     detected: object = cv2.goodFeaturesToTrack(grey_a, MAX_CORNERS, 0.01, 8)  # None if there are none
     corners = np.zeros((0, 2), np.float32) if detected is None else np.asarray(detected, np.float32).reshape(-1, 2)
-    height, width = depth_a.shape
-    column, row = np.rint(corners).astype(np.intp).T
-    depth = depth_a[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
+    column, row = np.rint(corners).astype(np.intp).clip(0, np.array(depth_a.shape[::-1]) - 1).T
+    depth = depth_a[row, column].astype(np.float64)
     corners, depth = corners[depth > 0], depth[depth > 0]
     if len(corners) < MIN_INLIERS:
         return None, 0
@@ -135,8 +134,7 @@ def relative_motion(
         points[chosen], pixels[chosen], camera.matrix, np.zeros(5), rotation, translation
     )
     T_b_a = np.eye(4)
-    T_b_a[:3, :3] = cv2.Rodrigues(rotation)[0]
-    T_b_a[:3, 3] = np.asarray(translation).reshape(3)
+    T_b_a[:3] = np.column_stack([cv2.Rodrigues(rotation)[0], np.asarray(translation).reshape(3)])
     return (se3.inverse(T_b_a), inliers) if se3.is_pose(T_b_a) else (None, inliers)
 
 
@@ -162,8 +160,7 @@ class Replay:
     def track(self, frame: Frame) -> TrackResult:
         """The pose of the frame's stamp, ``ok``; or ``lost`` without a pose. Stats: ``stamp_gap_s`` to the nearest."""
         stamps = self._trajectory.timestamps
-        at = int(np.searchsorted(stamps, frame.timestamp))
-        nearest = min((i for i in (at - 1, at) if 0 <= i < len(stamps)), key=lambda i: abs(stamps[i] - frame.timestamp))
+        nearest = int(np.argmin(np.abs(stamps - frame.timestamp)))
         gap = float(abs(stamps[nearest] - frame.timestamp))
         stats = {"stamp_gap_s": gap}
         if gap > self.settings.tolerance_s + 1e-9:  # rounding of the difference

@@ -166,8 +166,7 @@ class OrbSlam3Program(ProgramTracker):
     """ORB-SLAM3's name of the sensor."""
 
     def __init__(self, settings: OrbSlam3Settings, context: TrackerContext) -> None:
-        self.settings = settings
-        self._vocabulary = find_vocabulary(settings.vocabulary)
+        self.settings, self._vocabulary = settings, find_vocabulary(settings.vocabulary)
         packages = [str(Path(dynslam_bench.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
         super().__init__(
             "orbslam3",
@@ -267,6 +266,5 @@ def settings_yaml(camera: Camera, settings: OrbSlam3Settings, fps: float) -> str
 
 def _real(value: float) -> str:
     """A number that OpenCV's parser reads as real: always with a point, as ``1.0`` or ``1.0e-07``."""
-    text = repr(value)
-    mantissa, exponent, power = text.partition("e")
+    mantissa, exponent, power = repr(value).partition("e")
     return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power

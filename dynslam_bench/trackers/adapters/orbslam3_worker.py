@@ -22,9 +22,6 @@ class Worker:
 
     def __init__(self) -> None:
         self._slam: Any = None
-        self._monocular = False
-        self._tracked: list[float] = []
-        self._final: list[list[float]] | None = None
 
     def reset(self, request: dict[str, Any]) -> None:
         """Load the vocabulary and start ORB-SLAM3's threads."""
@@ -38,7 +35,8 @@ class Worker:
         options = request["options"]
         self._monocular = options["sensor"] == "MONOCULAR"
         sensor = getattr(pyorbslam3.Sensor, options["sensor"])
-        self._tracked, self._final = [], None
+        self._tracked: list[float] = []
+        self._final: list[list[float]] | None = None
         self._slam = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], sensor)
 
     def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
@@ -79,11 +77,8 @@ class Worker:
             self._slam.save_trajectory_tum(str(path))
             rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
         own = {f"{stamp:.6f}": stamp for stamp in self._tracked}  # the file rounds the stamps
-        poses: dict[float, list[float]] = {}
-        for row in rows:
-            stamp = own.get(f"{row[0]:.6f}")
-            if stamp is not None:
-                poses.setdefault(stamp, [stamp, *row[1:]])
+        named = [(own.get(f"{stamp:.6f}"), pose) for stamp, *pose in reversed(rows)]  # the first of a stamp counts
+        poses = {stamp: [stamp, *pose] for stamp, pose in named if stamp is not None}
         self._final = [poses[stamp] for stamp in sorted(poses)]
         return self._final
 

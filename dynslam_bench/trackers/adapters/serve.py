@@ -39,13 +39,11 @@ def serve(
     images: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
     for line in sys.stdin:
         request = json.loads(line)
-        operation = request.get("op")
-        answer: Answer
+        operation, answer = request.get("op"), Answer()
         try:
             if operation == "reset":
-                images = map_images(request)
+                images, answer = map_images(request), {"ok": True}
                 reset(request)
-                answer = {"ok": True}
             elif operation == "track":
                 if images is None:
                     raise RuntimeError("track before reset")

@@ -87,9 +87,14 @@ class SubprocessSettings(ProgramSettings):
             raise SettingsError("subprocess needs a command", hint)
         return command
 
+    @property
+    def working_folder(self) -> Path:
+        """The working folder of the program."""
+        return Path(self.folder).expanduser()
+
     def verify(self) -> None:
         """The program and its folder must be there."""
-        command, folder = self.words(), Path(self.folder or ".").expanduser()
+        command, folder = self.words(), self.working_folder
         if not folder.is_dir():
             raise SettingsError(f"subprocess: no folder {folder}")
         program = command[0] if os.sep not in command[0] else str((folder / Path(command[0]).expanduser()).absolute())

@@ -92,8 +92,7 @@ class Program:
             raise TrackerError(f"{name}: cannot start '{command[0]}': {reason}", "check its path") from error
         self._kill = weakref.finalize(self, _kill_group, self._process)
         self._answers: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # None: standard output has ended
-        self._old_lines: dict[str, str] = {}
-        self._new_lines: dict[str, str] = {}  # since the last request
+        self._old_lines, self._new_lines = dict[str, str](), dict[str, str]()  # new: since the last request
         self._readers = [
             threading.Thread(target=_read, args=(name, channel, stream, self._answers, self._new_lines), daemon=True)
             for channel, stream in (("out", self._process.stdout), ("err", self._process.stderr))
@@ -163,14 +162,13 @@ class Program:
         return next(filter(None, lines), self._old_lines.get("out", ""))
 
     def _death(self, doing: str) -> TrackerError:
-        try:
-            code = self._process.wait(timeout=1.0)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            return TrackerError(f"{self.name} {doing}: closed its output without an answer")
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=1.0)
+        code = self._process.returncode
         self.kill()
-        line = self._last_line()
-        shown = f"its last line: '{line}'" if line else "it wrote no message"
+        if code is None:
+            return TrackerError(f"{self.name} {doing}: closed its output without an answer")
+        shown = f"its last line: '{self._last_line()}'" if self._last_line() else "it wrote no message"
         ended = (
             f"was killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
         )
@@ -418,12 +416,10 @@ class ProgramTracker:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
         """
         self.close()
-        threads = str(self.context.threads)
-        limits = {name: threads for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        environment = dict.fromkeys(names, str(self.context.threads)) | self._environment
         self._exchange = ImageExchange(camera, self._images)
-        self._program = Program(
-            self.name, self._command, folder=self._folder, environment={**limits, **self._environment}
-        )
+        self._program = Program(self.name, self._command, folder=self._folder, environment=environment)
         request = {
             "op": "reset",
             "protocol": PROTOCOL,
@@ -499,8 +495,7 @@ class FinalizingProgramTracker(ProgramTracker):
 
 def files(settings: SubprocessSettings) -> list[Path]:
     """The files whose content decides what ``subprocess:COMMAND`` does: see `files_of_command`."""
-    folder = Path(settings.folder).expanduser() if settings.folder else None
-    return files_of_command(settings.words(), folder)
+    return files_of_command(settings.words(), settings.working_folder)
 
 
 def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTracker:
@@ -509,7 +504,6 @@ def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTrack
     Raises:
         SettingsError: No command was given, or its quotes do not match.
     """
-    command = settings.words()
-    folder = Path(settings.folder).expanduser() if settings.folder else None
-    kind = FinalizingProgramTracker if settings.final else ProgramTracker
-    return kind(Path(command[0]).name, settings, context, command, images=settings.images, folder=folder)
+    command, kind = settings.words(), FinalizingProgramTracker if settings.final else ProgramTracker
+    name, folder = Path(command[0]).name, settings.working_folder
+    return kind(name, settings, context, command, images=settings.images, folder=folder)

@@ -162,7 +162,7 @@ def compose(
     extractor = build_extractor(features)
     if cache is not None:
         extractor = cached["features"] = cached_extractor(extractor, features, cache, context.threads)
-    segmenter, masks = None, None
+    masks = None
     if isinstance(settings, SemanticSystemSettings):
         segmenter = build_segmenter(
             settings.segmentation,
@@ -174,15 +174,15 @@ def compose(
             also=movable_classes(filters),
         )
         masks = None if segmenter is None else MaskScheduler(settings.segmentation, segmenter)
+        if segmenter is not None and isinstance(segmenter.inner, CachedSegmenter):
+            cached["segmentation"] = segmenter.inner
     needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
-    if segmenter is None and needing:
+    if masks is None and needing:
         fault, cure = "segmentation.source is 'none'", f"sources: {SOURCES}"
         if not isinstance(settings, SemanticSystemSettings):
             fault = f"{type(settings).__name__} has no group segmentation"
             cure = "derive it from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)"
         raise SegmentationError(f"filter '{needing[0]}' needs masks, but {fault}", cure)
-    if segmenter is not None and isinstance(segmenter.inner, CachedSegmenter):
-        cached["segmentation"] = segmenter.inner
     return SlamPipeline(
         extractor=extractor,
         masks=masks,

@@ -132,8 +132,11 @@ DEPTH = "rigid motion in depth and free space seen before are tested as well (ou
 
 
 def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
-    monocular = isinstance(settings, EmfoaOftMonoSettings)
-    flow, sentences = getattr(settings, "flow", None), []
+    monocular, sparse = (
+        isinstance(settings, EmfoaOftMonoSettings),
+        isinstance(getattr(settings, "flow", None), FlowSettings),
+    )
+    sentences = []
     if isinstance(settings, SemanticSystemSettings):
         sentences += [describe_masks(settings.segmentation), CFPN]
         if settings.segmentation.dilation_px:
@@ -143,10 +146,9 @@ def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
     if not monocular:
         sentences.append(SENSOR)
     if isinstance(settings, PaperTestSettings):
-        sentences += [SPARSE] if isinstance(flow, FlowSettings) else DENSE
+        sentences += [SPARSE] if sparse else DENSE
     elif isinstance(settings, EpipolarTestSettings):
-        sentences += [SPARSE] if isinstance(flow, FlowSettings) else []
-        sentences += [SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
+        sentences += [*[SPARSE] * sparse, SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
     if isinstance(settings, DepthTestSettings):
         sentences.append(DEPTH)
     return (*sentences, BACKEND) if monocular else tuple(sentences)

@@ -39,15 +39,9 @@ def test_controls_keep_the_contract(name):
     check_tracker(name)
 
 
-def test_never_move_is_identity():
-    tracker = reset(build_tracker("never-move"))
-    for index in range(3):
-        result = tracker.track(blank(index, float(index)))
-        assert result.state == "ok" and np.array_equal(result.T_world_cam, np.eye(4))
-
-
-def test_constant_velocity_stands_still_without_images():
-    tracker = reset(build_tracker("constant-velocity"))
+@pytest.mark.parametrize("name", ["never-move", "constant-velocity"])
+def test_controls_stand_still_without_images(name):
+    tracker = reset(build_tracker(name))
     for index in range(12):
         result = tracker.track(blank(index, index / 30))
         assert result.state == "ok" and np.allclose(result.T_world_cam, np.eye(4), atol=1e-12)
@@ -93,13 +87,12 @@ def test_replay_skips_a_hole(trajectory, tmp_path):
 
 
 def test_replay_id_carries_the_file(trajectory):
-    path, _, _ = trajectory
+    path = trajectory[0]
     spec = TRACKERS.get(f"replay:{path}")
     assert spec.id == f"replay:{path}" and resolve_settings(spec).file == str(path)
     assert "estimate.txt" in spec.label
-    version = spec.version
     path.write_text(path.read_text() + "1400000000.0 0 0 0 0 0 0 1\n")
-    assert TRACKERS.get(f"replay:{path}").version != version, "another content is another run"
+    assert TRACKERS.get(f"replay:{path}").version != spec.version, "another content is another run"
     assert resolve_settings(spec, {"tolerance_s": "0.02"}).tolerance_s == 0.02
     assert TRACKERS.get("replay").id == "replay"
 
@@ -123,17 +116,18 @@ def test_names_with_a_colon_still_load_specs(tmp_path):
         TRACKERS.get("never-move:x")
 
 
-def test_replay_faults(tmp_path, trajectory):
-    path, _, _ = trajectory
-    with pytest.raises(SettingsError, match="replay:FILE"):
-        build_tracker("replay")
-    with pytest.raises(PluginError, match="lacks its file"):
-        TRACKERS.get("replay:")
-    with pytest.raises(TrajectoryError, match=r"missing\.txt"):
-        build_tracker(f"replay:{tmp_path / 'missing.txt'}")
-    empty = tmp_path / "empty.txt"
-    empty.write_text("# nothing\n")
-    with pytest.raises(TrajectoryError):
-        build_tracker(f"replay:{empty}")
-    with pytest.raises(SettingsError, match="tolerance_s"):
-        build_tracker(f"replay:{path}", {"tolerance_s": 0})
+@pytest.mark.parametrize(
+    ("name", "settings", "error", "words"),
+    [
+        ("replay", {}, SettingsError, "replay:FILE"),
+        ("replay:", {}, PluginError, "lacks its file"),
+        ("replay:missing.txt", {}, TrajectoryError, r"missing\.txt"),
+        ("replay:empty.txt", {}, TrajectoryError, r"empty\.txt"),
+        ("replay:estimate.txt", {"tolerance_s": 0}, SettingsError, "tolerance_s"),
+    ],
+)
+def test_replay_faults(tmp_path, monkeypatch, trajectory, name, settings, error, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.txt").write_text("# nothing\n")
+    with pytest.raises(error, match=words):
+        build_tracker(name, settings)

@@ -61,8 +61,7 @@ def test_tracker(example):
 
 
 def test_data_set(example, plugged, tmp_path):
-    path = example("my_data.py")
-    plugged("sequences", path, DATASETS)
+    plugged("sequences", example("my_data.py"), DATASETS)
     sequence = open_sequence("grey/wall", data_root=tmp_path)
     check_sequence(sequence)
     assert len(sequence) == 20 and open_sequence("grey/wall", data_root=tmp_path, frames="5:8")[0].timestamp == 5 / 30
@@ -71,10 +70,8 @@ def test_data_set(example, plugged, tmp_path):
 
 
 def test_segmenter(example, plugged):
-    path = example("my_segmenter.py")
-    plugged("segmenters", path, SEGMENTERS)
-    spec = SEGMENTERS.get("near")
-    build = load_object(spec.entry_point)
+    plugged("segmenters", example("my_segmenter.py"), SEGMENTERS)
+    build = load_object(SEGMENTERS.get("near").entry_point)
     check_segmenter(lambda: build(None, None))
     tracker = build_tracker("mask-rcnn", {"segmentation.source": "plugin:near"})
     sequence = CornerSequence(3)
@@ -83,8 +80,7 @@ def test_segmenter(example, plugged):
 
 
 def test_flow(example, plugged):
-    path = example("my_flow.py")
-    plugged("flow", path, FLOWS)
+    plugged("flow", example("my_flow.py"), FLOWS)
     flow = build_flow(FlowSettings(plugin="no-motion"))
     points = np.array([[3.5, 4.5], [10, 20]], np.float32)
     guess = np.array([[np.nan, np.nan], [11, 21]], np.float32)

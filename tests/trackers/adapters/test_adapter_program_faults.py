@@ -84,9 +84,11 @@ def test_a_second_answer_is_never_taken_for_the_next_frame(program):
         tracker.close()
 
 
-def test_refusal_at_reset(program):
+def test_refusals_at_reset_and_of_images_of_another_size(program):
     with pytest.raises(TrackerError, match="at reset: fisheye cameras only"):
         reset(program("next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)", close_timeout_s=0.1))
+    with pytest.raises(TrackerError, match="but the camera is 64x48"):
+        reset(program(GOOD)).track(Frame(0, 0.0, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32)))
 
 
 def test_faults_at_finalize(program):
@@ -159,13 +161,6 @@ def test_close_kills_what_does_not_end(program):
     tracker.close()
     assert time.monotonic() - start < 5
     assert gone(int(stats["pid"])) and gone(int(stats["child"]))
-
-
-def test_wrong_image_size(program):
-    tracker = reset(program(GOOD))
-    small = Frame(0, 0.0, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32))
-    with pytest.raises(TrackerError, match="but the camera is 64x48"):
-        tracker.track(small)
 
 
 def test_serve_answers_for_a_python_tracker(program):

@@ -1,5 +1,6 @@
 """Programs over JSON lines: what is exchanged."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -27,8 +28,6 @@ def test_reset_tells_all(program, tmp_path):
     """
     context = TrackerContext(sequence_id="tum/fr1/xyz", device="cuda:1", threads=3, fps=25.0)
     reset(program(text, context, folder=str(tmp_path)))
-    import json
-
     request, threads, folder = json.loads(told.read_text())
     camera = request["camera"]
     assert (camera["width"], camera["height"], camera["fx"], camera["fy"]) == (64, 48, 60.0, 61.0)

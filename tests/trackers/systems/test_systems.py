@@ -13,16 +13,22 @@ from quick_dense import quick
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import Parameter, parameters, settings_table
+from dynslam_bench.core.settings import parameters, settings_table
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pipeline import SlamPipeline
+from dynslam_bench.testing.tracker import first_difference
 from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.registry import all_specs, tracker_groups
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings, UnfilteredSystemSettings
 
 FRAMES = 6
 SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)]
+MASKED = [
+    spec
+    for spec in SYSTEMS
+    if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto"
+]
 IDENTITY = {"orb-slam2-mono", "orb-slam2"}
 SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
 """Need five keyframes, or a window of frames, before they judge."""
@@ -33,13 +39,14 @@ def walking():
     return open_sequence(f"synthetic/walking_xyz?frames={FRAMES}")
 
 
-def run(spec: TrackerSpec, sequence, seed: int = 0, **settings: object) -> list[TrackResult]:
-    semantic = issubclass(spec.settings, SemanticSystemSettings)
-    if semantic and spec.settings().segmentation.source == "auto":
-        settings.setdefault("segmentation.source", "oracle")
-    settings = quick(spec.settings) | settings
-    tracker = build_tracker(spec, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
-    tracker.reset(sequence.camera, rng=np.random.default_rng(seed))
+def build(spec: TrackerSpec, sequence) -> SlamPipeline:
+    settings = quick(spec.settings) | ({"segmentation.source": "oracle"} if spec in MASKED else {})
+    return build_tracker(spec, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
+
+
+def run(spec: TrackerSpec, sequence) -> list[TrackResult]:
+    tracker = build(spec, sequence)
+    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     return [tracker.track(sequence[index]) for index in range(FRAMES)]
 
 
@@ -49,7 +56,7 @@ def test_every_system_tracks_and_says_what_it_culls(spec: TrackerSpec, walking) 
     waiting = {"initialising"} if spec.sensors == "rgb" else set()  # until the camera has moved enough
     assert {result.state for result in results} <= {"ok"} | waiting and len(results) == FRAMES
     keys = [set(result.stats) for result in results[2:]]
-    assert all(each == keys[0] for each in keys), "the same stats on every frame"
+    assert all(names == keys[0] for names in keys), "the same stats on every frame"
     assert all(np.isfinite(list(result.stats.values())).all() for result in results)
     culled = sum(result.stats["culled"] for result in results)
     if spec.id in IDENTITY:
@@ -63,37 +70,22 @@ def test_every_system_tracks_and_says_what_it_culls(spec: TrackerSpec, walking) 
 
 @pytest.mark.parametrize("name", ["emfoa-oft", "yolo-slam"])
 def test_one_seed_gives_the_same_bits(name: str, walking) -> None:
-    first, second = run(TRACKERS.get(name), walking), run(TRACKERS.get(name), walking)
-    assert len(first) > 1
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(a.T_world_cam, b.T_world_cam)
-        assert a.stats == b.stats
+    assert not first_difference(*(run(TRACKERS.get(name), walking) for _ in range(2)))
 
 
 @pytest.mark.parametrize("name", ["mask-rcnn", "dynaslam", "yolo-slam", "seg-slam", "emfoa-oft"])
-def test_no_masks_where_a_system_needs_them_is_a_clear_error(name: str, walking) -> None:
+def test_no_masks_where_a_system_needs_them_is_a_clear_error(name: str) -> None:
     with pytest.raises(SettingsError, match=r"needs masks.*none.*oracle.*onnx:PATH.*weights:PATH"):
-        run(TRACKERS.get(name), walking, **{"segmentation.source": "none"})
+        build_tracker(name, {"segmentation.source": "none"})
 
 
-def test_online_segmentation_settings_reach_every_filter(walking) -> None:
-    reached = []
-    for spec in SYSTEMS:
-        semantic = issubclass(spec.settings, SemanticSystemSettings)
-        if not semantic or spec.settings().segmentation.source != "auto":
-            continue
-        tracker = build_tracker(
-            spec, {"segmentation.source": "oracle"}, TrackerContext(sequence_id=walking.id, masks=walking.masks)
-        )
-        assert isinstance(tracker, SlamPipeline)
-        changed = spec.settings.model_validate({"segmentation": {"source": "oracle", "confidence": 0.77}})
-        tracker.configure(changed)
-        for each in tracker._filters:
-            for held in (getattr(each, "segmentation", None), getattr(each, "settings", None)):
-                if isinstance(held, SegmentationSettings):
-                    assert held.confidence == 0.77, f"{spec.id}: {each.name}"
-                    reached.append(spec.id)
-    assert len(set(reached)) > 1
+@pytest.mark.parametrize("spec", MASKED, ids=lambda spec: spec.id)
+def test_online_segmentation_settings_reach_every_filter(spec: TrackerSpec, walking) -> None:
+    tracker = build(spec, walking)
+    tracker.configure(spec.settings.model_validate({"segmentation": {"source": "oracle", "confidence": 0.77}}))
+    held = [(getattr(rule, "segmentation", None), rule.settings) for rule in tracker._filters]
+    for settings in (settings for pair in held for settings in pair if isinstance(settings, SegmentationSettings)):
+        assert settings.confidence == 0.77
 
 
 @pytest.mark.parametrize("name", ["sof-slam", "seg-slam"])
@@ -110,10 +102,7 @@ def test_a_networks_movable_things_pass_only_where_a_filter_wants_them(walking) 
             return Instances(masks, boxes, ("person", "chair"), np.ones(2, np.float32))
 
     for name, wanted in (("seg-slam", ("person", "chair")), ("mask-rcnn", ("person",))):
-        tracker = build_tracker(
-            name, {"segmentation.source": "oracle"}, TrackerContext(sequence_id=walking.id, masks=walking.masks)
-        )
-        assert isinstance(tracker, SlamPipeline) and tracker._masks is not None
+        tracker = build(TRACKERS.get(name), walking)
         tracker._masks.segmenter.inner = Network()
         assert tracker._masks.segmenter.segment(walking[0]).class_names == wanted
 
@@ -121,8 +110,7 @@ def test_a_networks_movable_things_pass_only_where_a_filter_wants_them(walking) 
 @pytest.mark.parametrize("spec", all_specs(), ids=lambda spec: spec.id)
 def test_specs_are_complete(spec: TrackerSpec) -> None:
     assert spec.label and spec.summary and spec.provenance
-    described = parameters(spec.settings)
-    assert all(isinstance(each, Parameter) and each.meaning for each in described)
+    assert all(parameter.meaning for parameter in parameters(spec.settings))
     assert settings_table(spec.settings).count("\n") >= 2
     if spec.provenance in ("inspired", "assumed"):
         assert not spec.ranked and spec.assumptions

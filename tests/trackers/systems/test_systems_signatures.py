@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -61,14 +62,19 @@ def test_published_classes(tracker: str, sequence: str, expected: str | None) ->
 def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
     store = RunStore(tmp_path)
     replica = "synthetic/walking_rpy"
-    for seed in (0, 1):
-        fake.add_run(store, "mask-rcnn", replica, seed, error=0.004, overrides={"segmentation.source": "oracle"})
-        fake.add_run(store, "dynaslam-n", replica, seed, error=0.005, provenance="faithful-code")
-        fake.add_run(store, "orb-slam2", replica, seed, error=0.5, provenance="faithful-code")
-        fake.add_run(store, "yolo-slam", replica, seed, error=0.005)
-        fake.add_run(store, "cfp-slam", replica, seed, error=0.005, provenance="inspired")
-        fake.add_run(store, "dai-slam", replica, seed, error=0.005, lost=range(90))
-        fake.add_run(store, "di-slam", replica, seed, error=0.005, provenance="inspired")
+    for seed, (tracker, options) in product(
+        (0, 1),
+        {
+            "mask-rcnn": {"error": 0.004, "overrides": {"segmentation.source": "oracle"}},
+            "dynaslam-n": {"provenance": "faithful-code"},
+            "orb-slam2": {"error": 0.5, "provenance": "faithful-code"},
+            "yolo-slam": {},
+            "cfp-slam": {"provenance": "inspired"},
+            "dai-slam": {"lost": range(90)},
+            "di-slam": {"provenance": "inspired"},
+        }.items(),
+    ):
+        fake.add_run(store, tracker, replica, seed, **{"error": 0.005} | options)
     text = signatures.report(tmp_path)
     verdicts = {
         line.split("|")[1].strip(): line.rsplit("|", 2)[1].strip()
