@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -20,7 +21,6 @@ from dynslam_bench.core.settings import (
     apply_overrides,
     flatten,
     parameters,
-    value_of,
     why_unused,
 )
 from dynslam_bench.evaluation.online import OnlineSample
@@ -54,7 +54,7 @@ class ActionMap:
         self.parameters: tuple[Parameter, ...] = _select(settings, control)
         for parameter in self.parameters:
             _check_effect(settings, parameter)
-        self._values = {parameter.name: value_of(settings, parameter.name) for parameter in self.parameters}
+        self._values = {parameter.name: attrgetter(parameter.name)(settings) for parameter in self.parameters}
         self._neutral = self.encode(settings)
 
     @property
@@ -134,7 +134,7 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
 def _check_effect(settings: Settings, parameter: Parameter) -> None:
     if reason := why_unused(settings, parameter.name):
         raise SettingsError(f"setting '{parameter.name}' in control has no effect: {reason}", "leave it out of control")
-    value = value_of(settings, parameter.name)
+    value = attrgetter(parameter.name)(settings)
     if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
         raise SettingsError(
             f"setting '{parameter.name}' in control is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",

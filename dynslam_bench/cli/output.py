@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import from_json, to_json
 
-from dynslam_bench.core.download import Report
 from dynslam_bench.core.sanitise import printable
 
 if TYPE_CHECKING:
+    from dynslam_bench.core.download import Report
     from dynslam_bench.core.errors import DynslamError
     from dynslam_bench.reports.tables.table import Table
 

@@ -22,6 +22,7 @@ import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
@@ -45,8 +46,13 @@ class Settings(BaseModel):
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Refuse a class with a default that lies outside its own range: studies and actions could not name it."""
         for name, field, default in _leaves(cls):
-            if _annotation(field) is not None:
-                _check_default(cls, _describe(name, field, default))
+            if _annotation(field) is None:
+                continue
+            p = _describe(name, field, default)
+            if p.low is not None and p.high is not None and default is not None and not p.low <= default <= p.high:
+                raise TypeError(
+                    f"{cls.__name__}: the default of '{name}' is {default!r}, outside its range {p.low:g} to {p.high:g}"
+                )
 
     @property
     def unused(self) -> Mapping[str, str]:
@@ -147,7 +153,7 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
     for name, field, _ in _leaves(type(settings)):
         extra = field.json_schema_extra
         note = extra.get(_NAMES) if isinstance(extra, dict) else None
-        value = value_of(settings, name)
+        value = attrgetter(name)(settings)
         if isinstance(note, dict):
             value = value or os.environ.get(str(note["otherwise"]), "")
             differences[name] = (str(note["kind"]), str(value))
@@ -211,7 +217,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
 
 def flatten(settings: Settings) -> dict[str, Any]:
     """Dotted name to value of every leaf field."""
-    return {name: value_of(settings, name) for name in field_names(type(settings))}
+    return {name: attrgetter(name)(settings) for name in field_names(type(settings))}
 
 
 def field_names(cls: type[Settings]) -> list[str]:
@@ -270,16 +276,6 @@ def _default(field: FieldInfo) -> Any:
     return field.default if isinstance(field.default, Settings) else field.get_default(call_default_factory=True)
 
 
-def _check_default(cls: type[Settings], p: Parameter) -> None:
-    """Numbers only: pydantic holds the defaults of the others to their types."""
-    if p.low is None or p.high is None or p.default is None:
-        return
-    if not p.low <= float(p.default) <= p.high:
-        raise TypeError(
-            f"{cls.__name__}: the default of '{p.name}' is {p.default!r}, outside its range {p.low:g} to {p.high:g}"
-        )
-
-
 def _nested(field: FieldInfo) -> type[Settings] | None:
     annotation = field.annotation
     if typing.get_origin(annotation) is not None:  # tuple[float, ...], which Python 3.10 takes for a class
@@ -320,14 +316,6 @@ def _alternatives(annotation: Any) -> tuple[Any, ...]:
     """The types that a union allows; another type alone."""
     is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     return typing.get_args(annotation) if is_union else (annotation,)
-
-
-def value_of(settings: Settings, name: str) -> Any:
-    """The value of a field by its dotted name."""
-    node: Any = settings
-    for key in name.split("."):
-        node = getattr(node, key)
-    return node
 
 
 def _parse(value: Any, annotation: Any) -> Any:
