@@ -13,7 +13,6 @@ import pytest
 from documented_names import ROOT
 
 pytest.importorskip("mkdocstrings", reason="the extra [docs] is not installed")
-sys.path.append(str(ROOT / "tests" / "reports"))
 from reports_browser import Browser, needs_browser
 
 LOADING = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}

@@ -12,7 +12,7 @@ from dynslam_bench.runs.exchange import export as provenance
 from dynslam_bench.runs.exchange import formats as colmap
 from dynslam_bench.runs.exchange import formats as pose_tables
 from dynslam_bench.runs.exchange import formats as reading
-from dynslam_bench.runs.exchange.export import PROVENANCE_FILE, Provenance
+from dynslam_bench.runs.exchange.transfer import PROVENANCE_FILE, Provenance
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.slam import map_files
 

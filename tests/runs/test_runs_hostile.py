@@ -21,7 +21,7 @@ from dynslam_bench.core.errors import InfrastructureError
 from dynslam_bench.core.files import SHARED_MEMORY
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one
 from dynslam_bench.runs.process import supervisor as memory_module
-from dynslam_bench.runs.process.fork_server import SERVERS, Child, make_job
+from dynslam_bench.runs.process.fork_server import SERVERS
 from dynslam_bench.runs.process.supervisor import supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
@@ -301,13 +301,3 @@ def test_several_on_one_folder_share_the_work(store: RunStore, toy_folder: str) 
     assert len(made) == len(set(made)) == 3
     assert len(records) == 3 and records[0] == records[1] == records[2]
     assert not list(store.runs.glob(".*"))
-
-
-@linux
-def test_a_forked_run_finds_imported_what_every_run_needs(tmp_path: Path) -> None:
-    """The loop and the specs of all systems took 0.3 s of every run."""
-    text = "import sys\nfound = sorted(sys.modules)\ndef tell(*_):\n    return {'type': 'done', 'found': found}\n"
-    (tmp_path / "asks.py").write_text(text)
-    job = make_job(f"{tmp_path / 'asks.py'}:tell", tmp_path, spec={"threads": 1})
-    found = supervise(Child(), job, Limits()).final["found"]
-    assert {"torch", "dynslam_bench.runs.loop", "dynslam_bench.trackers.systems.yolo_slam"} <= set(found)

@@ -336,13 +336,6 @@ def test_bad_suites(tmp_path: Path, text: str, message: str) -> None:
         load_suite(write(tmp_path / "bad.toml", text))
 
 
-def test_unknown_suites(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"unknown suite 'dynamics'.*dynamic"):
-        load_suite("dynamics")
-    with pytest.raises(RunError, match="cannot read"):
-        load_suite(tmp_path / "none.toml")
-
-
 def test_frames_of_a_run_are_read_however_they_are_written() -> None:
     ways = [(0, 30), [0, 30], "0:30", ":30"]
     assert {RunSpec(tracker="x", sequence="y", frames=way).frames for way in ways} == {(0, 30)}

@@ -15,7 +15,7 @@ from dynslam_bench.envs import SlamEnv
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.geometry.stamps import format_ns, from_seconds
 from dynslam_bench.geometry.trajectory_files import read_tum
-from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, resolve, run_many, run_one, score
+from dynslam_bench.runs import RunRecord, RunSpec, RunStore, resolve, run_many, run_one, score
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
 
 
@@ -66,15 +66,6 @@ def test_the_run_is_the_environment(store: RunStore, toy_folder: str) -> None:
     assert scored["ate_rmse_m"] == pytest.approx(info["episode_metrics"]["ate_rmse_m"], rel=1e-5)
 
 
-def test_same_seed_same_run_and_other_seed_other_run(store: RunStore, toy_folder: str) -> None:
-    texts = []
-    for seed in (1, 1, 2):
-        record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=seed), store)
-        texts.append((record.run_id, (store.folder(record.run_id) / "trajectory_online.txt").read_text()))
-    assert texts[0] == texts[1]
-    assert texts[0][0] != texts[2][0] and texts[0][1] != texts[2][1]
-
-
 def test_a_start_offset_is_a_repeat_of_the_same_block(store: RunStore, toy_folder: str) -> None:
     spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(10, 40))
     plain = run_one(spec, store)
@@ -93,15 +84,11 @@ def test_a_start_offset_is_a_repeat_of_the_same_block(store: RunStore, toy_folde
         resolve(RunSpec(tracker=TARGET, sequence=toy_folder, offset=60))
 
 
-LIMITS = Limits(frame_s=3.0)
-
-
 @pytest.mark.parametrize(
     ("mode", "status", "reason"),
     [
         ("raise", "crashed", "frame 4 of 60: ValueError: the toy tracker raised on purpose (envs_toys.py:"),
         ("segfault", "crashed", "SIGSEGV (segmentation fault), after frame 3 of 60"),
-        ("exit", "crashed", "the process left with exit code 3, after frame 3 of 60"),
         ("nan", "invalid", "tracker 'toy' at frame 4 returned a pose with 16 values that are not finite"),
         ("scaled", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
         ("mirrored", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
@@ -111,7 +98,6 @@ LIMITS = Limits(frame_s=3.0)
             "out-of-memory",
             "frame 4 of 60: MemoryError: the toy tracker ran out of memory on purpose (envs",
         ),
-        ("hang", "timeout", "no sign of life for 3 s, after frame 3 of 60"),
         ("lost", "lost", "tracked on 4 of 60 frames"),
         ("initialising", "lost", "tracked on 4 of 60 frames"),
     ],
@@ -119,7 +105,7 @@ LIMITS = Limits(frame_s=3.0)
 def test_every_failure_is_a_record_with_status_and_reason(
     store: RunStore, toy_folder: str, mode: str, status: str, reason: str
 ) -> None:
-    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": mode}, limits=LIMITS), store)
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": mode}), store)
     assert record.status == status and record.reason.startswith(reason)
     assert "\n" not in record.reason
     assert store.read(record.run_id) == record
@@ -165,14 +151,6 @@ def test_partial_metrics_and_stopping(store: RunStore, toy_folder: str) -> None:
     whole = run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store, on_progress=lambda *a: seen.append(a) or True)
     assert [partial["frames_done"] for _, partial in seen] == [50, 60]
     assert seen[-1][1]["metrics"]["ate_rmse_m"] == pytest.approx(score(store, whole).metrics["ate_rmse_m"], rel=1e-5)
-
-
-def test_no_ground_truth(store: RunStore, tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "blind", 12, has_truth=False)
-    record = run_one(RunSpec(tracker=TARGET, sequence=str(folder)), store)
-    assert record.status == "ok" and not record.sequence.ground_truth
-    metrics = score(store, record)
-    assert metrics.primary is None and "has no ground truth" in metrics.reasons["online"]
 
 
 @pytest.mark.parametrize(
