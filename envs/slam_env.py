@@ -359,8 +359,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def episode_metrics(self) -> dict[str, float]:
         """The metrics of the frames so far under the protocol: plain floats by name, without undefined ones.
 
-        ``coverage``, ``frames`` and ``tracked_frames`` of the scored trajectory, and the metrics of `evaluate` where there
-        is ground truth and the protocol finds something to evaluate.
+        ``coverage``, ``frames`` and ``tracked_frames`` of the scored trajectory, and the metrics of `evaluate` where
+        there is ground truth and the protocol finds something to evaluate.
         """
         final = self.final_trajectory() if self.protocol.trajectory == "final" else None
         trajectory = final if final is not None else self.online_trajectory()

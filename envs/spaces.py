@@ -194,14 +194,13 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
 )
 """Name and meaning of every entry of the ``stats`` observation, in order. What a tracker does not report is 0."""
 
-STATS_SIZE = len(STATS_LAYOUT)
 _SIGNED = np.array([name.startswith("motion_") for name, _ in STATS_LAYOUT])
 
 
 def stats_space() -> spaces.Box:
     """``Box`` of float32 ``[24]``: entries in [0, 1], the motion's in [-1, 1]; see `STATS_LAYOUT`."""
     low = np.where(_SIGNED, -1.0, 0.0).astype(np.float32)
-    return spaces.Box(low, np.ones(STATS_SIZE, np.float32), dtype=np.float32)
+    return spaces.Box(low, np.ones_like(low), dtype=np.float32)
 
 
 def rgbd_space(camera: Camera) -> spaces.Dict:

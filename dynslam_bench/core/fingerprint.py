@@ -169,9 +169,7 @@ def distribution_of_module(module: str) -> tuple[str, str]:
     return (names[0], distribution_version(names[0])) if names else ("", "")
 
 
-@cache
-def _distributions() -> Mapping[str, Sequence[str]]:
-    return importlib.metadata.packages_distributions()
+_distributions = cache(importlib.metadata.packages_distributions)
 
 
 @cache

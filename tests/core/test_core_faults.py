@@ -9,6 +9,7 @@ import signal
 import tempfile
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 from pathlib import Path
 
@@ -108,27 +109,21 @@ def test_a_download_goes_on_after_any_fault(here: str, tmp_path: Path) -> None:
 
 
 def test_many_replace_a_folder_at_the_same_time(tmp_path: Path) -> None:
-    target, errors = tmp_path / "folder", []
+    target = tmp_path / "folder"
 
     def replace(number: int) -> None:
         for turn in range(50):
             work = tmp_path / f"work-{number}-{turn}"
             work.mkdir()
             (work / "file").write_text("whole")
-            try:
-                replace_folder(work, target)
-            except OSError as error:
-                errors.append(error)
+            replace_folder(work, target)
 
-    threads = [threading.Thread(target=replace, args=(number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    seen = 0
-    while any(thread.is_alive() for thread in threads) or not seen:
-        if target.is_dir():
-            seen += 1
-            assert (target / "file").read_text() == "whole"
-    assert errors == [] and [path.name for path in tmp_path.iterdir()] == ["folder"]
+    with ThreadPoolExecutor(4) as pool:
+        writers = [pool.submit(replace, number) for number in range(4)]
+        while not all(writer.done() for writer in writers):
+            assert not target.is_dir() or (target / "file").read_text() == "whole"
+    assert [writer.result() for writer in writers] == [None] * 4
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
 def test_a_name_is_claimed_once(tmp_path: Path) -> None:
