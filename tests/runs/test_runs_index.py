@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import sqlite3
 from pathlib import Path
@@ -199,7 +198,7 @@ def test_a_link_in_a_folder_is_seen_behind_its_back(filled, tmp_path: Path) -> N
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "tests" / "fixtures" / "results"
 ROWS = [
-    FrameRow(0, 1.5, "ok", None, None, 0.0, 0.0, -0.0, 0.25, {"total": 0.1}, {"culled": 3.0}, [0.0] * 6 + [1.0]),
+    FrameRow(0, 1.5, "ok", 0.05, 0.15, 0.0, 0.0, -0.0, 0.25, {"total": 0.1}, {"culled": 3.0}, [0.0] * 6 + [1.0], 0.5),
     FrameRow(1, 1.625, "dropped"),
     FrameRow(
         2, 1.75, "lost", 0.1, 0.2, 0.30000000000000004, 0.4, -0.1, None, {"total": 1e-9, "flow": 2.0}, {"f_s": 1.0}
@@ -219,6 +218,8 @@ def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path:
 
 
 def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
+    write_csv(tmp_path / "without.csv", ROWS[1:])
+    assert "dynamic_share" not in (tmp_path / "without.csv").read_text(), "no frame has exact masks"
     write_csv(tmp_path / "frames.csv", ROWS)
     head = (tmp_path / "frames.csv").read_text().splitlines()[0]
     assert head.split(",")[-4:] == ["total_s", "flow_s", "stat_culled", "stat_f_s"]
@@ -290,23 +291,6 @@ def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
         assert all(row[name] == (None if line[name] is pd.NA else line[name]) or row[name] == "" for name in shared)
 
 
-def test_from_results_to_a_plot_in_three_lines(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page's examples are run as they stand."""
-    page = (ROOT / "docs" / "environments.md").read_text()
-    section = page[page.index("### From `results/` to a plot") :]
-    first, second = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
-    (store.root / "latest").symlink_to("runs/a7abe04996a79cc4")
-    monkeypatch.chdir(store.root.parent)
-    for text, names in (
-        (first, ("ate.html", "Old Slam", "never move")),
-        (second, ("frames.html", "pose_error_trans_m")),
-    ):
-        assert len([line for line in text.splitlines() if line]) == 3
-        exec(compile(text, "environments.md", "exec"), {})
-        plot = Path(names[0]).read_text()
-        assert all(name in plot for name in names[1:])
-
-
 SHAPE = (48, 65, 3)
 
 
@@ -356,11 +340,3 @@ def test_a_damaged_file_is_one_clear_line(tmp_path: Path, content: bytes) -> Non
     (tmp_path / SNAPSHOTS_FILE).write_bytes(content)
     with pytest.raises(RunError, match=r"holds no (snapshots|arrays)"):
         read_snapshots(tmp_path)
-
-
-def test_the_dynamic_share_is_a_column_where_it_is_known(tmp_path: Path) -> None:
-    known = [FrameRow(0, 1.0, "ok", dynamic_share=0.25), FrameRow(1, 2.0, "ok", dynamic_share=0.0)]
-    write_csv(tmp_path / "known.csv", known)
-    assert [row.dynamic_share for row in read_csv(tmp_path / "known.csv")] == [0.25, 0.0]
-    write_csv(tmp_path / "unknown.csv", [FrameRow(0, 1.0, "ok")])
-    assert "dynamic_share" not in (tmp_path / "unknown.csv").read_text()

@@ -14,7 +14,6 @@ from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.runs import RunSpec, RunStore, run_many, run_one
-from dynslam_bench.tuning import StudySpec, Tuner
 
 
 @pytest.fixture
@@ -88,22 +87,6 @@ def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_fold
         return caught.value.options[-1]
 
     assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft?masks=none" in hint("mask-rcnn")
-
-
-def test_a_study_refuses_it_too(toy_folder: str, mistakes, tmp_path: Path) -> None:
-    source, words = mistakes["no network"]
-    spec = StudySpec.model_validate(
-        {
-            "name": "s",
-            "tracker": "mask-rcnn",
-            "tune": (toy_folder,),
-            "trials": 2,
-            "space": {"fixed": {"segmentation.source": source}},
-        }
-    )
-    with pytest.raises(DynslamError, match=words):
-        Tuner(spec, tmp_path / "results").run()
-    assert RunStore(tmp_path / "results").ids() == []
 
 
 @pytest.mark.parametrize(

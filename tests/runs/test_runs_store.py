@@ -186,7 +186,7 @@ def test_a_new_run_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     found = survey(lambda: make(root, RECORD), root, halfway=whole_or_missing, result=lambda: held(root))
     assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
     assert found.operations > 20 and found.ends["kill", -9] == found.operations
-    assert found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5 and found.faults == 4 * found.operations
+    assert found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5 and found.ends.total() == 4 * found.operations
 
 
 def test_a_run_that_is_made_again_is_never_lost(tmp_path: Path) -> None:
