@@ -175,6 +175,9 @@ def misbehave(mode: str, result: TrackResult) -> TrackResult:
             return replace(result, T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0]) @ pose)
         case "mirrored":
             return replace(result, T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0]))
+        case "far":
+            pose[:3, 3] = 1e200
+            return replace(result, T_world_cam=pose)
         case "none":
             return replace(result, T_world_cam=None)
         case "string":

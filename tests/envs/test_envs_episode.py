@@ -141,6 +141,7 @@ def test_frames_and_stride_cut_the_sequence(toy_folder: str) -> None:
         ("nan", r"frame 4 returned a pose with 16 values that are not finite"),
         ("scaled", r"frame 4 returned a pose that is no rigid transformation: .* det R = 8"),
         ("mirrored", r"frame 4 returned a pose that is no rigid transformation: .* det R = -1"),
+        ("far", r"frame 4 returned a pose 1e\+200 m away"),
         ("none", r"frame 4 returned state 'ok' without a pose"),
         ("string", r"frame 4 returned a str"),
     ],
@@ -288,25 +289,11 @@ def _only_localising(settings: Any) -> Any:
     return settings.model_copy(update={"backend": backend})
 
 
-@pytest.mark.parametrize("stamps", [[0.0, 0.1, 0.1, 0.2], [0.0, 0.2, 0.1, 0.3], [0.0, 0.1, np.nan, 0.3]])
+@pytest.mark.parametrize(
+    "stamps", [[0.0, 0.1, 0.1, 0.2], [0.0, 0.2, 0.1, 0.3], [0.0, 0.1, np.nan, 0.3], [0.0, 0.1, 0.1 + 2e-7, 0.2]]
+)
 def test_stamps_that_do_not_tell_frames_apart_are_refused_before_anything_runs(stamps: list[float]) -> None:
     sequence = ToySequence(4)
     sequence.timestamps = np.array(stamps)
-    with pytest.raises(SequenceError, match="stamps"):
+    with pytest.raises(SequenceError, match=r"stamps|ns apart"):
         SlamEnv(sequence, TARGET)
-
-
-def test_poses_out_of_this_world_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = ToyTracker.track
-
-    def far(self: ToyTracker, frame: Any) -> Any:
-        found = whole(self, frame)
-        found.T_world_cam[:3, 3] *= 1e200 if frame.index == 5 else 1.0
-        return found
-
-    monkeypatch.setattr(ToyTracker, "track", far)
-    env = SlamEnv(ToySequence(12), replace(SPEC, entry_point="envs_toys:ToyTracker"))
-    env.reset(seed=0)
-    with pytest.raises(TrackerContractError, match=r"frame 5 returned a pose 4\.99e"):
-        for _ in range(11):
-            env.step(env.neutral_action)

@@ -131,7 +131,8 @@ def test_stats_named_with_half_characters_are_stored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "table",
-    ["index,timestamp,state,reward_m\n0,1.0,ok,0\n1,2.0\n", "a\n1\n", "index,timestamp,state,reward_m\n0,1.0,asleep,0\n", "\xff", "index\n" + "x" * 200_000,
+    ["index,timestamp,state,reward_m\n0,1.0,ok,0\n1,2.0\n", "a\n1\n",
+     "index,timestamp,state,reward_m\n0,1.0,asleep,0\n", "\xff", "index\n" + "x" * 200_000,
      "index,timestamp,state,reward_m\n99999999999999999999,1.0,ok,0\n"],
 )  # fmt: skip
 def test_a_damaged_table_of_frames_is_one_clear_line(tmp_path: Path, table: str) -> None:

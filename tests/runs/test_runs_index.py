@@ -18,7 +18,6 @@ from dynslam_bench.core.errors import RunError
 from dynslam_bench.envs.slam_env import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import load_frame
 from dynslam_bench.runs import RunStore, load_frames, score
 from dynslam_bench.runs import store as store_module
 from dynslam_bench.runs.artifacts import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
@@ -267,28 +266,6 @@ def test_trials_of_studies_are_left_out_unless_asked_for(store: RunStore) -> Non
     everything = store.frame(trials=True)
     assert everything["study"].tolist() == ["thresholds", pd.NA] and everything["study"].dtype == "string"
     assert store.frame()["study"].isna().all()
-
-
-def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
-    listed, table = set(list_runs(store)[0][0]), set(store.frame(trials=True).columns)
-    reported = set(load_frame(store).columns)
-    assert listed - table == {"seen_in_training"} and "seen_in_training" in reported
-    assert listed - reported == {"identity", "reason", "started"}
-    shared = {
-        "run_id",
-        "frames",
-        "segmentation",
-        "study",
-        "static_camera_ate_rmse_m",
-        "ate_rmse_m",
-        "coverage",
-        "frame_ms",
-    }
-    assert shared <= listed & table & reported
-    by_id = {row["run_id"]: row for row in list_runs(store)[0]}
-    for line in store.frame().astype(object).to_dict("records"):
-        row = by_id[line["run_id"]]
-        assert all(row[name] == (None if line[name] is pd.NA else line[name]) or row[name] == "" for name in shared)
 
 
 SHAPE = (48, 65, 3)

@@ -170,35 +170,6 @@ def test_an_image_that_cannot_be_used_is_the_datas_fault(store: RunStore, damage
     assert run_one(RunSpec(tracker="never-move", sequence=folder), store).status == "ok"
 
 
-REMOVES = """
-from pathlib import Path
-from dynslam_bench.contracts import TrackerSpec, TrackResult
-from dynslam_bench.core.settings import Settings
-import numpy as np
-
-class Removes:
-    def __init__(self, settings):
-        pass
-
-    def reset(self, camera, *, rng):
-        pass
-
-    def track(self, frame):
-        Path({image!r}).unlink(missing_ok=True)
-        return TrackResult(np.eye(4), "ok")
-
-SPEC = TrackerSpec(id="removes", entry_point=__file__ + ":Removes", label="removes", summary="", settings=Settings)
-"""
-
-
-def test_a_file_that_goes_in_mid_run_is_the_datas_fault(store: RunStore, damaged, tmp_path: Path) -> None:
-    folder, image = damaged
-    (tmp_path / "removes.py").write_text(REMOVES.format(image=str(image)))
-    with pytest.raises(RunError, match=rf"frame {AT} of '.*' cannot be read: .*{image.name}"):
-        run_one(RunSpec(tracker=f"{tmp_path}/removes.py:SPEC", sequence=folder), store)
-    assert store.ids() == []
-
-
 def test_a_recorded_mask_that_cannot_be_decoded_is_the_datas_fault(store: RunStore, damaged, tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     masks.mkdir()
