@@ -151,9 +151,9 @@ def report_table(source: Table, names: Sequence[str] = (), most: int | None = No
     return table([titles[at] for at in chosen], cells)
 
 
-def wrapped(text: str, most: int = 120) -> str:
-    """Text in lines as wide as the terminal, `most` characters at most; that many where there is none."""
-    return textwrap.fill(text, min(_terminal_width(), most) if sys.stdout.isatty() else most)
+def wrapped(text: str) -> str:
+    """Text in lines as wide as the terminal, 120 characters at most; that many where there is none."""
+    return textwrap.fill(text, min(_terminal_width(), 120) if sys.stdout.isatty() else 120)
 
 
 def _terminal_width() -> int:

@@ -19,7 +19,7 @@ import json
 import os
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from operator import attrgetter
@@ -102,7 +102,6 @@ def tunable(
     limits: tuple[float | None, float | None] | None = None,
     unit: str = "",
     online: bool = False,
-    choices: Sequence[Scalar] | None = None,
 ) -> Any:
     """A field that studies may tune.
 
@@ -115,18 +114,10 @@ def tunable(
         limits: What validation accepts, where that is wider than the search range; None leaves an end open.
         unit: Physical unit, e.g. ``px``.
         online: True if the field may change in mid-episode.
-        choices: The values that studies try, for fields that accept more than these (e.g. free text).
     """
     if scale == "log" and (low is None or low <= 0):
         raise ValueError(f"a log scale needs low > 0, got {low=}")
-    annotation: dict[str, Any] = {
-        "low": low,
-        "high": high,
-        "scale": scale,
-        "unit": unit,
-        "online": online,
-        "choices": list(choices or ()),
-    }
+    annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online}
     least, most = (low, high) if limits is None else limits
     return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most)
 
@@ -277,10 +268,9 @@ def _default(field: FieldInfo) -> Any:
 
 
 def _nested(field: FieldInfo) -> type[Settings] | None:
-    annotation = field.annotation
-    if typing.get_origin(annotation) is not None:  # tuple[float, ...], which Python 3.10 takes for a class
-        return None
-    return annotation if isinstance(annotation, type) and issubclass(annotation, Settings) else None
+    kind = field.annotation
+    is_class = isinstance(kind, type) and typing.get_origin(kind) is None  # Python 3.10: tuple[float, ...] is a type
+    return kind if is_class and issubclass(kind, Settings) else None
 
 
 def _annotation(field: FieldInfo) -> dict[str, Any] | None:
@@ -291,25 +281,13 @@ def _annotation(field: FieldInfo) -> dict[str, Any] | None:
 def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
     note = _annotation(field)
     assert note is not None
-    common: dict[str, Any] = {
-        "name": name,
-        "default": default,
-        "unit": note["unit"],
-        "online": note["online"],
-        "meaning": field.description or "",
-    }
     kinds = [kind for kind in _alternatives(field.annotation) if kind is not type(None)]
     base = kinds[0] if len(kinds) == 1 else field.annotation
-    if note["choices"]:
-        return Parameter(kind="categorical", choices=tuple(note["choices"]), **common)
-    if base is bool:
-        return Parameter(kind="bool", choices=(False, True), **common)
-    if typing.get_origin(base) is Literal:
-        return Parameter(kind="categorical", choices=typing.get_args(base), **common)
-    if base not in (int, float) or note["low"] is None or note["high"] is None:
+    choices = (False, True) if base is bool else typing.get_args(base) if typing.get_origin(base) is Literal else ()
+    if not choices and (base not in (int, float) or note["low"] is None or note["high"] is None):
         raise TypeError(f"tunable field '{name}' of type {base} needs low and high, or a bool or Literal type")
-    kind: Literal["int", "float"] = "int" if base is int else "float"
-    return Parameter(kind=kind, low=note["low"], high=note["high"], scale=note["scale"], **common)
+    kind: Any = base.__name__ if base in (bool, int, float) else "categorical"
+    return Parameter(name, kind, default, choices=choices, meaning=field.description or "", **note)
 
 
 def _alternatives(annotation: Any) -> tuple[Any, ...]:
