@@ -52,8 +52,6 @@ class ActionMap:
     def __init__(self, settings: Settings, control: Sequence[str]) -> None:
         self.base = settings
         self.parameters: tuple[Parameter, ...] = _select(settings, control)
-        for parameter in self.parameters:
-            _check_effect(settings, parameter)
         self._values = {parameter.name: attrgetter(parameter.name)(settings) for parameter in self.parameters}
         self._neutral = self.encode(settings)
 
@@ -125,21 +123,18 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
                 raise SettingsError(f"setting '{name}' may not change in mid-episode", did_you_mean(name, online))
             hint = did_you_mean(name, online) or "this tracker has no online settings"
             raise SettingsError(f"unknown setting '{name}' in control", hint)
-        if online[name] in chosen:
+        parameter, value = online[name], attrgetter(name)(settings)
+        if parameter in chosen:
             raise SettingsError(f"setting '{name}' is given twice in control")
-        chosen.append(online[name])
+        if reason := why_unused(settings, name):
+            raise SettingsError(f"setting '{name}' in control has no effect: {reason}", "leave it out of control")
+        if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
+            raise SettingsError(
+                f"setting '{name}' in control is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
+                "set it within, or leave it out of control",
+            )
+        chosen.append(parameter)
     return tuple(chosen)
-
-
-def _check_effect(settings: Settings, parameter: Parameter) -> None:
-    if reason := why_unused(settings, parameter.name):
-        raise SettingsError(f"setting '{parameter.name}' in control has no effect: {reason}", "leave it out of control")
-    value = attrgetter(parameter.name)(settings)
-    if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
-        raise SettingsError(
-            f"setting '{parameter.name}' in control is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
-            "set it within, or leave it out of control",
-        )
 
 
 def _decode(parameter: Parameter, share: float) -> Scalar:

@@ -118,8 +118,7 @@ class _Supervisor:
         connection = self.child.connection
         is_open = True
         while True:
-            ready = wait([self.child.status_fd, *([connection] if is_open else [])], _POLL_S)
-            if connection in ready:
+            if connection in wait([self.child.status_fd, *([connection] if is_open else [])], _POLL_S):
                 is_open = self._receive()
             if self.child.poll() is not None:
                 while is_open and connection.poll(0):
