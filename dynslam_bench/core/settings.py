@@ -269,8 +269,9 @@ def _default(field: FieldInfo) -> Any:
 
 def _nested(field: FieldInfo) -> type[Settings] | None:
     kind = field.annotation
-    is_class = isinstance(kind, type) and typing.get_origin(kind) is None  # Python 3.10: tuple[float, ...] is a type
-    return kind if is_class and issubclass(kind, Settings) else None
+    if typing.get_origin(kind) is None and isinstance(kind, type) and issubclass(kind, Settings):
+        return kind  # Python 3.10 takes tuple[float, ...] for a class, too
+    return None
 
 
 def _annotation(field: FieldInfo) -> dict[str, Any] | None:
