@@ -6,8 +6,9 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -29,7 +30,6 @@ from dynslam_bench.envs.arguments import (
     preprocessing_of,
     resolve_device,
 )
-from dynslam_bench.envs.episode import Episode, FrameOutcome
 from dynslam_bench.envs.spaces import (
     REWARDS,
     ActionMap,
@@ -48,6 +48,66 @@ from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_set
 
 RENDER_MODES = ("rgb_array",)
 FrameTransform = Callable[[Frame], Frame]
+FrameState = Literal["initialising", "ok", "lost", "dropped"]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameOutcome:
+    """One frame of the episode.
+
+    Attributes:
+        index: Index of the frame in the sequence (after `frames` and `stride`).
+        timestamp: Seconds.
+        state: The tracker's state, or ``dropped`` if the frame never reached it.
+        T_world_cam: Tracked pose ``[4, 4]``; None unless the state is ``ok``.
+        stats: The tracker's diagnostics.
+        timings: Seconds: ``read`` (decoding or rendering), ``total`` (the tracker's step, segmentation included,
+            reading excluded), ``processor`` (processor time of this process in that step, all threads together; what a
+            foreign program or a GPU does is no part of it) and the tracker's stages.
+        error: Causal errors against the ground truth; None where there is none.
+        reward: What the frame earned.
+    """
+
+    index: int
+    timestamp: float
+    state: FrameState
+    T_world_cam: NDArray[np.float64] | None
+    stats: Mapping[str, float]
+    timings: Mapping[str, float]
+    error: OnlineSample | None
+    reward: float
+
+
+@dataclass(eq=False)
+class Episode:
+    """The frames so far.
+
+    Attributes:
+        outcomes: One entry a frame, in order.
+        lost_streak: Frames without a tracked pose in a row, up to the last one; an initialising tracker is not lost.
+        over: Whether the last step ended the episode.
+    """
+
+    outcomes: list[FrameOutcome] = field(default_factory=list)
+    lost_streak: int = 0
+    over: bool = False
+
+    def add(self, outcome: FrameOutcome) -> None:
+        """Append a frame's outcome."""
+        self.outcomes.append(outcome)
+        self.lost_streak = self.lost_streak + 1 if outcome.state == "lost" else 0
+
+    @property
+    def next_index(self) -> int:
+        """Index of the frame that comes next."""
+        return len(self.outcomes)
+
+    def trajectory(self) -> Trajectory:
+        """The online trajectory: the poses of the frames with state ``ok``, each as it was when the frame came."""
+        tracked = [(o.timestamp, o.T_world_cam) for o in self.outcomes if o.T_world_cam is not None]
+        stamps = np.array([stamp for stamp, _ in tracked], dtype=np.float64)
+        poses = np.array([pose for _, pose in tracked], dtype=np.float64).reshape(-1, 4, 4)
+        return Trajectory(stamps, poses)
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -297,12 +357,31 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return total
 
     def episode_metrics(self) -> dict[str, float]:
-        """The metrics of the frames so far under the protocol; only ``coverage`` and counts without ground truth."""
+        """The metrics of the frames so far under the protocol: plain floats by name, without undefined ones.
+
+        ``coverage``, ``frames`` and ``tracked_frames`` of the scored trajectory, and the metrics of `evaluate` where
+        there is ground truth and the protocol finds something to evaluate.
+        """
         final = self.final_trajectory() if self.protocol.trajectory == "final" else None
         trajectory = final if final is not None else self.online_trajectory()
         due = self.sequence.timestamps if self.episode.over else self.sequence.timestamps[: self.episode.next_index]
+        try:
+            tracked = int(tracked_frames(trajectory, due).sum())
+        except EvaluationError:  # a final trajectory whose stamps are of no frame
+            tracked = 0
+        counts = {
+            "coverage": tracked / len(due) if len(due) else 0.0,
+            "frames": float(len(due)),
+            "tracked_frames": float(tracked),
+        }
         truth = self.sequence.ground_truth if self.tracker_spec.metric or self.protocol.finds_scale else None
-        return episode_metrics(self.protocol, trajectory, due, truth)
+        if truth is None:
+            return counts
+        try:
+            metrics = evaluate(trajectory, truth, self.protocol, input_timestamps=due).metrics
+        except EvaluationError:  # too little was tracked; the coverage says so
+            return counts
+        return counts | {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
 
     def render(self) -> NDArray[np.uint8] | None:
         """The current frame with its features and masks beside the trajectory, uint8 ``[H, W, 3]``."""
@@ -513,40 +592,3 @@ def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
         }
         info |= {name: float(value) for name, value in errors.items() if value is not None}
     return info
-
-
-def episode_metrics(
-    protocol: Protocol,
-    trajectory: Trajectory,
-    timestamps: NDArray[np.float64],
-    ground_truth: Trajectory | None,
-) -> dict[str, float]:
-    """The metrics of an episode under a protocol: plain floats by name, without undefined ones.
-
-    Args:
-        protocol: How to evaluate.
-        trajectory: Poses of the tracked frames, online or final; coverage is that of this trajectory.
-        timestamps: Stamps in seconds of all frames that were due, tracked or not.
-        ground_truth: True poses; None leaves only the coverage and the counts.
-
-    Returns:
-        ``coverage``, ``frames``, ``tracked_frames`` and the metrics of `evaluate` (``ate_rmse_m``, ...); these are
-        missing if there is no ground truth or the protocol finds nothing to evaluate.
-    """
-    frames = len(timestamps)
-    try:
-        tracked = int(tracked_frames(trajectory, timestamps).sum())
-    except EvaluationError:  # a final trajectory whose stamps are of no frame
-        tracked = 0
-    counts = {
-        "coverage": tracked / frames if frames else 0.0,
-        "frames": float(frames),
-        "tracked_frames": float(tracked),
-    }
-    if ground_truth is None:
-        return counts
-    try:
-        evaluation = evaluate(trajectory, ground_truth, protocol, input_timestamps=timestamps)
-    except EvaluationError:  # too little was tracked; the coverage says so
-        return counts
-    return counts | {name: float(value) for name, value in evaluation.metrics.items() if math.isfinite(value)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -20,7 +21,6 @@ from dynslam_bench.core.settings import (
     apply_overrides,
     flatten,
     parameters,
-    value_of,
     why_unused,
 )
 from dynslam_bench.evaluation.online import OnlineSample
@@ -51,9 +51,7 @@ class ActionMap:
     def __init__(self, settings: Settings, control: Sequence[str]) -> None:
         self.base = settings
         self.parameters: tuple[Parameter, ...] = _select(settings, control)
-        for parameter in self.parameters:
-            _check_effect(settings, parameter)
-        self._values = {parameter.name: value_of(settings, parameter.name) for parameter in self.parameters}
+        self._values = {parameter.name: attrgetter(parameter.name)(settings) for parameter in self.parameters}
         self._neutral = self.encode(settings)
 
     @property
@@ -124,21 +122,18 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
                 raise SettingsError(f"setting '{name}' may not change in mid-episode", did_you_mean(name, online))
             hint = did_you_mean(name, online) or "this tracker has no online settings"
             raise SettingsError(f"unknown setting '{name}' in control", hint)
-        if online[name] in chosen:
+        parameter, value = online[name], attrgetter(name)(settings)
+        if parameter in chosen:
             raise SettingsError(f"setting '{name}' is given twice in control")
-        chosen.append(online[name])
+        if reason := why_unused(settings, name):
+            raise SettingsError(f"setting '{name}' in control has no effect: {reason}", "leave it out of control")
+        if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
+            raise SettingsError(
+                f"setting '{name}' in control is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
+                "set it within, or leave it out of control",
+            )
+        chosen.append(parameter)
     return tuple(chosen)
-
-
-def _check_effect(settings: Settings, parameter: Parameter) -> None:
-    if reason := why_unused(settings, parameter.name):
-        raise SettingsError(f"setting '{parameter.name}' in control has no effect: {reason}", "leave it out of control")
-    value = value_of(settings, parameter.name)
-    if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
-        raise SettingsError(
-            f"setting '{parameter.name}' in control is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
-            "set it within, or leave it out of control",
-        )
 
 
 def _decode(parameter: Parameter, share: float) -> Scalar:
@@ -193,14 +188,13 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
 )
 """Name and meaning of every entry of the ``stats`` observation, in order. What a tracker does not report is 0."""
 
-STATS_SIZE = len(STATS_LAYOUT)
 _SIGNED = np.array([name.startswith("motion_") for name, _ in STATS_LAYOUT])
 
 
 def stats_space() -> spaces.Box:
     """``Box`` of float32 ``[24]``: entries in [0, 1], the motion's in [-1, 1]; see `STATS_LAYOUT`."""
     low = np.where(_SIGNED, -1.0, 0.0).astype(np.float32)
-    return spaces.Box(low, np.ones(STATS_SIZE, np.float32), dtype=np.float32)
+    return spaces.Box(low, np.ones_like(low), dtype=np.float32)
 
 
 def rgbd_space(camera: Camera) -> spaces.Dict:

@@ -262,8 +262,7 @@ class Degradation:
         if self.noise:
             image = image + rng.normal(0.0, 40.0 * self.noise, image.shape).astype(np.float32)
         depth = self._noisy_depth(frame.depth, rng) if self.depth_noise else frame.depth
-        rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-        return dataclasses.replace(frame, rgb=rgb, depth=depth)
+        return dataclasses.replace(frame, rgb=np.clip(np.rint(image), 0, 255).astype(np.uint8), depth=depth)
 
     def _phase(self, name: str, count: int) -> NDArray[np.float64]:
         return stream(self.seed, "degrade", name).uniform(0.0, 2.0 * math.pi, count)
@@ -403,6 +402,5 @@ class DropFrames(SlamWrapper):
         return self._base.sequence.timestamps / self._speed
 
     def _busy_s(self) -> float:
-        if self._frame_time_s is not None:
-            return self._frame_time_s
-        return float(self._base.episode.outcomes[-1].timings["total"])
+        measured_s = self._base.episode.outcomes[-1].timings["total"]
+        return measured_s if self._frame_time_s is None else self._frame_time_s

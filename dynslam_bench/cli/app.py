@@ -24,7 +24,6 @@ from dynslam_bench.cli import (
 )
 from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START, ShortHelp
 from dynslam_bench.cli.output import download_bar, set_json_mode, write_error
-from dynslam_bench.core.download import show_downloads
 from dynslam_bench.core.errors import DynslamError
 
 INTERRUPT_CODE = 130
@@ -72,6 +71,8 @@ def _root(
     ] = None,
 ) -> None:
     """Benchmark and tune visual SLAM in dynamic scenes."""
+    from dynslam_bench.core.download import show_downloads
+
     show_downloads(download_bar)
 
 

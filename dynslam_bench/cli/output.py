@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import from_json, to_json
 
-from dynslam_bench.core.download import Report
 from dynslam_bench.core.sanitise import printable
 
 if TYPE_CHECKING:
+    from dynslam_bench.core.download import Report
     from dynslam_bench.core.errors import DynslamError
     from dynslam_bench.reports.tables.table import Table
 
@@ -151,9 +151,9 @@ def report_table(source: Table, names: Sequence[str] = (), most: int | None = No
     return table([titles[at] for at in chosen], cells)
 
 
-def wrapped(text: str, most: int = 120) -> str:
-    """Text in lines as wide as the terminal, `most` characters at most; that many where there is none."""
-    return textwrap.fill(text, min(_terminal_width(), most) if sys.stdout.isatty() else most)
+def wrapped(text: str) -> str:
+    """Text in lines as wide as the terminal, 120 characters at most; that many where there is none."""
+    return textwrap.fill(text, min(_terminal_width(), 120) if sys.stdout.isatty() else 120)
 
 
 def _terminal_width() -> int:

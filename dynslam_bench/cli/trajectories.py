@@ -131,7 +131,7 @@ def export(
         typer.Argument(
             metavar="FORMAT",
             help="tum, kitti, euroc, vslam-lab, colmap, mcap or rrd (rerun).",
-            autocompletion=names_of("runs.exchange.export:FORMATS"),
+            autocompletion=names_of("runs.exchange.transfer:FORMATS"),
         ),
     ],
     run: Annotated[str, typer.Argument(help="The run's id, its first digits, or latest.")] = "latest",

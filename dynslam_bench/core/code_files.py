@@ -117,7 +117,7 @@ def files_below(folder: Path) -> Iterator[Path]:
             continue
         if entry.is_file():
             yield entry
-        elif entry.is_dir() and not _is_left_out(entry) and not leads_back(entry):
+        elif entry.is_dir() and not _is_left_out(entry) and not _leads_back(entry):
             yield from files_below(entry)
 
 
@@ -150,7 +150,7 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
     scripts = [file for file in named if is_python(file) and not _is_of_system(file)]
     own = [file for folder in sorted({script.parent for script in scripts}) for file in program_files(folder)]
     modules = {name for script in scripts for name in foreign_modules(script)} - set(sys.stdlib_module_names)
-    own += [file for name in sorted(modules) for file in _module_files(name, base) if not _is_installed(file)]
+    own += [file for name in sorted(modules) for file in _module_files(name, base) if not is_installed(file)]
     return list(dict.fromkeys(file.resolve() for file in (*named, *own)))
 
 
@@ -167,10 +167,10 @@ def _module_files(module: str, base: Path) -> list[Path]:
     except (ImportError, ValueError):
         spec = None
     folders = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
-    return [file for place in folders if not _is_installed(place) for file in files_below(place)]
+    return [file for place in folders if not is_installed(place) for file in files_below(place)]
 
 
-def _is_installed(path: Path) -> bool:
+def is_installed(path: Path) -> bool:
     """Whether a path belongs to an installed distribution, which its version tells."""
     return any(part in ("site-packages", "dist-packages") for part in path.parts)
 
@@ -236,7 +236,7 @@ def _is_file(path: Path) -> bool:
     return os.path.isfile(path) and os.access(path, os.R_OK)  # noqa: PTH113 - it takes words that cannot be a path
 
 
-def leads_back(entry: Path) -> bool:
+def _leads_back(entry: Path) -> bool:
     """Whether a folder is a link to one that it lies in: following it would never end."""
     return entry.is_symlink() and entry.resolve() in (entry.parent.resolve() / entry.name).parents
 

@@ -1,30 +1,26 @@
-"""Resumable download of one file over HTTP, bounded in size.
-
-Nothing heavy is imported before something is downloaded.
-"""
+"""Resumable download of one file over HTTP, bounded in size."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
+import ipaddress
 import json
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from http.client import HTTPException
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+from urllib.error import HTTPError
+from urllib.parse import SplitResult, urlsplit
+from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from dynslam_bench.core.errors import DownloadError, DynslamError
 from dynslam_bench.core.files import claimed
-from dynslam_bench.core.reading import read_json
+from dynslam_bench.core.reading import file_sha256, read_json
 from dynslam_bench.core.sanitise import without_passwords
-
-if TYPE_CHECKING:
-    from urllib.parse import SplitResult
-    from urllib.request import Request
-
 
 CHUNK = 1 << 18
 MOST_BYTES = 32 * 2**30
@@ -108,7 +104,8 @@ def download(
             if not target.is_file():
                 partial.complete(attempts, wait_s)
             file = target if target.is_file() else part
-            checksum = file_sha256(file, progress)
+            report = progress
+            checksum = file_sha256(file, lambda done, total: report(Progress("check", done, total)))
             if sha256 is not None and not checksum.startswith(sha256):
                 size = file.stat().st_size
                 file.unlink()
@@ -122,18 +119,6 @@ def download(
             return checksum
     except OSError as error:
         raise DownloadError(f"cannot write {target}: {error.strerror or error}", "name another folder") from error
-
-
-def file_sha256(path: Path, progress: Report | None = None) -> str:
-    """SHA-256 of a file."""
-    total, done, value = path.stat().st_size, 0, hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            value.update(block)
-            done += len(block)
-            if progress is not None:
-                progress(Progress("check", done, total))
-    return value.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -152,9 +137,6 @@ class _Partial:
         Raises:
             DownloadError: It does not become so.
         """
-        import http.client
-        import urllib.error
-
         fruitless, best, total, reason = 0, self._size(), None, ""
         while fruitless < attempts:
             try:
@@ -163,7 +145,7 @@ class _Partial:
                     if self._receive(response, total):
                         return
                 reason = "the server closed the connection early"
-            except urllib.error.HTTPError as error:
+            except HTTPError as error:
                 if error.code == 416 and self._size():
                     if error.headers.get("Content-Range", "").rpartition("/")[2] == str(self._size()):
                         return
@@ -171,7 +153,7 @@ class _Partial:
                 reason = f"the server answers {error.code} {error.reason}"
                 if error.code < 500 and error.code not in (408, 416, 429):
                     raise DownloadError(f"{reason} for {self.url}") from error
-            except (OSError, http.client.HTTPException, ValueError) as error:  # no route, time-out, TLS, odd redirect
+            except (OSError, HTTPException, ValueError) as error:  # no route, time-out, TLS, odd redirect
                 reason = str(getattr(error, "reason", "") or error) or type(error).__name__
             fruitless = 0 if self._size() > best else fruitless + 1
             best = max(best, self._size())
@@ -187,8 +169,6 @@ class _Partial:
 
     def _connect(self) -> Any:
         """Ask for what is missing, if the server still has the version that the file was begun with."""
-        from urllib.request import Request
-
         try:
             notes = dict(read_json(self._notes))
         except (DynslamError, TypeError, ValueError):
@@ -227,24 +207,15 @@ class _Partial:
 
     def _receive(self, response: Any, total: int | None) -> bool:
         """Append the body to the file; True if it came to its announced end."""
-        from http.client import IncompleteRead
-
         done = self._size()
         try:
-            with self.part.open("r+b" if done else "wb") as file:
-                file.seek(done)
-                while True:
-                    try:
-                        block = response.read1(CHUNK)
-                    except IncompleteRead as error:
-                        file.write(error.partial)
-                        return False
-                    if not block:
-                        return total is None or done == total
+            with self.part.open("ab") as file:
+                while block := response.read1(CHUNK):
                     done += len(block)
                     self._check(done)
                     file.write(block)
                     self.report(Progress("download", done, total))
+            return total is None or done == total
         except OSError as error:
             if error.errno not in _DISK_ERRORS:
                 raise
@@ -278,8 +249,6 @@ def check_address(url: str, *, checked: bool) -> SplitResult:
     Raises:
         DownloadError: Another scheme, no host, characters that no address has, or a password.
     """
-    from urllib.parse import urlsplit
-
     shown = f"cannot download {url[:200]!r}"
     try:
         parts = urlsplit(url)
@@ -304,25 +273,19 @@ def connect(request: Request, timeout_s: float) -> Any:
         DownloadError: The server redirects to another scheme.
         OSError: It cannot be reached, or answers with an error.
     """
-    import urllib.request
+    return build_opener(_Redirect).open(request, timeout=timeout_s)
 
-    class Redirect(urllib.request.HTTPRedirectHandler):
-        """Follows redirects to https, and from http to http."""
 
-        def redirect_request(self, req: Request, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
-            scheme = newurl.partition(":")[0].lower()
-            if scheme not in ("https", req.type):
-                raise DownloadError(
-                    f"the server redirects {req.full_url} to {newurl[:200]!r}, refused", "name a mirror"
-                )
-            return super().redirect_request(req, fp, code, msg, headers, newurl)
+class _Redirect(HTTPRedirectHandler):
+    """Follows redirects to https, and from http to http."""
 
-    return urllib.request.build_opener(Redirect).open(request, timeout=timeout_s)
+    def redirect_request(self, req: Request, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
+        if newurl.partition(":")[0].lower() not in ("https", req.type):
+            raise DownloadError(f"the server redirects {req.full_url} to {newurl[:200]!r}, refused", "name a mirror")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
 def _is_loopback(host: str) -> bool:
-    import ipaddress
-
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -25,10 +25,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dynslam_bench
-from dynslam_bench.core.code_files import files_below, foreign_modules, imported_modules, is_code, program_files
+from dynslam_bench.core.code_files import (
+    files_below,
+    foreign_modules,
+    imported_modules,
+    is_code,
+    is_installed,
+    program_files,
+)
 from dynslam_bench.core.errors import DynslamError, PluginError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
+from dynslam_bench.core.reading import file_sha256
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.core.version import release
@@ -147,7 +155,7 @@ def _dependencies(modules: set[str]) -> dict[str, str]:
             places = _folders_of(top)
         except (PluginError, ImportError, ValueError):
             continue
-        if any(part in ("site-packages", "dist-packages") for part in places[0].parts):
+        if is_installed(places[0]):
             digests[top] = distribution_of_module(top)[1]
         else:
             digests[top] = digest([_whole(place) for place in places])
@@ -161,9 +169,7 @@ def distribution_of_module(module: str) -> tuple[str, str]:
     return (names[0], distribution_version(names[0])) if names else ("", "")
 
 
-@cache
-def _distributions() -> Mapping[str, Sequence[str]]:
-    return importlib.metadata.packages_distributions()
+_distributions = cache(importlib.metadata.packages_distributions)
 
 
 @cache
@@ -235,9 +241,8 @@ def content_digest(*arrays: NDArray[Any]) -> str:
 
 # -- file contents, whose digests are remembered while the files are unchanged ----------------------------------------
 
-_BLOCK = 1 << 20
 _SETTLED_NS = 2_000_000_000
-_MEMORY: dict[str, str] = {}
+"""Digests of files that are younger are not stored: a change within the same tick of the clock would not show."""
 
 
 def contents_digest(files: Iterable[Path], root: Path | None = None, *, syntax: bool = True) -> str:
@@ -258,7 +263,7 @@ def contents_digest(files: Iterable[Path], root: Path | None = None, *, syntax: 
         for file in ordered:
             name = "" if root is None else f"{file.relative_to(root).as_posix()}\0"
             is_source = syntax and file.suffix == ".py"
-            content = syntax_digest(file.read_bytes()) if is_source else _sha256(file)
+            content = syntax_digest(file.read_bytes()) if is_source else file_sha256(file)
             whole.update(f"{name}{content}\n".encode(errors="surrogateescape"))
         return whole.hexdigest()
 
@@ -272,7 +277,7 @@ def path_digest(path: Path) -> str:
         OSError: Something cannot be read.
     """
     if path.is_file():
-        return _remembered("file", [path], lambda: _sha256(path))
+        return _remembered("file", [path], lambda: file_sha256(path))
     return contents_digest((file for file in path.rglob("*") if file.is_file()), path, syntax=False)
 
 
@@ -310,40 +315,19 @@ def _is_docstring(node: Any) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _sha256(path: Path) -> str:
-    whole = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            whole.update(block)
-    return whole.hexdigest()
-
-
 def _remembered(kind: str, files: list[Path], compute: Callable[[], str]) -> str:
     state, newest = _files_state(files)
     key = hashlib.sha256(f"{kind}\0{state}".encode()).hexdigest()
-    if key in _MEMORY:
-        return _MEMORY[key]
     entry = digest_cache_folder() / key[:40]
     with contextlib.suppress(OSError):
         stored = entry.read_text(encoding="ascii", errors="replace")
         if len(stored) == 64:
-            _MEMORY[key] = stored
             return stored
     value = compute()
-    if is_settled(newest):
-        _MEMORY[key] = value
+    if time.time_ns() - newest > _SETTLED_NS:
         with contextlib.suppress(DynslamError):  # a cache that cannot be written costs time only
             write_atomic(entry, value)
     return value
-
-
-def is_settled(newest_ns: int | None) -> bool:
-    """Whether files whose newest time is this may be remembered: a change within the same tick would not show.
-
-    Args:
-        newest_ns: Time in nanoseconds since 1970; None without a file.
-    """
-    return newest_ns is not None and time.time_ns() - newest_ns > _SETTLED_NS
 
 
 def _files_state(files: Iterable[Path]) -> tuple[str, int]:
@@ -415,13 +399,8 @@ def this_machine() -> Machine:
 def versions() -> dict[str, str]:
     """Versions of Python, of this package and of those that a result depends on; missing ones are left out."""
     environment = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
-    for name in PACKAGES:
-        installed = distribution_version(name)
-        if installed:
-            environment[name] = installed
-    if opencv_version():
-        environment["opencv"] = opencv_version()
-    return environment
+    environment |= {name: distribution_version(name) for name in PACKAGES} | {"opencv": opencv_version()}
+    return {name: number for name, number in environment.items() if number}
 
 
 @cache

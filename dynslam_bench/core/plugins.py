@@ -101,7 +101,11 @@ class Registry(Generic[P]):
         if name in plugins:
             return plugins[name].spec
         if ":" in name:
-            return self._not_built_in(self._check(load_object(name), name), name)
+            spec = self._check(load_object(name), name)
+            registered = plugins.get(spec.id)  # under a built-in id tables could not tell them apart
+            if registered is not None and registered.source == "built in" and registered.spec != spec:
+                raise PluginError(f"{name} has the id '{spec.id}', which is built in", "give the plug-in another id")
+            return spec
         broken = [failure for failure in self._failures if name in failure.source]
         hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, plugins)
         raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
@@ -134,13 +138,6 @@ class Registry(Generic[P]):
             self._failures.append(Failure(source, _reason(error)))
         else:
             self._found[spec.id] = Found(spec, source)
-
-    def _not_built_in(self, spec: P, source: str) -> P:
-        """Refuse a plug-in under the id of a built-in one: tables could not tell them apart."""
-        registered = self._discover().get(spec.id)
-        if registered is not None and registered.source == "built in" and registered.spec != spec:
-            raise PluginError(f"{source} has the id '{spec.id}', which is built in", "give the plug-in another id")
-        return spec
 
     def _check(self, value: object, source: str) -> P:
         if isinstance(value, self._spec_type):

@@ -6,9 +6,10 @@ are not UTF-8, nested too deeply, too long or not readable.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -136,6 +137,21 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise kind(f"{path} holds something else than arrays")
     return arrays
+
+
+def file_sha256(path: Path, progress: Callable[[int, int], object] = lambda done, total: None) -> str:
+    """SHA-256 of a file; `progress` is called with the bytes done and their total.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        total = path.stat().st_size
+        while block := file.read(MEGABYTE):
+            digest.update(block)
+            progress(file.tell(), total)
+    return digest.hexdigest()
 
 
 def _reason(error: OSError | ValueError) -> str:

@@ -19,9 +19,10 @@ import json
 import os
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
@@ -45,8 +46,13 @@ class Settings(BaseModel):
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Refuse a class with a default that lies outside its own range: studies and actions could not name it."""
         for name, field, default in _leaves(cls):
-            if _annotation(field) is not None:
-                _check_default(cls, _describe(name, field, default))
+            if _annotation(field) is None:
+                continue
+            p = _describe(name, field, default)
+            if p.low is not None and p.high is not None and default is not None and not p.low <= default <= p.high:
+                raise TypeError(
+                    f"{cls.__name__}: the default of '{name}' is {default!r}, outside its range {p.low:g} to {p.high:g}"
+                )
 
     @property
     def unused(self) -> Mapping[str, str]:
@@ -96,7 +102,6 @@ def tunable(
     limits: tuple[float | None, float | None] | None = None,
     unit: str = "",
     online: bool = False,
-    choices: Sequence[Scalar] | None = None,
 ) -> Any:
     """A field that studies may tune.
 
@@ -109,18 +114,10 @@ def tunable(
         limits: What validation accepts, where that is wider than the search range; None leaves an end open.
         unit: Physical unit, e.g. ``px``.
         online: True if the field may change in mid-episode.
-        choices: The values that studies try, for fields that accept more than these (e.g. free text).
     """
     if scale == "log" and (low is None or low <= 0):
         raise ValueError(f"a log scale needs low > 0, got {low=}")
-    annotation: dict[str, Any] = {
-        "low": low,
-        "high": high,
-        "scale": scale,
-        "unit": unit,
-        "online": online,
-        "choices": list(choices or ()),
-    }
+    annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online}
     least, most = (low, high) if limits is None else limits
     return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most)
 
@@ -147,7 +144,7 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
     for name, field, _ in _leaves(type(settings)):
         extra = field.json_schema_extra
         note = extra.get(_NAMES) if isinstance(extra, dict) else None
-        value = value_of(settings, name)
+        value = attrgetter(name)(settings)
         if isinstance(note, dict):
             value = value or os.environ.get(str(note["otherwise"]), "")
             differences[name] = (str(note["kind"]), str(value))
@@ -211,7 +208,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
 
 def flatten(settings: Settings) -> dict[str, Any]:
     """Dotted name to value of every leaf field."""
-    return {name: value_of(settings, name) for name in field_names(type(settings))}
+    return {name: attrgetter(name)(settings) for name in field_names(type(settings))}
 
 
 def field_names(cls: type[Settings]) -> list[str]:
@@ -270,21 +267,11 @@ def _default(field: FieldInfo) -> Any:
     return field.default if isinstance(field.default, Settings) else field.get_default(call_default_factory=True)
 
 
-def _check_default(cls: type[Settings], p: Parameter) -> None:
-    """Numbers only: pydantic holds the defaults of the others to their types."""
-    if p.low is None or p.high is None or p.default is None:
-        return
-    if not p.low <= float(p.default) <= p.high:
-        raise TypeError(
-            f"{cls.__name__}: the default of '{p.name}' is {p.default!r}, outside its range {p.low:g} to {p.high:g}"
-        )
-
-
 def _nested(field: FieldInfo) -> type[Settings] | None:
-    annotation = field.annotation
-    if typing.get_origin(annotation) is not None:  # tuple[float, ...], which Python 3.10 takes for a class
-        return None
-    return annotation if isinstance(annotation, type) and issubclass(annotation, Settings) else None
+    kind = field.annotation
+    if typing.get_origin(kind) is None and isinstance(kind, type) and issubclass(kind, Settings):
+        return kind  # Python 3.10 takes tuple[float, ...] for a class, too
+    return None
 
 
 def _annotation(field: FieldInfo) -> dict[str, Any] | None:
@@ -295,39 +282,19 @@ def _annotation(field: FieldInfo) -> dict[str, Any] | None:
 def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
     note = _annotation(field)
     assert note is not None
-    common: dict[str, Any] = {
-        "name": name,
-        "default": default,
-        "unit": note["unit"],
-        "online": note["online"],
-        "meaning": field.description or "",
-    }
     kinds = [kind for kind in _alternatives(field.annotation) if kind is not type(None)]
     base = kinds[0] if len(kinds) == 1 else field.annotation
-    if note["choices"]:
-        return Parameter(kind="categorical", choices=tuple(note["choices"]), **common)
-    if base is bool:
-        return Parameter(kind="bool", choices=(False, True), **common)
-    if typing.get_origin(base) is Literal:
-        return Parameter(kind="categorical", choices=typing.get_args(base), **common)
-    if base not in (int, float) or note["low"] is None or note["high"] is None:
+    choices = (False, True) if base is bool else typing.get_args(base) if typing.get_origin(base) is Literal else ()
+    if not choices and (base not in (int, float) or note["low"] is None or note["high"] is None):
         raise TypeError(f"tunable field '{name}' of type {base} needs low and high, or a bool or Literal type")
-    kind: Literal["int", "float"] = "int" if base is int else "float"
-    return Parameter(kind=kind, low=note["low"], high=note["high"], scale=note["scale"], **common)
+    kind: Any = base.__name__ if base in (bool, int, float) else "categorical"
+    return Parameter(name, kind, default, choices=choices, meaning=field.description or "", **note)
 
 
 def _alternatives(annotation: Any) -> tuple[Any, ...]:
     """The types that a union allows; another type alone."""
     is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     return typing.get_args(annotation) if is_union else (annotation,)
-
-
-def value_of(settings: Settings, name: str) -> Any:
-    """The value of a field by its dotted name."""
-    node: Any = settings
-    for key in name.split("."):
-        node = getattr(node, key)
-    return node
 
 
 def _parse(value: Any, annotation: Any) -> Any:

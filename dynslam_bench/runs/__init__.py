@@ -10,11 +10,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dynslam_bench.runs.exchange.export import Exported, export_run
     from dynslam_bench.runs.exchange.formats import read_trajectory
+    from dynslam_bench.runs.exchange.transfer import Exported, export_run, import_trajectory
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
-    from dynslam_bench.runs.imported import import_trajectory
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
     from dynslam_bench.runs.running import RunEvent, run_many, run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
@@ -22,10 +21,10 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "DEFAULT_PROTOCOL": "store",
-    "export_run": "exchange.export",
-    "Exported": "exchange.export",
+    "export_run": "exchange.transfer",
+    "Exported": "exchange.transfer",
     "FAILED": "record",
-    "import_trajectory": "imported",
+    "import_trajectory": "exchange.transfer",
     "Limits": "spec",
     "load_frames": "frames",
     "MetricRecord": "record",

@@ -23,7 +23,7 @@ from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_pl
 from dynslam_bench.slam.run_figure import write_run_figure
 
 if TYPE_CHECKING:
-    from dynslam_bench.envs.episode import FrameOutcome
+    from dynslam_bench.envs.slam_env import FrameOutcome
 
 
 SNAPSHOTS_FILE = "snapshots.npz"
@@ -244,9 +244,8 @@ class SheetWriter:
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
         truth, ate_m = aligned_truth(sequence.ground_truth, track)
-        input_image = sequence[0].rgb
         write_run_figure(
-            self._path, title, input_image, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES
+            self._path, title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES
         )
 
 
@@ -309,5 +308,4 @@ def aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajecto
     move = np.eye(4)
     move[:3, :3], move[:3, 3] = fit.rotation, fit.translation
     moved = Trajectory(track.timestamps[rows], se3.inverse(move) @ true)
-    left = moved.positions - track.positions[rows]
-    return moved, float(np.sqrt(np.square(left).sum(axis=1).mean()))
+    return moved, float(np.sqrt(np.square(moved.positions - track.positions[rows]).sum(axis=1).mean()))

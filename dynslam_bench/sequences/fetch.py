@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from dynslam_bench.core.download import MOST_BYTES, Report, download, file_sha256
+from dynslam_bench.core.download import MOST_BYTES, Report, download
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.reading import read_lines, read_text
+from dynslam_bench.core.reading import file_sha256, read_lines, read_text
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.core.sanitise import inside, is_inside, without_passwords
 from dynslam_bench.sequences.archives import DISK_FULL, extract

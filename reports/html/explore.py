@@ -32,7 +32,7 @@ from dynslam_bench.reports.model.load import JOB, run_jobs
 from dynslam_bench.reports.model.row import SEEN, RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.tables.leaderboard import DOUBT, middle, rank_cell, timed
 from dynslam_bench.runs.artifacts import Snapshot, read_snapshots, spread
-from dynslam_bench.runs.exchange.export import open_stored
+from dynslam_bench.runs.exchange.transfer import open_stored
 from dynslam_bench.runs.frames import CSV_FILE
 from dynslam_bench.runs.record import RunRecord
 

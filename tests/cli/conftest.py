@@ -1,13 +1,8 @@
 """The program as the tests of the command line call it, and a small sequence for it."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "envs"))
-
 from envs_toys import write_sequence
 
 from dynslam_bench.cli import output

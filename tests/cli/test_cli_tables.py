@@ -60,12 +60,6 @@ def test_report_prints_five_lines_and_its_place(cli, walk, tmp_path):
     assert code == 0 and "\\_" not in out and "| tracker" not in out and "all 1 sequences" in out
 
 
-def test_help_is_grouped(cli):
-    out = cli("--help")[1]
-    places = [out.index(title) for title in ("Begin here", "Run and measure", "Report and tune", "Extend and care")]
-    assert places == sorted(places) and "─ Commands" not in out
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

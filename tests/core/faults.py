@@ -14,7 +14,8 @@ import shutil
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,12 +98,10 @@ class Survey:
     Attributes:
         operations: Of the undisturbed work.
         ends: How often the disturbed work ended how, by fault and exit code.
-        faults: How many were tried.
     """
 
     operations: int = 0
-    ends: dict[tuple[str, int], int] = field(default_factory=dict)
-    faults: int = 0
+    ends: Counter[tuple[str, int]] = field(default_factory=Counter)
 
 
 def survey(
@@ -140,8 +139,7 @@ def survey(
         for at in range(1, found.operations + 1, every):
             _fresh(root, begin)
             code, _ = in_fork(work, Injector(root, at, fault))
-            found.faults += 1
-            found.ends[fault, code] = found.ends.get((fault, code), 0) + 1
+            found.ends[fault, code] += 1
             where = f"{fault} at operation {at} of {found.operations}"
             assert code in ((-signal.SIGKILL, DONE) if fault == "kill" else (DONE, TOLD)), f"{where}: {code}"
             if fault == "gone":
@@ -180,16 +178,9 @@ def in_fork(work: Callable[[], None], injector: Injector) -> tuple[int, int]:
 
 def tree(root: Path) -> dict[str, bytes | str]:
     """Everything below a folder: files by their content, links by their target."""
-    return dict(_entries(root))
-
-
-def _entries(root: Path) -> Iterator[tuple[str, bytes | str]]:
-    for path in sorted(root.rglob("*")):
-        name = str(path.relative_to(root))
-        if path.is_symlink():
-            yield name, str(path.readlink())
-        elif path.is_file():
-            yield name, path.read_bytes()
+    paths = [path for path in sorted(root.rglob("*")) if path.is_symlink() or path.is_file()]
+    contents = [str(path.readlink()) if path.is_symlink() else path.read_bytes() for path in paths]
+    return {str(path.relative_to(root)): content for path, content in zip(paths, contents, strict=True)}
 
 
 def _fresh(root: Path, begin: Callable[[], None]) -> None:

@@ -75,8 +75,3 @@ def test_a_checkout_that_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(metadata, "version", missing)
     assert (dynslam_bench.__version__, versions.release()) == ("0+unknown", "0.0.0")
-
-
-def test_other_names_of_the_package_are_missing_as_ever() -> None:
-    with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
-        dynslam_bench.nonsense  # noqa: B018

@@ -40,17 +40,6 @@ def fake_distribution(folder, group, targets, name="fake-dist"):
     (info / "entry_points.txt").write_text(f"[{group}]\n{lines}")
 
 
-def test_built_in_are_found_and_sorted():
-    assert [found.spec.id for found in registry().all()] == ["built-in", "never-move"]
-    assert registry().get("never-move") == Spec("never-move")
-    assert {found.source for found in registry().all()} == {"built in"}
-
-
-def test_unknown_id_has_a_did_you_mean():
-    with pytest.raises(PluginError, match=r"unknown tracker 'never-mov' \(did you mean 'never-move'\?\)"):
-        registry().get("never-mov")
-
-
 def test_file_and_module_targets(tmp_path, monkeypatch):
     file = tmp_path / "my_tracker.py"
     file.write_text(SPEC_SOURCE.format(id="mine"))

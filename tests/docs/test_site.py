@@ -13,9 +13,6 @@ import pytest
 from documented_names import ROOT
 
 pytest.importorskip("mkdocstrings", reason="the extra [docs] is not installed")
-sys.path.append(str(ROOT / "tests" / "reports"))
-from reports_browser import Browser, needs_browser
-
 LOADING = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
 
 
@@ -93,24 +90,3 @@ def test_every_door_setting_command_and_tracker_is_on_a_page(site: Path, pages: 
     assert len(leaves) > 100 and [name for name in leaves if f"<code>{name}</code>" not in settings] == []
     commands = pages[site / "reference" / "commands.html"].anchors
     assert {"dynslam-bench-demo", "dynslam-bench-tune-run", "dynslam-bench-report"} <= commands
-
-
-@needs_browser
-def test_a_page_opens_from_its_folder_fetches_nothing_and_can_be_searched(
-    site: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    browser = Browser(tmp_path_factory.mktemp("browser"))
-    try:
-        for page in ("index.html", "start/tracker.html", "reference/contracts.html"):
-            for width in (1400, 360):
-                browser.open(site / page, width=width)
-                fetched = {urlsplit(address).scheme for address in browser.fetched}
-                assert fetched <= {"file", "data", "blob"} and "file" in fetched and browser.faults == [], page
-                assert browser.run("document.documentElement.scrollWidth <= innerWidth"), f"{page} at {width}"
-        browser.size(1400)
-        browser.run("one('.md-search__input').focus()")
-        browser.run("(q => { q.value = 'moth flame'; q.dispatchEvent(new Event('keyup')) })(one('.md-search__input'))")
-        browser.until("all('.md-search-result__item').length > 2", tries=200)
-        assert browser.faults == []
-    finally:
-        browser.close()

@@ -116,15 +116,6 @@ def test_an_action_is_in_force_from_its_frame_on_and_reset_undoes_it() -> None:
     assert first.tobytes() == fresh.tobytes()
 
 
-def test_the_neutral_action_changes_nothing() -> None:
-    plain, steered = SlamEnv(ToySequence(8), TARGET), SlamEnv(ToySequence(8), TARGET, control=["noise.passes"])
-    for env in (plain, steered):
-        env.reset(seed=3)
-        for _ in range(7):
-            env.step(env.neutral_action)
-    assert plain.online_trajectory().T_world_cam.tobytes() == steered.online_trajectory().T_world_cam.tobytes()
-
-
 @pytest.mark.parametrize(
     ("control", "action"),
     [((), action) for action in ("x", None, 1, -1, 0.0, [0], np.array([0]), {})]

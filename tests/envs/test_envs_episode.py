@@ -31,13 +31,6 @@ def play(env: SlamEnv, seed: int = 0) -> tuple[list[float], list[dict], list[tup
     return rewards, infos, ends
 
 
-def test_an_episode_has_one_step_less_than_frames_and_is_truncated() -> None:
-    rewards, infos, ends = play(SlamEnv(ToySequence(12), TARGET))
-    assert len(rewards) == 11
-    assert [info["frame_index"] for info in infos] == list(range(12))
-    assert ends[:-1] == [(False, False)] * 10 and ends[-1] == (False, True)
-
-
 @pytest.mark.parametrize(
     ("reward", "error"), [("neg_rpe", "frame_error_trans_m"), ("neg_pose_error", "pose_error_trans_m")]
 )
@@ -66,13 +59,6 @@ def test_lost_frames_cost_twice_the_way_and_the_way_back_nothing() -> None:
     assert [info["tracking_state"] for info in infos[4:7]] == ["lost"] * 3
     assert all("pose" not in info for info in infos[4:7])
     assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(9 / 12)
-
-
-def test_losing_track_costs_the_way_so_far() -> None:
-    env = SlamEnv(ToySequence(12), TARGET, settings=QUIET | {"mode": "lost"}, reward="neg_pose_error")
-    rewards, _, _ = play(env)
-    way = np.cumsum(np.linalg.norm(np.diff(truth(12)[:, :3, 3], axis=0), axis=1))
-    assert np.allclose(rewards[3:], -way[3:], atol=1e-9)
 
 
 @pytest.mark.parametrize("reward", ["neg_rpe", "neg_pose_error"])
@@ -155,6 +141,7 @@ def test_frames_and_stride_cut_the_sequence(toy_folder: str) -> None:
         ("nan", r"frame 4 returned a pose with 16 values that are not finite"),
         ("scaled", r"frame 4 returned a pose that is no rigid transformation: .* det R = 8"),
         ("mirrored", r"frame 4 returned a pose that is no rigid transformation: .* det R = -1"),
+        ("far", r"frame 4 returned a pose 1e\+200 m away"),
         ("none", r"frame 4 returned state 'ok' without a pose"),
         ("string", r"frame 4 returned a str"),
     ],
@@ -302,25 +289,11 @@ def _only_localising(settings: Any) -> Any:
     return settings.model_copy(update={"backend": backend})
 
 
-@pytest.mark.parametrize("stamps", [[0.0, 0.1, 0.1, 0.2], [0.0, 0.2, 0.1, 0.3], [0.0, 0.1, np.nan, 0.3]])
+@pytest.mark.parametrize(
+    "stamps", [[0.0, 0.1, 0.1, 0.2], [0.0, 0.2, 0.1, 0.3], [0.0, 0.1, np.nan, 0.3], [0.0, 0.1, 0.1 + 2e-7, 0.2]]
+)
 def test_stamps_that_do_not_tell_frames_apart_are_refused_before_anything_runs(stamps: list[float]) -> None:
     sequence = ToySequence(4)
     sequence.timestamps = np.array(stamps)
-    with pytest.raises(SequenceError, match="stamps"):
+    with pytest.raises(SequenceError, match=r"stamps|ns apart"):
         SlamEnv(sequence, TARGET)
-
-
-def test_poses_out_of_this_world_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = ToyTracker.track
-
-    def far(self: ToyTracker, frame: Any) -> Any:
-        found = whole(self, frame)
-        found.T_world_cam[:3, 3] *= 1e200 if frame.index == 5 else 1.0
-        return found
-
-    monkeypatch.setattr(ToyTracker, "track", far)
-    env = SlamEnv(ToySequence(12), replace(SPEC, entry_point="envs_toys:ToyTracker"))
-    env.reset(seed=0)
-    with pytest.raises(TrackerContractError, match=r"frame 5 returned a pose 4\.99e"):
-        for _ in range(11):
-            env.step(env.neutral_action)

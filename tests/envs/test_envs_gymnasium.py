@@ -82,22 +82,6 @@ def test_pickle_gives_an_equal_environment(toy_folder: str) -> None:
     assert rollout(duplicate, 10, 2) == rollout(env, 10, 2)
 
 
-def test_record_video(toy_folder: str, tmp_path) -> None:
-    pytest.importorskip("moviepy")
-    env = gym.make(GENERIC_ID, sequence=toy_folder, tracker=TARGET, frames=[0, 8], render_mode="rgb_array")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the folder exists
-        env = gym.wrappers.RecordVideo(env, str(tmp_path), episode_trigger=lambda _: True)
-    env.reset(seed=0)
-    over = False
-    while not over:
-        _, _, terminated, truncated, _ = env.step(0)
-        over = terminated or truncated
-    env.close()
-    videos = list(tmp_path.glob("*.mp4"))
-    assert len(videos) == 1 and videos[0].stat().st_size > 1000
-
-
 def test_async_vector_env(toy_folder: str) -> None:
     kwargs = {"sequence": toy_folder, "tracker": TARGET, "frames": [0, 6]}
     makers = [lambda: gym.make("dynslam_bench.envs:dynslam/Sequence-v0", **kwargs) for _ in range(2)]

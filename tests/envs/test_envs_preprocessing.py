@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from dynslam_bench.envs import SlamEnv
-from dynslam_bench.runs import RunSpec, resolve
 
 SEQUENCE = "synthetic/sitting_xyz?frames=4"
 HALF = {"preprocessing.width": 320, "preprocessing.height": 240}
@@ -25,9 +24,3 @@ def test_a_reset_may_change_it() -> None:
     env.reset(seed=0, options={"settings": {"preprocessing.normalisation": "equalise"}})
     changed = env.sequence[1].rgb
     assert changed.shape == plain.shape and np.abs(changed.astype(int) - plain).mean() > 2
-
-
-def test_it_is_part_of_a_run_s_identity() -> None:
-    plain = resolve(RunSpec(tracker="orb-slam2", sequence=SEQUENCE))
-    half = resolve(RunSpec(tracker="orb-slam2", sequence=SEQUENCE, settings=HALF))
-    assert plain.run_id != half.run_id and half.sequence.camera.width == 320

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -50,41 +51,40 @@ class Hostile:
             file.writelines(f"{pid}\n" for pid in pids)
 
     def act(self, mode: str) -> None:
-        if mode == "sys.exit":
-            sys.exit(0)
-        if mode == "os._exit":
-            os._exit(0)
-        if mode == "hang":
-            while True:
-                pass
-        if mode == "segfault":
-            os.kill(os.getpid(), signal.SIGSEGV)
-        if mode == "deaf":
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
-            time.sleep(300)
-        if mode == "raise":
-            raise ValueError("too few\npoints")
-        if mode == "full":
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        if mode == "gone":
-            shutil.rmtree(self.settings.pids)
-            raise ValueError("no folder")
-        if mode == "children":
-            self.leave_children()
-        if mode == "flood":
-            print("the first line")
-            for _ in range(300):
-                os.write(1, b"the same line over and over\n" * 2000)
-            print("the last line")
-        if mode == "shared":
-            self.share()
-        if mode == "hog-child":
-            self.note(subprocess.Popen([sys.executable, "-S", "-c", HOG]).pid)
-            time.sleep(300)
-        if mode == "thread":
-            import threading
-
-            threading.Thread(target=time.sleep, args=(300,)).start()
+        match mode:
+            case "sys.exit":
+                sys.exit(0)
+            case "os._exit":
+                os._exit(0)
+            case "hang":
+                while True:
+                    pass
+            case "segfault":
+                os.kill(os.getpid(), signal.SIGSEGV)
+            case "deaf":
+                signal.signal(signal.SIGTERM, signal.SIG_IGN)
+                time.sleep(300)
+            case "raise":
+                raise ValueError("too few\npoints")
+            case "full":
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            case "gone":
+                shutil.rmtree(self.settings.pids)
+                raise ValueError("no folder")
+            case "children":
+                self.leave_children()
+            case "flood":
+                print("the first line")
+                for _ in range(300):
+                    os.write(1, b"the same line over and over\n" * 2000)
+                print("the last line")
+            case "shared":
+                self.share()
+            case "hog-child":
+                self.note(subprocess.Popen([sys.executable, "-S", "-c", HOG]).pid)
+                time.sleep(300)
+            case "thread":
+                threading.Thread(target=time.sleep, args=(300,)).start()
 
     def leave_children(self) -> None:
         """One in its own process group, one in a session of its own, one whose parent is gone (a daemon)."""

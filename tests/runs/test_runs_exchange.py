@@ -23,9 +23,9 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
 from dynslam_bench.runs import RunRecord, RunSpec, RunStore, export_run, import_trajectory, read_trajectory, run_one
 from dynslam_bench.runs.artifacts import read_snapshots
-from dynslam_bench.runs.exchange.export import Provenance, stated_provenance
 from dynslam_bench.runs.exchange.formats import read_colmap, write_colmap
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, check_rerun, write_recording
+from dynslam_bench.runs.exchange.transfer import Provenance, stated_provenance
 from dynslam_bench.slam.map_files import read_ply, write_ply
 
 TOLERANCE = 1e-6

@@ -8,8 +8,8 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Pipe
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from dynslam_bench.core.errors import InfrastructureError
 from dynslam_bench.core.files import SHARED_MEMORY
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one
 from dynslam_bench.runs.process import supervisor as memory_module
-from dynslam_bench.runs.process.fork_server import SERVERS, Child, make_job
+from dynslam_bench.runs.process.fork_server import SERVERS
 from dynslam_bench.runs.process.supervisor import supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
@@ -140,8 +140,6 @@ def test_the_parent_ends_and_all_end_with_it(toy_folder: str, tmp_path: Path, st
     assert list(store.runs.iterdir()) == []
 
 
-linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
-
 STRAYS = """
 import json, os, signal, subprocess, sys, time
 DEAF = "import signal, time; [signal.signal(s, signal.SIG_IGN) for s in (1, 2, 15)]; time.sleep(300)"
@@ -183,34 +181,19 @@ def started(pids: Path, count: int) -> list[int]:
     return [int(line) for line in pids.read_text().split()]
 
 
-def in_background(spec: RunSpec, store: RunStore) -> tuple[threading.Thread, list[BaseException]]:
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            run_one(spec, store)
-        except BaseException as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    return thread, errors
-
-
 @linux
 def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store: RunStore) -> None:
     """It is started again once; killed again, the run is given up, and nothing of it is stored or left."""
     spec, pids = strays
-    thread, errors = in_background(spec, store)
-    seen = []
-    for turn in (1, 2):
-        seen = started(pids, 4 * turn)
-        time.sleep(1.0)  # until the supervisor has seen them
-        os.kill(SERVERS["fork"]._process.pid, signal.SIGKILL)  # nothing else knows its number
-        until(lambda: alive(seen) == [], 20)  # noqa: B023
-    thread.join()
-    assert len(errors) == 1 and isinstance(errors[0], InfrastructureError)
-    assert "the fork server was ended from outside" in str(errors[0]) and "is not stored" in str(errors[0])
+    with ThreadPoolExecutor(1) as pool:
+        run = pool.submit(run_one, spec, store)
+        for turn in (1, 2):
+            seen = started(pids, 4 * turn)
+            time.sleep(1.0)  # until the supervisor has seen them
+            os.kill(SERVERS["fork"]._process.pid, signal.SIGKILL)  # nothing else knows its number
+            until(lambda: alive(seen) == [], 20)  # noqa: B023
+        with pytest.raises(InfrastructureError, match=r"the fork server was ended from outside.*is not stored"):
+            run.result()
     assert len(seen) == 8 and store.ids() == [] and list(store.runs.iterdir()) == []
 
 
@@ -287,27 +270,13 @@ def test_the_time_limit_begins_when_the_run_does(tmp_path: Path) -> None:
 def test_several_on_one_folder_share_the_work(store: RunStore, toy_folder: str) -> None:
     specs = [RunSpec(tracker="never-move", sequence=toy_folder, frames=(0, 4), stride=s) for s in (1, 2, 3)]
     made: list[str] = []
-    records: list[list] = []
 
-    def bench() -> None:
+    def bench(_: int) -> list[RunRecord]:
         events = {"on_event": lambda event: made.append(event.run_id) if event.kind == "finished" else None}
-        records.append(run_many(specs, results=RunStore(store.root), **events))
+        return run_many(specs, results=RunStore(store.root), **events)
 
-    threads = [threading.Thread(target=bench) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(3) as pool:
+        first, second, third = pool.map(bench, range(3))
     assert len(made) == len(set(made)) == 3
-    assert len(records) == 3 and records[0] == records[1] == records[2]
+    assert first == second == third
     assert not list(store.runs.glob(".*"))
-
-
-@linux
-def test_a_forked_run_finds_imported_what_every_run_needs(tmp_path: Path) -> None:
-    """The loop and the specs of all systems took 0.3 s of every run."""
-    text = "import sys\nfound = sorted(sys.modules)\ndef tell(*_):\n    return {'type': 'done', 'found': found}\n"
-    (tmp_path / "asks.py").write_text(text)
-    job = make_job(f"{tmp_path / 'asks.py'}:tell", tmp_path, spec={"threads": 1})
-    found = supervise(Child(), job, Limits()).final["found"]
-    assert {"torch", "dynslam_bench.runs.loop", "dynslam_bench.trackers.systems.yolo_slam"} <= set(found)

@@ -95,13 +95,17 @@ def test_one_content_has_one_identity_wherever_it_lies(tmp_path: Path) -> None:
 
 def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
     folder = tmp_path / "plugin"
-    write(folder / "mine.py", PLUGIN)
-    write(folder / "helper.py", "def make(text):\n    return 1  # a note\n")
-    write(folder / "params" / "slam.yaml", "threshold: 1\nweights: net.bin\n")
-    write(folder / "params" / "net.bin", "1111")
-    write(folder / "notes.md", "nothing reads this")
-    write(folder / "results" / "runs" / "x" / "slam.yaml", "an output")
-    write(folder / "results" / "index.sqlite", "an output")
+    files = {
+        "mine.py": PLUGIN,
+        "helper.py": "def make(text):\n    return 1  # a note\n",
+        "params/slam.yaml": "threshold: 1\nweights: net.bin\n",
+        "params/net.bin": "1111",
+        "notes.md": "nothing reads this",
+        "results/runs/x/slam.yaml": "an output",
+        "results/index.sqlite": "an output",
+    }
+    for name, text in files.items():
+        write(folder / name, text)
     return RunSpec(tracker=f"{folder / 'mine.py'}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))), folder
 
 
@@ -185,21 +189,24 @@ def test_what_a_plug_in_imports_from_elsewhere_counts(tmp_path: Path, monkeypatc
 
 def a_program(tmp_path: Path) -> Path:
     """A folder of a program with everything that commands name."""
-    folder = tmp_path / "program"
-    write(folder / "slam.py", 'import part\nopen("beside.json")\n')
-    write(folder / "part.py", "x = 1\n")
-    write(folder / "beside.json", "1111")
-    write(folder / "c.yaml", "vocabulary: voc.bin\n")
-    write(folder / "voc.bin", "1111")
-    write(folder / "maps" / "a.map", "1111")
-    write(folder / "package" / "__init__.py", "")
-    write(folder / "package" / "__main__.py", "x = 1\n")
-    write(folder / "run.sh", "#!/bin/sh\nexec python slam.py\n").chmod(0o755)
-    write(folder / "here.sh", '#!/bin/bash\npython "$(dirname "$0")/inner/main.py"\n').chmod(0o755)
-    write(folder / "sub.sh", "#!/bin/sh\ncd inner && python main.py\n").chmod(0o755)
-    write(folder / "inner" / "main.py", "x = 1\n")
-    write(folder / "script", "#!/usr/bin/env python3\nimport part\n").chmod(0o755)
-    return folder
+    files = {
+        "slam.py": 'import part\nopen("beside.json")\n',
+        "part.py": "x = 1\n",
+        "beside.json": "1111",
+        "c.yaml": "vocabulary: voc.bin\n",
+        "voc.bin": "1111",
+        "maps/a.map": "1111",
+        "package/__init__.py": "",
+        "package/__main__.py": "x = 1\n",
+        "run.sh": "#!/bin/sh\nexec python slam.py\n",
+        "here.sh": '#!/bin/bash\npython "$(dirname "$0")/inner/main.py"\n',
+        "sub.sh": "#!/bin/sh\ncd inner && python main.py\n",
+        "inner/main.py": "x = 1\n",
+        "script": "#!/usr/bin/env python3\nimport part\n",
+    }
+    for name, text in files.items():
+        write(tmp_path / "program" / name, text).chmod(0o755)
+    return tmp_path / "program"
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import sqlite3
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +15,13 @@ from reports_fake_store import add_run
 
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import RunError
-from dynslam_bench.envs.episode import FrameOutcome
+from dynslam_bench.envs.slam_env import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.reports import load_frame
 from dynslam_bench.runs import RunStore, load_frames, score
 from dynslam_bench.runs import store as store_module
 from dynslam_bench.runs.artifacts import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
-from dynslam_bench.runs.frames import FIXED, FrameLog, FrameRow, read_csv, write_csv
+from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
 from dynslam_bench.runs.store import FIELDS, list_runs, rescore, run_row
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
@@ -200,7 +197,7 @@ def test_a_link_in_a_folder_is_seen_behind_its_back(filled, tmp_path: Path) -> N
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "tests" / "fixtures" / "results"
 ROWS = [
-    FrameRow(0, 1.5, "ok", None, None, 0.0, 0.0, -0.0, 0.25, {"total": 0.1}, {"culled": 3.0}, [0.0] * 6 + [1.0]),
+    FrameRow(0, 1.5, "ok", 0.05, 0.15, 0.0, 0.0, -0.0, 0.25, {"total": 0.1}, {"culled": 3.0}, [0.0] * 6 + [1.0], 0.5),
     FrameRow(1, 1.625, "dropped"),
     FrameRow(
         2, 1.75, "lost", 0.1, 0.2, 0.30000000000000004, 0.4, -0.1, None, {"total": 1e-9, "flow": 2.0}, {"f_s": 1.0}
@@ -220,19 +217,14 @@ def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path:
 
 
 def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
+    write_csv(tmp_path / "without.csv", ROWS[1:])
+    assert "dynamic_share" not in (tmp_path / "without.csv").read_text(), "no frame has exact masks"
     write_csv(tmp_path / "frames.csv", ROWS)
     head = (tmp_path / "frames.csv").read_text().splitlines()[0]
     assert head.split(",")[-4:] == ["total_s", "flow_s", "stat_culled", "stat_f_s"]
     found = read_csv(tmp_path / "frames.csv")
     assert [row.cells() for row in found] == [row.cells() for row in ROWS]
     assert [row.pose for row in found] == [None] * 3
-
-
-@pytest.mark.parametrize("text", ["run,tracker\n1,x\n", "index,timestamp,state,reward_m\n0,1.0,asleep,0\n"])
-def test_another_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
-    (tmp_path / "frames.csv").write_text(text)
-    with pytest.raises(RunError, match="is no table of frames: row 1 is damaged"):
-        read_csv(tmp_path / "frames.csv")
 
 
 def test_frames_of_a_run_by_record_id_and_path(store: RunStore) -> None:
@@ -274,45 +266,6 @@ def test_trials_of_studies_are_left_out_unless_asked_for(store: RunStore) -> Non
     everything = store.frame(trials=True)
     assert everything["study"].tolist() == ["thresholds", pd.NA] and everything["study"].dtype == "string"
     assert store.frame()["study"].isna().all()
-
-
-def test_lists_frames_and_reports_have_one_vocabulary(store: RunStore) -> None:
-    listed, table = set(list_runs(store)[0][0]), set(store.frame(trials=True).columns)
-    reported = set(load_frame(store).columns)
-    assert listed - table == {"seen_in_training"} and "seen_in_training" in reported
-    assert listed - reported == {"identity", "reason", "started"}
-    shared = {
-        "run_id",
-        "frames",
-        "segmentation",
-        "study",
-        "static_camera_ate_rmse_m",
-        "ate_rmse_m",
-        "coverage",
-        "frame_ms",
-    }
-    assert shared <= listed & table & reported
-    by_id = {row["run_id"]: row for row in list_runs(store)[0]}
-    for line in store.frame().astype(object).to_dict("records"):
-        row = by_id[line["run_id"]]
-        assert all(row[name] == (None if line[name] is pd.NA else line[name]) or row[name] == "" for name in shared)
-
-
-def test_from_results_to_a_plot_in_three_lines(store: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The page's examples are run as they stand."""
-    page = (ROOT / "docs" / "environments.md").read_text()
-    section = page[page.index("### From `results/` to a plot") :]
-    first, second = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
-    (store.root / "latest").symlink_to("runs/a7abe04996a79cc4")
-    monkeypatch.chdir(store.root.parent)
-    for text, names in (
-        (first, ("ate.html", "Old Slam", "never move")),
-        (second, ("frames.html", "pose_error_trans_m")),
-    ):
-        assert len([line for line in text.splitlines() if line]) == 3
-        exec(compile(text, "environments.md", "exec"), {})
-        plot = Path(names[0]).read_text()
-        assert all(name in plot for name in names[1:])
 
 
 SHAPE = (48, 65, 3)
@@ -364,19 +317,3 @@ def test_a_damaged_file_is_one_clear_line(tmp_path: Path, content: bytes) -> Non
     (tmp_path / SNAPSHOTS_FILE).write_bytes(content)
     with pytest.raises(RunError, match=r"holds no (snapshots|arrays)"):
         read_snapshots(tmp_path)
-
-
-def test_the_dynamic_share_is_a_column_where_it_is_known(tmp_path: Path) -> None:
-    known = [FrameRow(0, 1.0, "ok", dynamic_share=0.25), FrameRow(1, 2.0, "ok", dynamic_share=0.0)]
-    write_csv(tmp_path / "known.csv", known)
-    assert [row.dynamic_share for row in read_csv(tmp_path / "known.csv")] == [0.25, 0.0]
-    write_csv(tmp_path / "unknown.csv", [FrameRow(0, 1.0, "ok")])
-    assert "dynamic_share" not in (tmp_path / "unknown.csv").read_text()
-
-
-def test_a_row_comes_back_whole_from_the_log_of_a_run(tmp_path: Path) -> None:
-    numbers = {name: 0.25 + at for at, name in enumerate((*FIXED[3:], "dynamic_share"))}
-    row = FrameRow(3, 1.5, "ok", **numbers, timings={"read": 0.1}, stats={"culled": 7}, pose=[0.0] * 6 + [1.0])
-    assert None not in [getattr(row, each.name) for each in fields(row)]
-    (tmp_path / "log").write_text(row.to_json())
-    assert FrameLog.read(tmp_path / "log") == FrameLog([row])

@@ -8,14 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from envs_toys import TARGET, ToySequence, truth, write_folder
+from envs_toys import TARGET, ToySequence, write_folder
 
-from dynslam_bench.core.errors import DynslamError, SequenceError
+from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.envs import SlamEnv
-from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.geometry.stamps import format_ns, from_seconds
 from dynslam_bench.geometry.trajectory_files import read_tum
-from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, resolve, run_many, run_one, score
+from dynslam_bench.runs import RunRecord, RunSpec, RunStore, resolve, run_many, run_one, score
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
 
 
@@ -66,15 +65,6 @@ def test_the_run_is_the_environment(store: RunStore, toy_folder: str) -> None:
     assert scored["ate_rmse_m"] == pytest.approx(info["episode_metrics"]["ate_rmse_m"], rel=1e-5)
 
 
-def test_same_seed_same_run_and_other_seed_other_run(store: RunStore, toy_folder: str) -> None:
-    texts = []
-    for seed in (1, 1, 2):
-        record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=seed), store)
-        texts.append((record.run_id, (store.folder(record.run_id) / "trajectory_online.txt").read_text()))
-    assert texts[0] == texts[1]
-    assert texts[0][0] != texts[2][0] and texts[0][1] != texts[2][1]
-
-
 def test_a_start_offset_is_a_repeat_of_the_same_block(store: RunStore, toy_folder: str) -> None:
     spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(10, 40))
     plain = run_one(spec, store)
@@ -93,15 +83,11 @@ def test_a_start_offset_is_a_repeat_of_the_same_block(store: RunStore, toy_folde
         resolve(RunSpec(tracker=TARGET, sequence=toy_folder, offset=60))
 
 
-LIMITS = Limits(frame_s=3.0)
-
-
 @pytest.mark.parametrize(
     ("mode", "status", "reason"),
     [
         ("raise", "crashed", "frame 4 of 60: ValueError: the toy tracker raised on purpose (envs_toys.py:"),
         ("segfault", "crashed", "SIGSEGV (segmentation fault), after frame 3 of 60"),
-        ("exit", "crashed", "the process left with exit code 3, after frame 3 of 60"),
         ("nan", "invalid", "tracker 'toy' at frame 4 returned a pose with 16 values that are not finite"),
         ("scaled", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
         ("mirrored", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
@@ -111,7 +97,6 @@ LIMITS = Limits(frame_s=3.0)
             "out-of-memory",
             "frame 4 of 60: MemoryError: the toy tracker ran out of memory on purpose (envs",
         ),
-        ("hang", "timeout", "no sign of life for 3 s, after frame 3 of 60"),
         ("lost", "lost", "tracked on 4 of 60 frames"),
         ("initialising", "lost", "tracked on 4 of 60 frames"),
     ],
@@ -119,7 +104,7 @@ LIMITS = Limits(frame_s=3.0)
 def test_every_failure_is_a_record_with_status_and_reason(
     store: RunStore, toy_folder: str, mode: str, status: str, reason: str
 ) -> None:
-    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": mode}, limits=LIMITS), store)
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings={"mode": mode}), store)
     assert record.status == status and record.reason.startswith(reason)
     assert "\n" not in record.reason
     assert store.read(record.run_id) == record
@@ -165,14 +150,6 @@ def test_partial_metrics_and_stopping(store: RunStore, toy_folder: str) -> None:
     whole = run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store, on_progress=lambda *a: seen.append(a) or True)
     assert [partial["frames_done"] for _, partial in seen] == [50, 60]
     assert seen[-1][1]["metrics"]["ate_rmse_m"] == pytest.approx(score(store, whole).metrics["ate_rmse_m"], rel=1e-5)
-
-
-def test_no_ground_truth(store: RunStore, tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "blind", 12, has_truth=False)
-    record = run_one(RunSpec(tracker=TARGET, sequence=str(folder)), store)
-    assert record.status == "ok" and not record.sequence.ground_truth
-    metrics = score(store, record)
-    assert metrics.primary is None and "has no ground truth" in metrics.reasons["online"]
 
 
 @pytest.mark.parametrize(
@@ -270,22 +247,9 @@ def test_the_same_bits_on_one_thread_and_on_two(store: RunStore) -> None:
         assert one == two and len(one) > 100, name
 
 
-def test_scores_under_another_protocol_need_no_run(store: RunStore, toy_folder: str) -> None:
-    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder), store)
-    first = score(store, record)
-    before = sorted(path.stat().st_mtime_ns for path in store.folder(record.run_id).iterdir())
-    second = score(store, record, "evo-default")
-    assert second.protocol_digest != first.protocol_digest
-    assert sorted(path.stat().st_mtime_ns for path in store.folder(record.run_id).iterdir()) == before
-    want = evaluate(store.trajectory(record.run_id), read_tum(Path(toy_folder) / "groundtruth.txt"), "evo-default")
-    assert second.metrics["ate_rmse_m"] == pytest.approx(want.metrics["ate_rmse_m"], abs=1e-12)
-    assert score(store, record) == first and first.online and first.final
-    assert np.allclose(store.ground_truth(record.sequence.part).T_world_cam, truth(60), atol=1e-6)
-
-
 ECHO = """#!{python}
 import json, sys
-sys.stderr.write("echo {version}\\n")
+sys.stderr.write("echo\\n")
 for line in sys.stdin:
     request = json.loads(line)
     answer = dict(index=request.get("index"), state="ok", T_world_cam=[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
@@ -294,21 +258,15 @@ for line in sys.stdin:
 """
 
 
-def test_a_rebuilt_program_is_another_run_and_its_words_are_kept(store: RunStore, toy_folder: str, tmp_path) -> None:
+def test_what_a_program_writes_is_in_the_log(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     program = tmp_path / "slam"
-
-    def made(version: int) -> RunRecord:
-        program.write_text(ECHO.format(python=sys.executable, version=version))
-        program.chmod(0o755)
-        spec = RunSpec(tracker=f"subprocess:{program}", sequence=toy_folder, frames=(0, 3), label="my SLAM")
-        return run_one(spec, store)
-
-    first, second = made(1), made(2)
-    assert first.status == second.status == "ok" and first.run_id != second.run_id
-    assert made(1).run_id == first.run_id
-    assert first.tracker.label == "my SLAM"
-    log = (store.folder(second.run_id) / "log.txt").read_text()
-    assert "[slam] echo 2" in log and "[slam] on it" in log
+    program.write_text(ECHO.format(python=sys.executable))
+    program.chmod(0o755)
+    spec = RunSpec(tracker=f"subprocess:{program}", sequence=toy_folder, frames=(0, 3), label="my SLAM")
+    record = run_one(spec, store)
+    assert record.status == "ok" and record.tracker.label == "my SLAM"
+    log = (store.folder(record.run_id) / "log.txt").read_text()
+    assert "[slam] echo" in log and "[slam] on it" in log
 
 
 START = 1403636579763555584
@@ -374,12 +332,7 @@ def test_stamps_a_fifth_of_a_microsecond_apart_are_refused_before_tracking(
     assert store.ids() == [records[0].run_id]
 
 
-def test_a_data_set_of_the_users_is_asked_for_the_same() -> None:
-    sequence = ToySequence(6)
-    sequence.timestamps = sequence.timestamps.copy()
-    sequence.timestamps[3] = sequence.timestamps[2] + 2e-7
-    with pytest.raises(SequenceError, match=r"frames of 'toy/walk': .*ns apart"):
-        SlamEnv(sequence, TARGET)
+def test_a_data_set_of_the_users_may_state_its_nanoseconds() -> None:
     sequence = ToySequence(6)
     sequence.timestamps_ns = from_seconds(sequence.timestamps.tolist()) + 3
     env = SlamEnv(sequence, TARGET)

@@ -14,7 +14,6 @@ from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.runs import RunSpec, RunStore, run_many, run_one
-from dynslam_bench.tuning import StudySpec, Tuner
 
 
 @pytest.fixture
@@ -88,22 +87,6 @@ def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_fold
         return caught.value.options[-1]
 
     assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft?masks=none" in hint("mask-rcnn")
-
-
-def test_a_study_refuses_it_too(toy_folder: str, mistakes, tmp_path: Path) -> None:
-    source, words = mistakes["no network"]
-    spec = StudySpec.model_validate(
-        {
-            "name": "s",
-            "tracker": "mask-rcnn",
-            "tune": (toy_folder,),
-            "trials": 2,
-            "space": {"fixed": {"segmentation.source": source}},
-        }
-    )
-    with pytest.raises(DynslamError, match=words):
-        Tuner(spec, tmp_path / "results").run()
-    assert RunStore(tmp_path / "results").ids() == []
 
 
 @pytest.mark.parametrize(
@@ -185,35 +168,6 @@ def test_an_image_that_cannot_be_used_is_the_datas_fault(store: RunStore, damage
     assert "\n" not in str(caught.value) and store.ids() == []
     image.write_bytes(sound)
     assert run_one(RunSpec(tracker="never-move", sequence=folder), store).status == "ok"
-
-
-REMOVES = """
-from pathlib import Path
-from dynslam_bench.contracts import TrackerSpec, TrackResult
-from dynslam_bench.core.settings import Settings
-import numpy as np
-
-class Removes:
-    def __init__(self, settings):
-        pass
-
-    def reset(self, camera, *, rng):
-        pass
-
-    def track(self, frame):
-        Path({image!r}).unlink(missing_ok=True)
-        return TrackResult(np.eye(4), "ok")
-
-SPEC = TrackerSpec(id="removes", entry_point=__file__ + ":Removes", label="removes", summary="", settings=Settings)
-"""
-
-
-def test_a_file_that_goes_in_mid_run_is_the_datas_fault(store: RunStore, damaged, tmp_path: Path) -> None:
-    folder, image = damaged
-    (tmp_path / "removes.py").write_text(REMOVES.format(image=str(image)))
-    with pytest.raises(RunError, match=rf"frame {AT} of '.*' cannot be read: .*{image.name}"):
-        run_one(RunSpec(tracker=f"{tmp_path}/removes.py:SPEC", sequence=folder), store)
-    assert store.ids() == []
 
 
 def test_a_recorded_mask_that_cannot_be_decoded_is_the_datas_fault(store: RunStore, damaged, tmp_path: Path) -> None:

@@ -235,13 +235,12 @@ def read_bag_trajectory(path: Path, topic: str | None = None) -> Trajectory:
     return camera_poses
 
 
-def write_bag(folder: Path, trajectories: Mapping[str, Trajectory], frame_id: str = "world") -> None:
+def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
     """Write trajectories, each on the topics ``/NAME/pose`` and ``/NAME/path``.
 
     Args:
         folder: Where, it exists: it becomes a bag of ROS 2, ``trajectory.mcap`` with its ``metadata.yaml``.
         trajectories: Camera-to-world poses by name.
-        frame_id: Name of the world's frame.
 
     Raises:
         DynslamError: `rosbags` is not installed, or the file cannot be written.
@@ -257,14 +256,14 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory], frame_id: st
         try:
             with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 for name, trajectory in trajectories.items():
-                    _write_messages(writer, store, name, trajectory, frame_id)
+                    _write_messages(writer, store, name, trajectory)
             for file in bag.iterdir():
                 file.replace(folder / file.name)
         except OSError as error:
             raise RunError(f"cannot write {folder}: {error.strerror}", "check the free space") from error
 
 
-def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory, frame_id: str) -> None:
+def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) -> None:
     types, poses = store.types, []
     topic = writer.add_connection(f"/{name}/pose", POSE_MESSAGE, typestore=store)
     rows = np.concatenate(se3.to_quaternion(trajectory.T_world_cam), axis=1).tolist()
@@ -274,8 +273,7 @@ def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory, 
         position = types["geometry_msgs/msg/Point"](*row[:3])
         orientation = types["geometry_msgs/msg/Quaternion"](*row[3:])
         pose = types["geometry_msgs/msg/Pose"](position=position, orientation=orientation)
-        header = types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
-        poses.append(types[POSE_MESSAGE](header=header, pose=pose))
+        poses.append(types[POSE_MESSAGE](header=types["std_msgs/msg/Header"](stamp=time, frame_id="world"), pose=pose))
         writer.write(topic, ns, store.serialize_cdr(poses[-1], POSE_MESSAGE))
     if poses:
         whole = types[PATH](header=poses[0].header, poses=poses)

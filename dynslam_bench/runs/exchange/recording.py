@@ -170,8 +170,7 @@ class _Stream:
                 self._send(LAYERS[layer], points, self._point_columns)
                 counts = [(f, float(len(chosen))) for f, chosen in points]
                 self._send(f"features/{layer}", counts, lambda values: rr.Scalars.columns(scalars=values))
-            masks = [(f, shot.mask) for f, shot in shots if shot.mask is not None]
-            self._send(LAYERS["mask"], masks, self._masks)
+            self._send(LAYERS["mask"], [(f, shot.mask) for f, shot in shots if shot.mask is not None], self._masks)
 
     def _send(self, entity: str, rows: list[tuple[RecordedFrame, Any]], columns: Callable[[list[Any]], Any]) -> None:
         if not rows:
@@ -276,8 +275,7 @@ def _scaled(shot: Snapshot, scale: NDArray[np.float64]) -> Snapshot:
     """A snapshot of an image that the tracker's preprocessing had resized, in pixels of the sequence's."""
     if (scale == 1).all():
         return shot
-    points = ((shot.points + 0.5) * scale - 0.5).round().astype(np.int16)
-    return replace(shot, points=points)
+    return replace(shot, points=((shot.points + 0.5) * scale - 0.5).round().astype(np.int16))
 
 
 def _pose_at(trajectory: Trajectory, stamp: float) -> NDArray[np.float64] | None:

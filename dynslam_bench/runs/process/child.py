@@ -77,8 +77,7 @@ def main(connection: Connection) -> int:
         with contextlib.closing(TemporaryFolder()) as temporary:
             os.environ["TMPDIR"] = tempfile.tempdir = str(temporary.path)
             _prepare(job)
-            work = load_object(job["work"])
-            message = work(job, lambda message: _send(connection, message), stop.is_set)
+            message = load_object(job["work"])(job, lambda message: _send(connection, message), stop.is_set)
     except BaseException as error:
         traceback.print_exc()
         message = describe_failure(error)
@@ -92,8 +91,7 @@ def main(connection: Connection) -> int:
 
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
 
 
 def _listen(connection: Connection, stop: threading.Event) -> None:

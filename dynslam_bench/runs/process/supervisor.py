@@ -118,8 +118,7 @@ class _Supervisor:
         connection = self.child.connection
         is_open = True
         while True:
-            ready = wait([self.child.status_fd, *([connection] if is_open else [])], _POLL_S)
-            if connection in ready:
+            if connection in wait([self.child.status_fd, *([connection] if is_open else [])], _POLL_S):
                 is_open = self._receive()
             if self.child.poll() is not None:
                 while is_open and connection.poll(0):
@@ -136,17 +135,16 @@ class _Supervisor:
         Raises:
             InfrastructureError: Something beside the run broke.
         """
-        final, kind = self.final, self.final.get("type")
-        if final.get("infrastructure"):
-            raise InfrastructureError(final["infrastructure"], _GO_ON)
-        if kind == "done":
-            return self._verdict("ok")
-        if kind == "stopped":
-            return self._verdict("stopped", f"stopped on request after {final['frames']} frames")
-        if kind == "failed":
-            verdict = self._verdict(final["status"], final["reason"])
-            verdict.refused = final.get("data", False) or (final.get("refused", False) and self.frame < 0)
-            return verdict
+        match self.final:
+            case {"infrastructure": str(broken)}:
+                raise InfrastructureError(broken, _GO_ON)
+            case {"type": "done"}:
+                return self._verdict("ok")
+            case {"type": "stopped", "frames": frames}:
+                return self._verdict("stopped", f"stopped on request after {frames} frames")
+            case {"type": "failed", "status": status, "reason": reason, **more}:
+                refused = more.get("data", False) or (more.get("refused", False) and self.frame < 0)
+                return self._verdict(status, reason, refused=refused)
         code = self.child.poll()
         assert code is not None
         if code < 0 and not self.cancelled():  # the signal that ends this process may have ended the child first
@@ -164,21 +162,22 @@ class _Supervisor:
             message = json.loads(self.child.connection.recv_bytes())
         except (EOFError, OSError):
             return False
-        kind = message["type"]
         self.last_message = time.monotonic()
-        if kind == "ready":
-            self.began = self.last_message
-        elif kind == "started":
-            self.n_frames = message["frames"]
-        elif kind == "frame":
-            self.frame = message["index"]
-        elif kind != "progress":
-            self.final = message
-            self.peak_mb = max(self.peak_mb, message["peak_memory_mb"])
-        elif not self.on_progress(message) and self.stop_sent is None:
-            self.stop_sent = time.monotonic()
-            with contextlib.suppress(OSError):  # it has ended, which its status tells
-                self.child.connection.send_bytes(b"stop")
+        match message["type"]:
+            case "ready":
+                self.began = self.last_message
+            case "started":
+                self.n_frames = message["frames"]
+            case "frame":
+                self.frame = message["index"]
+            case "progress":
+                if not self.on_progress(message) and self.stop_sent is None:
+                    self.stop_sent = time.monotonic()
+                    with contextlib.suppress(OSError):  # it has ended, which its status tells
+                        self.child.connection.send_bytes(b"stop")
+            case _:
+                self.final = message
+                self.peak_mb = max(self.peak_mb, message["peak_memory_mb"])
         return True
 
     def _over_limit(self) -> Verdict | None:
@@ -221,8 +220,8 @@ class _Supervisor:
         done = "before frame 0 was tracked" if self.frame < 0 else f"after frame {self.frame}"
         return f", {done} of {self.n_frames}"
 
-    def _verdict(self, status: Status, reason: str = "") -> Verdict:
-        return Verdict(status, reason, self.final, self.peak_mb)
+    def _verdict(self, status: Status, reason: str = "", *, refused: bool = False) -> Verdict:
+        return Verdict(status, reason, self.final, self.peak_mb, refused)
 
 
 def _reason_of_exit(code: int) -> str:
