@@ -1,4 +1,4 @@
 """Runs in the formats of others, and trajectories from them: EuRoC, VSLAM-LAB, KITTI, COLMAP, ROS / MCAP, rerun.
 
-`export.export_run` writes, `formats.read_trajectory` reads; what is written carries a ``provenance.json`` beside it.
+`transfer` writes and imports, `formats.read_trajectory` reads; what is written carries a ``provenance.json`` beside it.
 """
