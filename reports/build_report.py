@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -20,7 +19,7 @@ from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, render, resource, table_blocks
-from dynslam_bench.reports.model.board import Board, On, common_errors, make_board, missing_commands, missing_note
+from dynslam_bench.reports.model.board import Board, On, make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import (
     Loaded,
     OnProgress,
@@ -120,16 +119,19 @@ def build_report(
         )  # fmt: skip
         on_progress(0, None, "putting the tables and figures together")
         again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
+        none_failed = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
         sections = [
             leaderboard_section(board, protocol, loaded),
             Section("explore", "Explore", "Explore", explore_notes, [Block("explore")]),
             speed_section(board),
-            errors_section(board, protocol, pool),
+            errors_section(board, protocol),
             paper_section(board, protocol),
             trajectories_section(board, protocol),
-            repeatability_section(board),
+            Section(
+                "repeatability", "Repeatability", "Repeatability", blocks=table_blocks(tables.repeatability(board))
+            ),
             masks_section(board),
-            failures_section(board),
+            Section("failures", "Failures", "Failures", blocks=table_blocks(tables.failures(board)) or none_failed),
             provenance_section(board, loaded, again),
         ]
     on_progress(0, None, "writing")
@@ -149,12 +151,9 @@ def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int 
 def _write(
     sections: Sequence[Section], board: Board, protocol: Protocol, output: Path, title: str, trials: int
 ) -> ReportPaths:
-    counts = [
-        (len(board.labels), "tracker"),
-        (len(board.sequences) + len(board.unscored), "sequence"),
-        (len(board.rows), "run"),
-    ]
-    facts = [(str(count), name + "s" * (count != 1)) for count, name in counts]
+    n_sequences = len(board.sequences) + len(board.unscored)
+    counts = {"tracker": len(board.labels), "sequence": n_sequences, "run": len(board.rows)}
+    facts = [(str(count), name + "s" * (count != 1)) for name, count in counts.items()]
     facts.append((str(sum(row.failed for row in board.rows)), "failed"))
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. This page works without a network."
@@ -178,19 +177,19 @@ def _write(
     texts = "\n".join(map(to_markdown, shown.values()))
     head = f"# {prose(title)}\n\n{protocol.describe()}\n\n{counted}\n\n"
     write_atomic(paths.markdown, f"{head}{notes}{texts}\n{footer}\n")
-    latex = [to_latex(table, protocol.id) for name, table in shown.items() if name not in _NOT_IN_LATEX]
-    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
-    data = ReportData(
+    write_atomic(
+        paths.latex,
+        "% needs \\usepackage{booktabs}\n"
+        + "\n".join([to_latex(table, protocol.id) for name, table in shown.items() if name not in _NOT_IN_LATEX]),
+    )
+    ReportData(
         title=title,
         protocol=protocol.describe(),
         reference=board.reference_name,
         version=dynslam_bench.__version__,
         rows=board.rows,
-    )
-    data.write(paths.data)
-    charts = {block.figure: block.chart for block in blocks if block.figure}
-    page = render(sections, charts, title=title, protocol=protocol.describe(), facts=facts, footer=footer)
-    write_atomic(paths.html, page)
+    ).write(paths.data)
+    write_atomic(paths.html, render(sections, title=title, protocol=protocol.describe(), facts=facts, footer=footer))
     return paths
 
 
@@ -251,21 +250,19 @@ def speed_section(board: Board) -> Section:
     caption = (
         "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
         "include segmentation and exclude decoding; they hold for the machine named below."
-    )
-    if any(row.cached for row in board.rows):
-        caption += f" {tables.CACHED_NOTE}"
+    ) + f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
     blocks = figure_blocks("speed", figures.speed_figure(board), caption)
     return Section("speed", "Accuracy against speed", "Speed", blocks=blocks)
 
 
-def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> Section:
+def errors_section(board: Board, protocol: Protocol) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
     section = Section("errors", "Errors by sequence", "Errors")
     if not board.sequences:
         return section
     excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
-    recorded = [row for row in board.rows if not row.sequence.id.startswith("synthetic/")]
-    parts = sorted(excerpts | {board.sequence(row) for row in recorded if part_words(row)})
+    shortened = {board.sequence(r) for r in board.rows if part_words(r) and not r.sequence.id.startswith("synthetic/")}
+    parts = sorted(excerpts | shortened)
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     whole = [name for name in board.sequences if name not in parts]
@@ -279,12 +276,9 @@ def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> S
             f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
             "are of the whole recordings is not checked."
         )
-    table_of_errors = tables.per_sequence(board, protocol, published)
-    section.blocks.append(Block("table", "Absolute trajectory error", table_of_errors))
-    common, frames = common_errors(board, protocol, pool)
+    section.blocks.append(Block("table", "Absolute trajectory error", tables.per_sequence(board, protocol, published)))
     lost = any(row.coverage < 1 and not row.failed for row in board.rows)
     section.blocks += table_blocks(
-        tables.common_frames_table(board, common, frames),
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
         tables.tracked_errors(board, protocol) if lost else None,
         tables.failure_rule_table(board),
@@ -318,33 +312,15 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
     )  # fmt: skip
 
 
-def repeatability_section(board: Board) -> Section:
-    """How far the runs of a cell lie apart."""
-    caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
-    blocks = figure_blocks("repeat", figures.repeat_figure(board), caption + thinned_note(board))
-    blocks += table_blocks(tables.repeatability(board))
-    return Section("repeatability", "Repeatability", "Repeatability", blocks=blocks)
-
-
-def thinned_note(board: Board) -> str:
-    """What a figure with a point for every run says where there are too many."""
-    most = figures.MOST_POINTS
-    if all(len(board.runs(key)) <= most for key in board.trackers):
-        return ""
-    return f" Of trackers with more than {most} runs fewer are drawn, from the best to the worst."
-
-
 def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
-    blocks = figure_blocks("masks", figures.mask_figure(board), "One point a run." + thinned_note(board))
-    blocks += table_blocks(tables.mask_quality(board))
+    caption = "One point a run."
+    if any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers):
+        caption += (
+            f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
+        )
+    blocks = figure_blocks("masks", figures.mask_figure(board), caption) + table_blocks(tables.mask_quality(board))
     return Section("masks", "Mask quality and pose error", "Masks", blocks=blocks)
-
-
-def failures_section(board: Board) -> Section:
-    """Every run that failed, or that none did."""
-    nothing = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
-    return Section("failures", "Failures", "Failures", blocks=table_blocks(tables.failures(board)) or nothing)
 
 
 def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
@@ -468,8 +444,9 @@ def publish(
             shutil.copyfile(source, target)
         pages.append((f"study/{STUDY_PAGE}", "Study", "What tuning the settings gained, and how sure that is."))
     template = Environment(autoescape=True, trim_blocks=True).from_string(resource("site.html.j2"))
-    page = template.render(title=title, pages=pages, note=note, version=dynslam_bench.__version__)
-    write_atomic(output / "index.html", page)
+    write_atomic(
+        output / "index.html", template.render(title=title, pages=pages, note=note, version=dynslam_bench.__version__)
+    )
     write_atomic(output / ".nojekyll", "")
     sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
     return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)

@@ -61,8 +61,7 @@ class Similarity:
 
     def apply(self, poses: Array) -> Array:
         """Poses ``[N, 4, 4]`` moved; rotations stay rotations."""
-        moved = poses.copy()
-        moved[:, :3, :3] = self.rotation @ poses[:, :3, :3]
+        moved = se3.with_rotation(poses, self.rotation @ poses[:, :3, :3])
         moved[:, :3, 3] = self.scale * poses[:, :3, 3] @ self.rotation.T + self.translation
         return moved
 
@@ -152,11 +151,9 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
     if len(source) < 3:
         return None
     if len(source) < 2 * BLOCKS:
-        kept = ~np.eye(len(source), dtype=bool)
-        pairs = [(source[rows], target[rows]) for rows in kept]
+        pairs = [(source[rows], target[rows]) for rows in ~np.eye(len(source), dtype=bool)]
         covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
-        squares = _turned_deg(covariances, rotation) ** 2
-        return float(np.sqrt((len(source) - 1) / len(source) * squares.sum()))
+        return float(np.sqrt((len(source) - 1) / len(source) * (_turned_deg(covariances, rotation) ** 2).sum()))
     size, more = divmod(len(source), BLOCKS)  # the first blocks are longer by one where it does not come out even
     starts = np.arange(BLOCKS) * size + np.minimum(np.arange(BLOCKS), more)
     source, target = source - source.mean(axis=0), target - target.mean(axis=0)

@@ -112,8 +112,13 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
         numbers |= {"back_s": notes.back_s, "repeated_stamps": float(notes.duplicates)}
     if not evidence:
         return []
-    text = f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one"
-    return [Hint("several-recordings", text, numbers)]
+    return [
+        Hint(
+            "several-recordings",
+            f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one",
+            numbers,
+        )
+    ]
 
 
 # -- time ----------------------------------------------------------------------------------------------------------
@@ -140,8 +145,7 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
         return 0.0, 1.0
     lags = np.arange(-most, most + 1)
     lag = int(lags[np.argmin(_unexplained(own[at], expected[at + lags[:, None]]))])
-    coarse = lag * step
-    fine = coarse + np.linspace(-1, 1, 9) * step
+    fine = lag * step + np.linspace(-1, 1, 9) * step
     begin, moved = grid[at], own[at]
     near = _unexplained(moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window))
     now, near = float(near[-1]), near[:-1]
@@ -189,15 +193,18 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
     both = truth.covers(stamps) & truth.covers(stamps + shift)
     if both.sum() < MIN_POSES:
         return []
-    before, after = (fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift))
-    if not after < (0.9 if left < 0.05 else 0.5) * before:
+    error, undone = (fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift))
+    if not undone < (0.9 if left < 0.05 else 0.5) * error:
         return []
-    text = (
-        f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each the "
-        f"error falls from {before:.4f} to {after:.4f} m (at its best scale); give the stamps of the images, on the "
-        "truth's clock"
-    )
-    return [Hint("time-shift", text, {"shift_s": shift, "error_m": before, "error_undone_m": after})]
+    return [
+        Hint(
+            "time-shift",
+            f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each "
+            f"the error falls from {error:.4f} to {undone:.4f} m (at its best scale); give the stamps of the images, "
+            "on the truth's clock",
+            {"shift_s": shift, "error_m": error, "error_undone_m": undone},
+        )
+    ]
 
 
 # -- scale and noise ---
@@ -205,8 +212,8 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
 
 def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     best = fit(poses, truth.at(stamps))
-    scale, before, after = best.scale, best.se3_m, best.sim3_m
-    if not (scale > 0 and abs(np.log(scale)) > np.log(SCALE_FACTOR) and after < min(0.4 * before, 0.2 * best.extent_m)):
+    scale, error, undone = best.scale, best.se3_m, best.sim3_m
+    if not (scale > 0 and abs(np.log(scale)) > np.log(SCALE_FACTOR) and undone < min(0.4 * error, 0.2 * best.extent_m)):
         return []
     window = min(DISPLACEMENT_S, (stamps[-1] - stamps[0]) / 6)
     moved, true = (_displacements(track, stamps, window) for track in (Track(stamps, poses), truth))
@@ -221,11 +228,14 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
         if unit
         else "check the depth factor; score a tracker without depth under a protocol that finds the scale"
     )
-    text = (
-        f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {before:.4g} to "
-        f"{after:.4g} m; {cure}"
-    )
-    return [Hint("scale", text, {"scale": scale, "error_m": before, "error_undone_m": after})]
+    return [
+        Hint(
+            "scale",
+            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {error:.4g} "
+            f"to {undone:.4g} m; {cure}",
+            {"scale": scale, "error_m": error, "error_undone_m": undone},
+        )
+    ]
 
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048, "inches": 0.0254, "kilometres": 1e3}
@@ -259,8 +269,7 @@ def _jitter(positions: Array, order: int) -> float:
     """Standard deviation of white noise, per axis, that differences of some order show; metres, 0 if there are few."""
     if len(positions) < 30:
         return 0.0
-    differences = np.diff(positions, order, axis=0)
-    return float(np.median(np.abs(differences)) / (0.6745 * np.sqrt(comb(2 * order, order))))
+    return float(np.median(np.abs(np.diff(positions, order, axis=0))) / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 
 # What hints are made from: poses between their stamps, and how well positions can be aligned.
@@ -314,13 +323,11 @@ class Track:
     def covers(self, stamps: Array) -> NDArray[np.bool_]:
         """Whether stamps lie within its time and in no hole ``[...]``."""
         after = np.searchsorted(self.stamps, stamps, side="right") - 1
-        exact = self.stamps[after.clip(0)] == stamps
-        return np.asarray((after >= 0) & (~self._holes[after] | exact))
+        return np.asarray((after >= 0) & (~self._holes[after] | (self.stamps[after.clip(0)] == stamps)))
 
     def positions_at(self, stamps: Array) -> Array:
         """Positions ``[..., 3]``, on straight lines between the stamps."""
-        axes = [np.interp(stamps, self.stamps, self.positions[:, axis]) for axis in range(3)]
-        return np.stack(axes, axis=-1)
+        return np.stack([np.interp(stamps, self.stamps, self.positions[:, axis]) for axis in range(3)], axis=-1)
 
     def at(self, stamps: Array) -> Array:
         """Poses ``[N, 4, 4]``: these positions, with the rotation of the pose that is nearest in time."""
@@ -417,11 +424,15 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
     misfit = [error + fit(undone, true_poses).misfit for error, _, undone in candidates]
     best = [candidate for candidate, score in zip(candidates, misfit, strict=True) if score < min(misfit) + TIE]
     error, convention, undone = best[0]
-    text = (
-        f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
-        f"by {100 * error:.0f} % {convention.cure}"
-    ) + "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:])
-    return [Hint(convention.id, text, {"motion_error": as_read, "motion_error_undone": error})], undone
+    return [
+        Hint(
+            convention.id,
+            f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
+            f"by {100 * error:.0f} % {convention.cure}"
+            + "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:]),
+            {"motion_error": as_read, "motion_error_undone": error},
+        )
+    ], undone
 
 
 def _in_axes_of_a_body(
@@ -434,10 +445,11 @@ def _in_axes_of_a_body(
         undone = convention.undo(poses)
         motions = _relative(undone, pairs)
         error, varies = _compare(motions, true, R_est_cam=_axes(motions, true))
-        worse = 2 * fit(undone, true_poses).misfit > fit(poses, true_poses).misfit
-        if error < min(EXPLAINED, as_turned / CLEARLY) and varies > VARIES:
-            if convention.id != "inverted-poses" or not worse:
-                return [(error, convention, undone)]
+        fits = convention.id != "inverted-poses" or (
+            2 * fit(undone, true_poses).misfit <= fit(poses, true_poses).misfit
+        )
+        if error < min(EXPLAINED, as_turned / CLEARLY) and varies > VARIES and fits:
+            return [(error, convention, undone)]
     return []
 
 
@@ -473,8 +485,7 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
         motion is always the same, and then many wrong poses explain it.
     """
     if R_est_cam is not None:
-        motions = motions.copy()
-        motions[:, :3, :3] = R_est_cam.T @ motions[:, :3, :3] @ R_est_cam
+        motions = se3.with_rotation(motions, R_est_cam.T @ motions[:, :3, :3] @ R_est_cam)
         motions[:, :3, 3] = motions[:, :3, 3] @ R_est_cam
     if len(true) < MIN_POSES:
         return np.inf, 0.0
@@ -502,12 +513,6 @@ def _reordered(poses: Array) -> Array:
     return se3.from_quaternion(position, np.roll(quaternion, -1, axis=1))
 
 
-def _turned_back(poses: Array) -> Array:
-    turned = poses.copy()
-    turned[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
-    return turned
-
-
 @dataclass(frozen=True)
 class Convention:
     """What poses may be in place of camera-to-world matrices.
@@ -523,18 +528,6 @@ class Convention:
     what: str
     cure: str
     undo: Callable[[Array], Array]
-
-
-def _with_axes(name: str, R_named_camera: Array) -> Convention:
-    """Orientations of axes that are not the camera's (x right, y down, z forward)."""
-
-    def undo(poses: Array) -> Array:
-        poses = poses.copy()
-        poses[:, :3, :3] = poses[:, :3, :3] @ R_named_camera
-        return poses
-
-    cure = "after turning them; give those of a camera with x right, y down, z forward"
-    return Convention("camera-axes", f"the orientations seem to have the axes {name}", cure, undo)
 
 
 CONVENTIONS = (
@@ -554,10 +547,20 @@ CONVENTIONS = (
         "inverted-rotations",
         "the rotations seem to be world to camera, the positions are not",
         "after transposing each rotation; give those of T_world_cam, camera to world",
-        _turned_back,
+        lambda poses: se3.with_rotation(poses, poses[:, :3, :3].transpose(0, 2, 1)),
     ),
-    _with_axes("y up, z back (OpenGL)", np.diag([1.0, -1.0, -1.0])),
-    _with_axes("x forward, y left, z up (ROS)", np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])),
+    Convention(
+        "camera-axes",
+        "the orientations seem to have the axes y up, z back (OpenGL)",
+        "after turning them; give those of a camera with x right, y down, z forward",
+        lambda poses: se3.with_rotation(poses, poses[:, :3, :3] @ np.diag([1.0, -1.0, -1.0])),
+    ),
+    Convention(
+        "camera-axes",
+        "the orientations seem to have the axes x forward, y left, z up (ROS)",
+        "after turning them; give those of a camera with x right, y down, z forward",
+        lambda poses: se3.with_rotation(poses, poses[:, :3, :3] @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+    ),
 )
 """The likeliest first."""
 

@@ -52,8 +52,7 @@ def log(pose: Array) -> Array:
     half = safe / 2
     factor = np.where(small, 1 / 12 + theta**2 / 720, (1 - half / np.tan(half)) / safe**2)
     skew = hat(phi)
-    inverse_jacobian = np.eye(3) - 0.5 * skew + factor * (skew @ skew)
-    rho = (inverse_jacobian @ flat[:, :3, 3:])[..., 0]
+    rho = ((np.eye(3) - 0.5 * skew + factor * (skew @ skew)) @ flat[:, :3, 3:])[..., 0]
     return np.concatenate([rho, phi], axis=-1).reshape(*pose.shape[:-2], 6)
 
 
@@ -106,6 +105,13 @@ def rotation_angle(pose: Array) -> Array:
 def transform(pose: Array, points: Array) -> Array:
     """Points ``[N, 3]`` moved by one pose ``[4, 4]``."""
     return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def with_rotation(pose: Array, rotation: Array) -> Array:
+    """The poses ``[..., 4, 4]`` with other rotations ``[..., 3, 3]``."""
+    turned = pose.copy()
+    turned[..., :3, :3] = rotation
+    return turned
 
 
 def is_pose(pose: object, tolerance: float = 1e-4) -> bool:

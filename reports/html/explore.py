@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.core.errors import DynslamError, RunError
@@ -115,16 +116,14 @@ def write_explore(
     typical = {row.run_id for name in board.sequences for row in board.typical_runs(name).values()}
     paged = _paged(board, typical, most_pages)
     shown = {row.run_id for row in paged if row.failed or row.run_id in typical}
-    newest = sorted(paged, key=lambda row: row.started, reverse=True)
-    by_column = grouped(sorted(newest, key=lambda row: row.offset), lambda row: row.column_id)
-    shares = {column: exact_shares(rows) for column, rows in by_column.items()}
+    newest = sorted(sorted(paged, key=lambda row: row.started, reverse=True), key=lambda row: row.offset)
+    shares = {column: exact_shares(rows) for column, rows in grouped(newest, lambda row: row.column_id).items()}
     ordered = sorted(paged, key=lambda row: (row.run_id not in shown, row.column_id))
     deadline = time.time() + picture_seconds
     jobs = []
     for (_, column), rows in grouped(ordered, lambda row: (row.run_id not in shown, row.column_id)).items():
         for first in range(0, len(rows), JOB):
-            some = rows[first : first + JOB]
-            jobs.append((some, shown, shares[column], protocol, output, deadline, most_frames))
+            jobs.append((rows[first : first + JOB], shown, shares[column], protocol, output, deadline, most_frames))
     pages: list[RunPage] = []
     missing: Counter[str] = Counter()
     for written, undrawn in run_jobs(pool, _write_pages, jobs):
@@ -135,8 +134,7 @@ def write_explore(
     write_side(output, "explore", _explore_content(board, protocol, pages, pageless))
     write_atomic(output / RUN_PAGE, render_run_page(title))
     reasons = "; ".join(f"{count} frames: {reason}" for reason, count in missing.items())
-    pictureless = f"Frames without a picture: {reasons}." if reasons else ""
-    return [note for note in (pageless, pictureless) if note]
+    return [note for note in (pageless, f"Frames without a picture: {reasons}." if reasons else "") if note]
 
 
 def pages_for(runs: int, typical: int) -> int:
@@ -236,19 +234,19 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
     page_of = {page.run_id: page for page in pages}
     kept = {row.run_id for cells in board.cells.values() for cell in cells.values() for row in cell.kept}
     first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
-    listed = board.rows  # a page of a hundred thousand would open slowly, and nobody reads them
-    if len(board.rows) > MOST_LISTED:
-        listed = [row for row in board.rows if row.run_id in page_of or row.run_id in first]
+    all_listed = len(board.rows) <= MOST_LISTED  # a page of a hundred thousand would open slowly
+    listed = [row for row in board.rows if all_listed or row.run_id in page_of or row.run_id in first]
     runs = []
     for row in sorted(listed, key=lambda r: (place[r.variant_key], column[board.sequence(r)], r.repeat_key)):
         page = page_of.get(row.run_id)
         values = [significant(_value(row, metric), 5) for metric in metrics]
         flags = (row.run_id in kept) + 2 * (page is not None and page.pictured) + 4 * (page is None)
-        where = [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat]
-        runs.append([*where, row.ending, flags, values, page.quantiles_mm if page else []])
-    tags: dict[str, set[str]] = {}
-    for row in board.rows:
-        tags.setdefault(board.sequence(row), set()).update(row.sequence.tags)
+        cell = place[row.variant_key], column[board.sequence(row)]
+        runs.append([row.run_id, *cell, row.repeat, row.ending, flags, values, page.quantiles_mm if page else []])
+    tags = {
+        name: sorted({tag for row in rows for tag in row.sequence.tags})
+        for name, rows in grouped(board.rows, board.sequence).items()
+    }
     by_tracker = grouped(pages, lambda page: page.variant_key)
     by_share = {place[key]: error_by_share(by_tracker.get(key, [])) for key in keys}
     return {
@@ -260,8 +258,7 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
         "metrics": metrics,
         "trackers": [_tracker(board, key, at) for at, key in enumerate(keys)],
         "sequences": [
-            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])}
-            for n in names
+            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": tags[n]} for n in names
         ],
         "static": [significant(board.static_camera.get(name), 5) for name in names],
         "cells": [
@@ -279,8 +276,7 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
 def _cell(cell: Cell, metrics: Sequence[Mapping[str, str]], rank_seen: bool) -> list[Any]:
     """How many runs of a cell there are and failed, what speaks against it, and the median of every number."""
     doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.in_training and not rank_seen)
-    values = [[_value(row, metric) for row in cell.kept] for metric in metrics]
-    medians = [middle(value for value in of_runs if value is None or np.isfinite(value)) for of_runs in values]
+    medians = [middle(_value(row, metric) for row in cell.kept) for metric in metrics]
     return [len(cell.rows), cell.failed, doubt, [significant(value, 5) for value in medians]]
 
 
@@ -288,7 +284,6 @@ def _tracker(board: Board, key: str, at: int) -> dict[str, Any]:
     runs, first = board.runs(key), board.first(key)
     standing = next((standing for standing in board.standings if standing.key == key), None)
     ended = [row for row in runs if not row.failed]
-    counts = Counter(row.failed for row in runs)
     return {
         "label": board.labels[key],
         "id": first.tracker.id,
@@ -298,7 +293,7 @@ def _tracker(board: Board, key: str, at: int) -> dict[str, Any]:
         "colour": COLOURS[at % len(COLOURS)],
         "rank": "–" if standing is None else rank_cell(standing).text,
         "ratio": None if standing is None else significant(standing.ratio.value, 4),
-        "success": [counts[False], len(runs)],
+        "success": [len(ended), len(runs)],
         "coverage": significant(float(np.mean([row.coverage for row in runs])), 4),
         "speed": significant(middle(row.real_time_factor for row in timed(ended)), 3),
         "memory": significant(middle(row.peak_memory_mb for row in ended), 4),
@@ -379,15 +374,14 @@ def run_content(
 
 def _facts(row: RunRow, record: RunRecord, rpe: Sequence[RPESpec]) -> list[list[str | float | None]]:
     """Name, number and unit of what is known of a run."""
-    rpe_facts = [
-        (f"RPE over {spec.describe()}", row.metrics.get(spec.metric("trans")), 1000, "mm/s" if spec.rate else "mm")
-        for spec in rpe
-    ]
     facts: list[tuple[str, float | None, int, str]] = [
         ("ATE, lost frames held", row.score_m, 1000, "mm"),
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, "mm"),
         ("ATE of the final trajectory", row.final_ate_m, 1000, "mm"),
-        *rpe_facts,
+        *(
+            (f"RPE over {spec.describe()}", row.metrics.get(spec.metric("trans")), 1000, "mm/s" if spec.rate else "mm")
+            for spec in rpe
+        ),
         ("coverage", row.coverage, 100, "%"),
         ("frame time", row.frame_ms, 1, "ms"),
         ("real time", row.real_time_factor, 1, "×"),
@@ -404,10 +398,10 @@ def _log(row: RunRow) -> str:
     if not path.is_file():
         return ""
     with path.open("rb") as file:
-        before = max(file.seek(0, os.SEEK_END) - _LOG_BYTES, 0)
-        file.seek(before)
+        skipped = max(file.seek(0, os.SEEK_END) - _LOG_BYTES, 0)
+        file.seek(skipped)
         text = file.read(_LOG_BYTES)
-    return (f"... {before} bytes before\n" if before else "") + text.decode(errors="replace")
+    return (f"... {skipped} bytes before\n" if skipped else "") + text.decode(errors="replace")
 
 
 def _series(frames: RunFrames, most: int) -> dict[str, Any]:
@@ -475,8 +469,7 @@ def _packed_track(track: Trajectory, columns: Mapping[str, Array], most: int) ->
     """Series along a track ``[N]`` or ``[N, 3]``, thinned, broken at gaps and packed."""
     start = float(track.timestamps[0])
     widths = [1 if values.ndim == 1 else values.shape[1] for values in columns.values()]
-    together = np.column_stack(list(columns.values()))
-    stamps, values = broken(track.timestamps - start, together, most)
+    stamps, values = broken(track.timestamps - start, np.column_stack(list(columns.values())), most)
     t, *rows = packed_rows(np.vstack([stamps, values.T]))
     packed: dict[str, Any] = {"start": start, "t": t}
     for name, width in zip(columns, widths, strict=True):
@@ -500,8 +493,7 @@ def broken(stamps: Array, values: Array, most: int) -> tuple[Array, Array]:
         return stamps, values
     intervals = np.diff(stamps)
     piece = np.concatenate([[0], np.cumsum(intervals > 2 * np.median(intervals))])
-    step = max(1, -(-len(stamps) // most))
-    keep = np.arange(len(stamps)) % step == 0
+    keep = np.arange(len(stamps)) % max(1, -(-len(stamps) // most)) == 0
     edge = np.diff(piece) > 0
     keep |= np.append(edge, True) | np.append(True, edge)  # the ends of every piece stay
     kept = np.flatnonzero(keep)
@@ -516,10 +508,7 @@ def broken(stamps: Array, values: Array, most: int) -> tuple[Array, Array]:
 def _angles(track: Trajectory, true: Trajectory) -> Array:
     """Yaw, pitch and roll (about the camera's y, x and z) from the first true pose, in degrees ``[N, 3]``."""
     turned = true.T_world_cam[0, :3, :3].T @ track.T_world_cam[:, :3, :3]
-    yaw = np.arctan2(turned[:, 0, 2], turned[:, 2, 2])
-    pitch = np.arcsin(np.clip(-turned[:, 1, 2], -1, 1))
-    roll = np.arctan2(turned[:, 1, 0], turned[:, 1, 1])
-    return np.asarray(np.degrees(np.unwrap(np.stack([yaw, pitch, roll], axis=1), axis=0)))
+    return np.asarray(np.degrees(np.unwrap(Rotation.from_matrix(turned).as_euler("YXZ"), axis=0)))
 
 
 # -- the frames of a run, from its ``frames.csv``
@@ -568,8 +557,12 @@ def read_frames(row: RunRow, exact: Mapping[int, float]) -> RunFrames:
         return RunFrames({}, np.zeros(0), np.zeros(0))
     errors_m, own = columns["frame_error_trans_m"], columns.get("stat_mask_fraction")
     if exact:
-        share = [exact.get(index + row.offset, np.nan) for index in columns["index"].tolist()]
-        return RunFrames(columns, errors_m, np.array(share), EXACT)
+        return RunFrames(
+            columns,
+            errors_m,
+            np.array([exact.get(index + row.offset, np.nan) for index in columns["index"].tolist()]),
+            EXACT,
+        )
     if own is not None and own.any():  # else it may have no masks
         return RunFrames(columns, errors_m, own, "the tracker's own masks")
     return RunFrames(columns, errors_m, np.full(len(errors_m), np.nan))
@@ -600,8 +593,9 @@ def read_table(path: Path, wanted: Callable[[str], bool]) -> Columns | None:
     try:
         if not path.is_file() or not path.stat().st_size:
             return None
-        content = io.BytesIO(read_bytes(path, limit=TABLE_BYTES))
-        table = pd.read_csv(content, usecols=wanted, dtype=kinds, low_memory=False)
+        table = pd.read_csv(
+            io.BytesIO(read_bytes(path, limit=TABLE_BYTES)), usecols=wanted, dtype=kinds, low_memory=False
+        )
     except (DynslamError, ValueError, OverflowError, OSError) as error:
         raise RunError(f"{CSV_FILE} is damaged: {error}") from error
     if not isinstance(table.index, pd.RangeIndex):
@@ -688,9 +682,8 @@ class Pictures:
         if not path.is_file():
             if time.time() >= self.deadline:
                 raise DynslamError("not drawn in the time for pictures", "make the report again: it goes on there")
-            image = self._sequence(record)[index].rgb
-            size = _shrunk_size(image, _WIDTH)
-            shrunk = cv2.resize(np.ascontiguousarray(image[:, :, ::-1]), size, interpolation=cv2.INTER_AREA)
+            bgr = np.ascontiguousarray(self._sequence(record)[index].rgb[:, :, ::-1])
+            shrunk = cv2.resize(bgr, _shrunk_size(bgr, _WIDTH), interpolation=cv2.INTER_AREA)
             write_atomic(path, _encoded(".webp", np.asarray(shrunk), cv2.IMWRITE_WEBP_QUALITY, _QUALITY))
         return path.relative_to(self.output).as_posix()
 

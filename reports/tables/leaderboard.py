@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import zip_longest
 from statistics import median
 
@@ -13,9 +14,9 @@ import numpy as np
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import MOST_COMPARED, STATIC_CAMERA, Board, Cell, mean_skipped, rank
+from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell, mean_skipped, rank
 from dynslam_bench.reports.model.published import ReportedCell
-from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
+from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (
     Column,
@@ -56,14 +57,9 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     standings = {standing.key: standing for standing in board.standings}
     epipolar = any(row.epipolar_skipped is not None for row in board.rows)
     columns = [
-        Column(
-            name,
-            numeric=name not in _WORDS,
-            meaning=meaning.replace("{reference}", board.reference_name),
-            latex=name not in _NOT_IN_LATEX,
-        )
-        for name, meaning in _MEANINGS.items()
-        if epipolar or name != "F skipped"
+        replace(column, meaning=column.meaning.replace("{reference}", board.reference_name))
+        for column in COLUMNS
+        if epipolar or column.name != "F skipped"
     ]
     rows = []
     for key in board.trackers:
@@ -72,30 +68,50 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     caption = _caption(board, protocol, epipolar)
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
     brief += ", with 95 % intervals" * any(math.isfinite(standing.ratio.low) for standing in board.standings)
-    muted = board.unranked_rows(board.trackers)
-    return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators(), brief)
+    return Table(
+        "leaderboard",
+        "Leaderboard",
+        caption,
+        columns,
+        rows,
+        board.unranked_rows(board.trackers),
+        board.separators(),
+        brief,
+    )
 
 
-_MEANINGS = {
-    "#": "ranks that the data leave open; several: not separable from the others with that rank",
-    "success": "runs that ended and could be evaluated, of all",
-    "tracker": "",
-    "ATE ratio": "geometric mean over sequences of the median ATE over that of {reference}",
-    "mean rank": "mean over sequences of the rank there",
-    "wins": "sequences with a smaller median ATE than the reference; behind it the probability that a run has a "
-    "smaller error than one of the reference",
-    "p": "paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it could never be "
-    "below 0.05",
-    "coverage": "tracked frames over associated input frames",
-    "× real time": "frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
-    "segmentation included, decoding excluded",
-    "MB": "peak resident memory",
-    "F skipped": "share of the tracked frames on which the epipolar test had no say, since F was not used",
-    "rows": "",
-    "provenance": "",
-}
-_WORDS = ("tracker", "rows", "provenance")
-_NOT_IN_LATEX = ("mean rank", "MB", "F skipped", "rows", "provenance")
+COLUMNS = (
+    Column("#", meaning="ranks that the data leave open; several: not separable from the others with that rank"),
+    Column("success", meaning="runs that ended and could be evaluated, of all"),
+    Column("tracker", numeric=False),
+    Column("ATE ratio", meaning="geometric mean over sequences of the median ATE over that of {reference}"),
+    Column("mean rank", meaning="mean over sequences of the rank there", latex=False),
+    Column(
+        "wins",
+        meaning="sequences with a smaller median ATE than the reference; behind it the probability that a run has a "
+        "smaller error than one of the reference",
+    ),
+    Column(
+        "p",
+        meaning="paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it could never "
+        "be below 0.05",
+    ),
+    Column("coverage", meaning="tracked frames over associated input frames"),
+    Column(
+        "× real time",
+        meaning="frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
+        "segmentation included, decoding excluded",
+    ),
+    Column("MB", meaning="peak resident memory", latex=False),
+    Column(
+        "F skipped",
+        meaning="share of the tracked frames on which the epipolar test had no say, since F was not used",
+        latex=False,
+    ),
+    Column("rows", numeric=False, latex=False),
+    Column("provenance", numeric=False, latex=False),
+)
+"""The leaderboard's columns; `_leaderboard_cells` fills them."""
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
@@ -149,7 +165,7 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
     coverage = float(np.mean([row.coverage for row in runs]))
     hinted = _hinted(runs)
     masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
-    tracker = runs[0].tracker
+    tracker, skipped = runs[0].tracker, mean_skipped(runs)
     cells = {
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
@@ -158,15 +174,13 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
         "× real time": speed_cell(ended),
         "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
         "rows": TableCell(tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items())),
+        "F skipped": TableCell() if skipped is None else TableCell(percent(skipped), value=skipped),
         "provenance": TableCell(
             _NAMES.get(tracker.provenance, tracker.provenance),
             f"{masks} masks" if masks else "",
             tip=_PROVENANCE.get(tracker.provenance, ""),
         ),
     }
-    skipped = mean_skipped(runs)
-    if skipped is not None:
-        cells["F skipped"] = TableCell(percent(skipped), value=skipped)
     if key in board.hopeless:
         return cells | {"ATE ratio": TableCell("nothing succeeded", emphasis="failed")}
     if standing is None:
@@ -176,8 +190,9 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
     best = key in first and 2 * len(first) <= len(board.ranked)
     ratio = interval_cell(standing.ratio, ".2f", "best" if best else "")
     if standing.sequences < len(board.common):
-        text = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
-        ratio = TableCell(ratio.text, text, ratio.value)
+        ratio = TableCell(
+            ratio.text, f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip(), ratio.value
+        )
     better = f"P {standing.better:.2f}" if standing.sequences >= FEWEST else ""
     wins = TableCell(f"{standing.wins} of {standing.sequences}", better, standing.wins)
     return cells | {
@@ -325,40 +340,6 @@ def _sequence_table(
     return Table(name, title, caption, columns, rows, muted, separators, brief)
 
 
-def common_frames_table(board: Board, common: Values, frames: Mapping[str, str]) -> Table | None:
-    """ATE on the frames that all evaluated runs of a sequence tracked; None where there are none.
-
-    Args:
-        board: The board.
-        common: ``(variant, sequence)`` to the median ATE there.
-        frames: Sequence to how many frames are common, in words.
-    """
-    if not common:
-        return None
-    marks = column_marks(board, common)
-    caption = (
-        "Median ATE (RMSE, millimetres) on those frames only that every successful run of the sequence tracked: a "
-        "tracker gains nothing here by losing the hard frames. Failed runs take no part."
-    )
-    counts = [sum(len(cells[name].kept) for cells in board.cells.values() if name in cells) for name in board.sequences]
-    if max(counts) > MOST_COMPARED:
-        caption += (
-            f" Of more than {MOST_COMPARED} runs on a sequence, these are the runs of every tracker around its median "
-            "error, as many of each."
-        )
-
-    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
-        words = mm(common[place]) + SEEN * cell.in_training
-        return TableCell(words, skipped_words(cell), common[place], marks.get(place, ""))
-
-    brief = "Absolute trajectory error on the common frames (RMSE, mm)"
-    table = _sequence_table(board, {"": common}, shown, "common_frames", "Error on the common frames", caption, brief)
-    table.muted_rows |= {len(table.rows)}
-    table.separators |= {len(table.rows)}
-    table.rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
-    return table
-
-
 def medians(board: Board, value: Value) -> dict[tuple[str, str], float]:
     """Median of a number over the runs that count and succeeded, by tracker and sequence."""
     of_cell = {}
@@ -389,18 +370,17 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
     sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
     usual = sizes.most_common(1)[0][0] if sizes else 1
-    medians = {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
-    marks = column_marks(board, medians)
+    marks = column_marks(
+        board, {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
+    )
     rows = []
     for key in board.trackers:
         cells = [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
         rows.append([TableCell(board.labels[key], tag="imported" * board.first(key).imported), *cells])
     rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
     separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
-    lines: dict[tuple[str, str], dict[str, ReportedCell]] = {}
-    for published in reported:
-        lines.setdefault((published.system, published.tag), {}).setdefault(published.sequence, published)
-    for (name, tag), line in lines.items():
+    for (name, tag), published in grouped(reported, lambda cell: (cell.system, cell.tag)).items():
+        line = {cell.sequence: cell for cell in reversed(published)}
         printed = [line.get(sequence) for sequence in board.sequences]
         cells = [TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell() for p in printed]
         rows.append([TableCell(name, tag=tag), *cells])
@@ -430,9 +410,15 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
             trained = [name for name in board.sequences if name in cells_of and cells_of[name].in_training]
             row.append(TableCell(", ".join(board.short[name] for name in trained)))
         caption += f" {SEEN_NOTE}"
-    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
     return Table(
-        "per_sequence", "Absolute trajectory error by sequence (mm)", caption, columns, rows, muted, separators, brief
+        "per_sequence",
+        "Absolute trajectory error by sequence (mm)",
+        caption,
+        columns,
+        rows,
+        muted,
+        separators,
+        "Absolute trajectory error (RMSE, mm), lost frames held",
     )
 
 
@@ -552,8 +538,8 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         ratio = cell.median / max(base, FLOOR_M)
         colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
         tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
-    shown = mm(cell.median) + SEEN * cell.in_training
-    return TableCell(shown, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
+    text = mm(cell.median) + SEEN * cell.in_training
+    return TableCell(text, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
 
 
 def _spread(cell: Cell) -> str:
@@ -598,14 +584,17 @@ def failure_rule_table(board: Board) -> Table | None:
                 cells += [rank_cell(standings[key]), interval_cell(standings[key].ratio, ".2f")]
             else:
                 cells += [TableCell(), TableCell()]
-    caption = (
+    return Table(
+        "failure_rules",
+        "Sensitivity to the rule for lost frames and failures",
         "The same runs under three rules. Lost frames held: the report's rule, a lost frame counts as not having moved "
         "since the last tracked one. Lost frames left out: the error of the tracked frames only, which is what most "
         "papers print; a tracker gains by losing the hard frames. Failures left out too: survivors only, which also "
         "flatters trackers that fail; in the first two they count as a static camera, or worse. A ranking "
-        "that changes between the rules is decided by the rule."
+        "that changes between the rules is decided by the rule.",
+        columns,
+        rows,
     )
-    return Table("failure_rules", "Sensitivity to the rule for lost frames and failures", caption, columns, rows)
 
 
 def _tracked_error(row: RunRow) -> float | None:
@@ -636,8 +625,13 @@ def failures(board: Board) -> Table | None:
         ]
         for row in sorted(failed, key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key))
     ]
-    caption = "Runs that crashed, took too long or too much, broke their contract, were lost, or cannot be evaluated."
-    return Table("failures", "Failures", caption, columns, rows)
+    return Table(
+        "failures",
+        "Failures",
+        "Runs that crashed, took too long or too much, broke their contract, were lost, or cannot be evaluated.",
+        columns,
+        rows,
+    )
 
 
 def repeatability(board: Board) -> Table | None:
@@ -654,12 +648,15 @@ def repeatability(board: Board) -> Table | None:
     rows = [cells for key in board.trackers if (cells := _spread_cells(board, key))]
     if not rows:
         return None
-    caption = (
+    return Table(
+        "repeatability",
+        "Repeatability",
         "How far the runs of one tracker on one sequence lie apart when only seed, start offset or sensor noise "
         "differ. Differences between trackers that are smaller than this are noise. Copies (several seeds, one result "
-        "to the last digit) are no repeats: they are counted as deterministic and take no part. Neither do failures."
+        "to the last digit) are no repeats: they are counted as deterministic and take no part. Neither do failures.",
+        columns,
+        rows,
     )
-    return Table("repeatability", "Repeatability", caption, columns, rows)
 
 
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
@@ -674,10 +671,10 @@ def _spread_cells(board: Board, key: str) -> list[TableCell]:
     for name, cell in several.items():
         errors = [row.score_m or 0.0 for row in cell.succeeded]
         spreads[name] = max(errors) / max(min(errors), FLOOR_M)
-    where = max(spreads, key=lambda name: (spreads[name], name))
+    widest = max(spreads, key=lambda name: (spreads[name], name))
     size = f"{median(len(cell.succeeded) for cell in several.values()):g}"
-    ratios = [number(median(spreads.values()), ".2f"), number(spreads[where], ".2f")]
-    return [*counts, TableCell(size), *ratios, TableCell(where)]
+    ratios = [number(median(spreads.values()), ".2f"), number(spreads[widest], ".2f")]
+    return [*counts, TableCell(size), *ratios, TableCell(widest)]
 
 
 def machines(board: Board) -> Table:
@@ -685,8 +682,7 @@ def machines(board: Board) -> Table:
     counts = Counter(row.machine_words or "not recorded" for row in board.rows)
     columns = [Column("runs"), Column("machine and versions", numeric=False)]
     rows = [[number(count), TableCell(name)] for name, count in counts.most_common()]
-    caption = "Times of different machines are not comparable."
-    return Table("machines", "Machines and versions", caption, columns, rows)
+    return Table("machines", "Machines and versions", "Times of different machines are not comparable.", columns, rows)
 
 
 # -- the implemented paper's Tables 1 to 3, made of our own runs
@@ -730,12 +726,11 @@ def relative_table(board: Board, protocol: Protocol) -> Table | None:
 
 def time_table(board: Board) -> Table | None:
     """Table 3: accuracy, error and time of a frame; None if nothing was scored."""
-    columns: dict[str, Value] = {
-        "accuracy (%)": lambda row: None if (share := _share(row)) is None else 100 - share,
-        "error (%)": _share,
-        "time (ms)": lambda row: None if _share(row) is None else row.frame_ms,
+    measures = {
+        "accuracy (%)": medians(board, lambda row: None if (share := _share(row)) is None else 100 - share),
+        "error (%)": medians(board, _share),
+        "time (ms)": medians(board, lambda row: None if _share(row) is None else row.frame_ms),
     }
-    measures = {name: medians(board, value) for name, value in columns.items()}
     if not measures["error (%)"]:
         return None
     caption = (
@@ -748,8 +743,15 @@ def time_table(board: Board) -> Table | None:
     def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
         return number(measures[kind][place], ".1f")
 
-    brief = "Error in percent of a static camera, accuracy, and time of a frame"
-    return _sequence_table(board, measures, shown, "paper_accuracy", "Accuracy, error and time", caption, brief)
+    return _sequence_table(
+        board,
+        measures,
+        shown,
+        "paper_accuracy",
+        "Accuracy, error and time",
+        caption,
+        "Error in percent of a static camera, accuracy, and time of a frame",
+    )
 
 
 def _share(row: RunRow) -> float | None:
@@ -771,11 +773,21 @@ def _statistics_table(
 
     def shown(cell: Cell, place: tuple[str, str], kind: str) -> TableCell:
         error = errors[kind][place]
-        words = mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell)
-        return TableCell(words, value=error, emphasis=marks[kind].get(place, ""))
+        return TableCell(
+            mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell),
+            value=error,
+            emphasis=marks[kind].get(place, ""),
+        )
 
-    caption = f"{source} Millimetres (metres in the CSV), median over the runs that succeeded."
-    table = _sequence_table(board, errors, shown, name, title, caption, brief)
+    table = _sequence_table(
+        board,
+        errors,
+        shown,
+        name,
+        title,
+        f"{source} Millimetres (metres in the CSV), median over the runs that succeeded.",
+        brief,
+    )
     if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
         table.caption += f" {LOST_NOTE}"
     keys = {key for key, _ in errors["rmse"]}

@@ -69,8 +69,7 @@ def test_latex_stands_in_blocks_and_floats():
     rows = [[TableCell(f"t{i}"), *(TableCell(f"{10 * i + j}.5") for j in range(12))] for i in range(15)]
     text = to_latex(Table("t", "T", "long", names, rows), "p")
     assert text.count(r"\begin{tabular}") > text.count(r"\caption{T, protocol p") > 1
-    shown = re.findall(r"(\d+\.5)", text)
-    assert sorted(shown) == sorted(f"{10 * i + j}.5" for i in range(15) for j in range(12))
+    assert sorted(re.findall(r"(\d+\.5)", text)) == sorted(f"{10 * i + j}.5" for i in range(15) for j in range(12))
 
 
 def test_no_name_is_more_than_a_name():
@@ -83,8 +82,7 @@ def test_no_name_is_more_than_a_name():
     assert "## a # b" in markdown and "\nc # d &lt;i>" in markdown
 
 
-def test_a_spreadsheet_takes_no_name_for_a_formula(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_a_spreadsheet_takes_no_name_for_a_formula(store, tmp_path):
     for label in ("=cmd|' /C calc'!A0", "+1", "@sum", "-2+3", "\x1b[2J\u202e"):
         add_run(store, f"t{label}", "s/a", label=label, n=40)
     paths = build_report(store, tmp_path / "report", title="one\n# two\n<script>")

@@ -9,15 +9,13 @@ from dynslam_bench.core import reading
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, figures
-from dynslam_bench.reports.build_report import thinned_note
+from dynslam_bench.reports.build_report import masks_section
 from dynslam_bench.reports.html import explore
 from dynslam_bench.reports.html.explore import FEWER_PAGES, MOST_PAGES, pages_for
-from dynslam_bench.reports.model import board as board_module
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_csv, to_markdown
-from dynslam_bench.runs import RunStore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 
@@ -31,8 +29,7 @@ def opened(monkeypatch):
     return found
 
 
-def test_fifty_known_runs_cost_no_file_each(tmp_path, opened):
-    store = RunStore(tmp_path / "results")
+def test_fifty_known_runs_cost_no_file_each(store, tmp_path, opened):
     for number in range(50):
         add_run(store, f"tracker-{number % 5}", f"s/{number % 2}", number // 10, n=20)
     load_runs([store], PROTOCOL)
@@ -61,19 +58,6 @@ def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
     assert {(run[1], run[2]) for run in short["runs"]} == {(cell[0], cell[1]) for cell in whole["cells"]}
 
 
-def test_common_frames_of_many_runs_are_those_around_every_median(monkeypatch):
-    errors = {"a": [0.5, 0.1, 0.3, 0.2, 0.4], "b": [1.0], "c": [3.0, 1.0, 2.0, 4.0]}
-    board = make_board([row(key, "s", error, seed=at) for key, some in errors.items() for at, error in enumerate(some)])
-    for most, kept in (
-        (10, errors),
-        (9, {"a": [0.2, 0.3, 0.4], "b": [1.0], "c": [1.0, 2.0, 3.0]}),
-        (1, {"a": [0.3], "b": [1.0], "c": [2.0]}),
-    ):
-        monkeypatch.setattr(board_module, "MOST_COMPARED", most)
-        compared = [(r.tracker.id, r.metrics["ate_rmse_m"]) for r in board_module.compared_runs(board, "s")]
-        assert sorted(compared) == sorted((key, error) for key, some in kept.items() for error in some)
-
-
 def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
     monkeypatch.setattr(tables, "MOST_ROWS", 3)
     long = Table("long", "Long", "All of it.", [Column("x")], [[TableCell(str(at), value=at)] for at in range(5)])
@@ -81,17 +65,13 @@ def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
     assert "All of it. These are the first 3 of 5 rows; all stand in csv/long.csv." in to_markdown(long)
 
 
-def test_figures_thin_many_points_and_say_so(tmp_path, monkeypatch):
+def test_the_figure_of_masks_thins_many_points_and_keeps_the_best(tmp_path, monkeypatch):
     board = make_board(load_runs([fill(tmp_path / "results", sequences=["s/a", "s/b"], seeds=range(4))], PROTOCOL).rows)
-    whole = figures.repeat_figure(board)
-    assert thinned_note(board) == ""
+    whole = figures.mask_figure(board)
     monkeypatch.setattr(figures, "MOST_POINTS", 3)
-    thin = figures.repeat_figure(board)
-    assert "more than 3 runs" in thinned_note(board)
-    best = [[min(trace["x"]) for trace in figure["data"]] for figure in (whole, thin)]
-    assert best[0] == best[1] and {len(trace["x"]) for trace in thin["data"]} <= {2, 3}
-    assert {len(trace["text"]) for trace in thin["data"]} <= {2, 3}
-    assert {len(trace["x"]) for trace in figures.mask_figure(board)["data"]} <= {2, 3}
+    thin = figures.mask_figure(board)
+    assert {len(trace["x"]) for trace in thin["data"]} <= {2, 3} and "more than 3 runs" in str(masks_section(board))
+    assert [min(trace["y"]) for trace in thin["data"]] == [min(trace["y"]) for trace in whole["data"]]
 
 
 def test_csv_of_every_kind_of_column():
@@ -115,8 +95,7 @@ def test_csv_of_every_kind_of_column():
 def test_rows_are_written_one_a_line_and_read_back(tmp_path):
     rows = [row(run_id=digest([at], 16), reason="postgresql://me:secret@db/x") for at in range(3)]
     for some in (rows, rows[:1], []):
-        data = ReportData(title="t", protocol="p", reference="r", version="1", rows=some)
-        data.write(tmp_path / "report.json")
+        ReportData(title="t", protocol="p", reference="r", version="1", rows=some).write(tmp_path / "report.json")
         text = (tmp_path / "report.json").read_text()
         read = ReportData.read(tmp_path / "report.json")
         assert [each.run_id for each in read.rows] == [each.run_id for each in some]
