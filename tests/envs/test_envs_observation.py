@@ -18,7 +18,8 @@ FRAME = Frame(3, 1.0, *images(3))
 
 
 def observe(result: TrackResult, frame: Frame = FRAME, motion: np.ndarray | None = None) -> dict[str, float]:
-    vector = stats_observation(frame, result, progress=0.5, lost_streak=0, motion=se3.log(motion))
+    twist = None if motion is None else se3.log(motion)
+    vector = stats_observation(frame, result, progress=0.5, lost_streak=0, motion=twist)
     assert vector in stats_space() and np.isfinite(vector).all()
     return dict(zip((name for name, _ in STATS_LAYOUT), vector.tolist(), strict=True))
 
