@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -369,4 +369,6 @@ def _adapted(sensor: SensorSettings, world: Mapping[str, Any]) -> SensorSettings
 
 def default_threads() -> int:
     """Cores this process may use, at most four; ``NUMBA_NUM_THREADS`` lowers it."""
-    return min(4, int(numba.config.NUMBA_NUM_THREADS))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get("NUMBA_NUM_THREADS", "")
+    return max(1, min(cores, 4, int(limit) if limit.isdigit() and int(limit) > 0 else 4))
