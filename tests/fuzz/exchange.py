@@ -10,8 +10,8 @@ import numpy as np
 
 from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.runs.exchange import transfer as provenance
 from dynslam_bench.runs.exchange import formats
+from dynslam_bench.runs.exchange import transfer as provenance
 from dynslam_bench.runs.exchange.transfer import PROVENANCE_FILE, Provenance
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.slam import map_files
