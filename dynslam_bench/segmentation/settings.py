@@ -161,7 +161,7 @@ class SegmentationSettings(Settings):
     def unused(self) -> Mapping[str, str]:
         """Tunable fields without effect: exact masks have no scores, recorded masks no probabilities."""
         fields: dict[str, tuple[str, ...]] = {
-            "none": type(self).model_fields.keys() - {"source"},
+            "none": tuple(type(self).model_fields.keys() - {"source"}),
             "oracle": ("confidence", "mask_threshold"),
             "oracle-classes": ("confidence", "mask_threshold"),
             "recorded": ("mask_threshold",),

@@ -267,7 +267,7 @@ class RgbdBackend:
     ) -> BackendResult:
         """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
         self.state, self._first = "lost", None
-        textured = np.count_nonzero((observations.z > 0) | (not self.uses_depth)) >= MIN_INITIAL
+        textured = int(((observations.z > 0) | (not self.uses_depth)).sum()) >= MIN_INITIAL
         if self._tracked:
             self._gate.lose(last, observations, textured=textured)
         self._tracked = False

@@ -415,8 +415,8 @@ class LoopCloser:
         self.rescaled = dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array) -> Edge:
-        ids = self.world.kf_id[[one, other]].tolist()
-        return Edge(*ids, pose_of_other @ se3.inverse(self.world.kf_pose[one]))
+        id_one, id_other = self.world.kf_id[[one, other]].tolist()
+        return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.world.kf_pose[one]))
 
     def _covisibility_edges(self, slots: Slots) -> list[Edge]:
         """Edges of each keyframe to the older ones that share many points, and to the one that shares most.

@@ -172,7 +172,7 @@ class RelocalisationGate:
         """
         self.start(last)
         self._advance(observations)
-        self._kidnapped = self.rotation is None and textured and np.count_nonzero(last.point >= 0) >= KIDNAP_POINTS
+        self._kidnapped = self.rotation is None and textured and int((last.point >= 0).sum()) >= KIDNAP_POINTS
 
     def start(self, last: TrackedFrame) -> None:
         """The camera counts as lost from the next frame on; `last` is the last tracked one."""
