@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -20,7 +19,7 @@ from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, render, resource, table_blocks
-from dynslam_bench.reports.model.board import Board, On, common_errors, make_board, missing_commands, missing_note
+from dynslam_bench.reports.model.board import Board, On, make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import (
     Loaded,
     OnProgress,
@@ -124,7 +123,7 @@ def build_report(
             leaderboard_section(board, protocol, loaded),
             Section("explore", "Explore", "Explore", explore_notes, [Block("explore")]),
             speed_section(board),
-            errors_section(board, protocol, pool),
+            errors_section(board, protocol),
             paper_section(board, protocol),
             trajectories_section(board, protocol),
             repeatability_section(board),
@@ -258,7 +257,7 @@ def speed_section(board: Board) -> Section:
     return Section("speed", "Accuracy against speed", "Speed", blocks=blocks)
 
 
-def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> Section:
+def errors_section(board: Board, protocol: Protocol) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
     section = Section("errors", "Errors by sequence", "Errors")
     if not board.sequences:
@@ -281,10 +280,8 @@ def errors_section(board: Board, protocol: Protocol, pool: Executor | None) -> S
         )
     table_of_errors = tables.per_sequence(board, protocol, published)
     section.blocks.append(Block("table", "Absolute trajectory error", table_of_errors))
-    common, frames = common_errors(board, protocol, pool)
     lost = any(row.coverage < 1 and not row.failed for row in board.rows)
     section.blocks += table_blocks(
-        tables.common_frames_table(board, common, frames),
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
         tables.tracked_errors(board, protocol) if lost else None,
         tables.failure_rule_table(board),

@@ -6,7 +6,7 @@ from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_fil
 from dynslam_bench.evaluation.hints import Hint, hints
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
 from dynslam_bench.evaluation.online import OnlineError, OnlineSample
-from dynslam_bench.evaluation.prepare import common_frames, coverage, hold
+from dynslam_bench.evaluation.prepare import coverage, hold
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, RPESpec, get_protocol
 
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "OnlineSample",
     "Protocol",
     "RPESpec",
-    "common_frames",
     "compare_masks",
     "compare_protocols",
     "coverage",

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import reduce
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -98,7 +95,7 @@ def apply_policy(
     return (hold(estimate, input_timestamps) if held else estimate), tracked
 
 
-# Which frames take part: coverage, frames common to several trajectories, and held poses of lost frames.
+# Which frames take part: coverage, and held poses of lost frames.
 
 STAMP_TOLERANCE = 1e-3
 """Seconds within which two stamps name the same input frame (trajectory files round to a microsecond or worse)."""
@@ -151,24 +148,3 @@ def hold(estimate: Trajectory, input_timestamps: ArrayLike) -> Trajectory:
     tracked = tracked_frames(estimate, stamps)
     latest = np.maximum(np.cumsum(tracked) - 1, 0)
     return Trajectory(stamps, estimate.T_world_cam[latest])
-
-
-def common_frames(trajectories: Sequence[Trajectory], tolerance: float = STAMP_TOLERANCE) -> list[Trajectory]:
-    """Each trajectory reduced to the frames that all of them have, for a comparison free of coverage.
-
-    Args:
-        trajectories: At least one.
-        tolerance: Seconds within which two stamps name the same frame.
-
-    Raises:
-        EvaluationError: There are no trajectories.
-    """
-    if not trajectories:
-        raise EvaluationError("there are no trajectories to find common frames of")
-
-    def shared(stamps: NDArray[np.float64], other: Trajectory) -> NDArray[np.float64]:
-        index, _ = associate(stamps, other.timestamps, tolerance, strict=False)
-        return stamps[index]
-
-    stamps = reduce(shared, trajectories[1:], trajectories[0].timestamps)
-    return [one.select(associate(stamps, one.timestamps, tolerance, strict=False)[1]) for one in trajectories]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
@@ -12,12 +10,10 @@ from pathlib import Path
 from statistics import geometric_mean, median
 from typing import TYPE_CHECKING, Any, Literal
 
-from dynslam_bench.core.errors import DynslamError, ReportError, did_you_mean
+from dynslam_bench.core.errors import ReportError, did_you_mean
 from dynslam_bench.core.toml import assignments
-from dynslam_bench.evaluation.ape import ate_rmse_m
-from dynslam_bench.evaluation.prepare import common_frames
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores, run_jobs
+from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
@@ -138,8 +134,45 @@ class Board:
         return {key: cell.typical for key, cell in cells.items() if cell.succeeded}
 
     def frame(self) -> pd.DataFrame:
-        """All rows as a pandas frame; see `rows_frame` for its columns and units."""
-        return rows_frame(self.rows, self.columns, self.labels)
+        """All rows as a pandas frame.
+
+        Returns:
+            One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``. ``string`` columns:
+            run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
+            ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
+            status, ending (of a failed run), study (of which the run is a trial), protocol_id, protocol_digest,
+            trajectory (``online``, ``final``: whose errors they are), segmentation.
+            ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked.
+            ``boolean``: ranked, failed, cached (whether stage times come from the stage cache), seen_in_training
+            (whether the masks come from a network that was trained on the scene). ``Float64``: coverage and
+            epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held, failures as a
+            static camera or worse), hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m (metres), frame_ms
+            (median, milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), rotation_uncertainty_deg
+            (standard error in degrees of the alignment's rotation; above 10 the metrics ``ape_rot_*`` say nothing of
+            the tracker), and every metric of the protocol under its own name, the unit at its end (``ate_rmse_m``,
+            ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
+        """
+        import pandas as pd
+
+        metrics = sorted({name for row in self.rows for name in row.metrics} - set(_COLUMNS["Float64"]))
+        kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(metrics, "Float64")
+        lines = []
+        for row in sorted(self.rows, key=lambda r: (self.labels[r.variant_key], self.sequence(r), r.repeat_key)):
+            values: dict[str, Any] = {
+                "kind": row.origin,
+                "tracker": row.tracker.id,
+                "label": self.labels[row.variant_key],
+                "settings": "; ".join(assignments(row.variant)),
+                "provenance": row.tracker.provenance,
+                "sequence": self.sequence(row),
+                "frames": part_words(row),
+                "split": row.sequence.split,
+                "study": row.trial_of,
+                "noise": row.sequence.noise,
+            }
+            values |= {name: row.metrics.get(name) for name in metrics}
+            lines.append([values[name] if name in values else getattr(row, name) for name in kinds])
+        return pd.DataFrame(lines, columns=list(kinds), dtype=object).astype(kinds)
 
     def competes(self, key: str, name: str) -> bool:
         """Whether a tracker's number on a sequence may rank: no network that it uses was trained there."""
@@ -190,7 +223,11 @@ def make_board(
     for key in board.labels:
         cells = grouped(board.runs(key), board.sequence)
         board.cells[key] = {name: make_cell(runs) for name, runs in cells.items()}
-    board.final_only = [key for key in board.labels if all(map(_is_final_only, board.runs(key)))]
+    board.final_only = [
+        key
+        for key in board.labels  # imports that have nothing of the trajectory that the protocol asks for
+        if all(row.imported and not row.metrics and row.final_ate_m is not None for row in board.runs(key))
+    ]
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
@@ -201,11 +238,6 @@ def make_board(
     board.trackers = sorted(placed, key=lambda key: key in board.hopeless)
     board.ranked = [key for key in board.trackers if key in board.ranked]
     return board
-
-
-def _is_final_only(row: RunRow) -> bool:
-    """Whether an import has nothing of the trajectory that the protocol asks for."""
-    return row.imported and not row.metrics and row.final_ate_m is not None
 
 
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
@@ -381,16 +413,16 @@ def mean_skipped(rows: Sequence[RunRow]) -> float | None:
 # -- the cells that are missing, and the commands that fill them
 
 
-def lacking(board: Board) -> dict[str, list[str]]:
+def missing_cells(board: Board) -> dict[str, list[str]]:
     """The sequences on which each tracker that could be ranked was not run."""
     rankable = [key for key in board.trackers if board.is_rankable(key)]
-    lacking = {key: [name for name in board.sequences if name not in board.cells[key]] for key in rankable}
-    return {key: names for key, names in lacking.items() if names}
+    missing = {key: [name for name in board.sequences if name not in board.cells[key]] for key in rankable}
+    return {key: names for key, names in missing.items() if names}
 
 
 def missing_note(board: Board) -> str:
     """One paragraph: what the ranking stands on, and what is missing for more; empty where nothing is."""
-    missing = lacking(board)
+    missing = missing_cells(board)
     if not missing:
         return ""
     common, total = len(board.common), len(board.sequences)
@@ -417,7 +449,7 @@ def missing_commands(board: Board) -> list[str]:
     commands: list[str] = []
     plainest = sorted(board.rows, key=lambda row: (row.sequence.noise is not None, row.offset))
     by_sequence = grouped(plainest, board.sequence)
-    for key, names in lacking(board).items():
+    for key, names in missing_cells(board).items():
         if board.first(key).imported:
             continue
         seeds = sorted({run.seed for run in board.runs(key)})
@@ -431,7 +463,7 @@ def missing_commands(board: Board) -> list[str]:
     return commands
 
 
-# -- the rows as a frame
+# -- from results folders
 
 _COLUMNS = {
     "string": (
@@ -445,55 +477,7 @@ _COLUMNS = {
         *("real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"),
     ),
 }
-"""Type of a column to the names."""
-
-
-def rows_frame(rows: Sequence[RunRow], columns: Mapping[str, str], labels: Mapping[str, str]) -> pd.DataFrame:
-    """Rows as a frame.
-
-    Args:
-        rows: One a run.
-        columns: Column id to the name of its sequence, see `name_columns`.
-        labels: Variant key to the name of the tracker in tables, see `make_labels`.
-
-    Returns:
-        One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``. ``string`` columns:
-        run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
-        ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
-        status, ending (of a failed run), study (of which the run is a trial), protocol_id, protocol_digest, trajectory
-        (``online``, ``final``: whose errors they are), segmentation.
-        ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked. ``boolean``:
-        ranked, failed, cached (whether stage times come from the stage cache), seen_in_training (whether the masks
-        come from a network that was trained on the scene). ``Float64``: coverage and
-        epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held,
-        failures as a static camera or worse), hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m (metres),
-        frame_ms (median, milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1),
-        rotation_uncertainty_deg (standard error in degrees of the alignment's rotation; above 10 the metrics
-        ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under
-        its own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
-    """
-    import pandas as pd
-
-    ordered = sorted(rows, key=lambda r: (labels[r.variant_key], columns[r.column_id], r.repeat_key))
-    metrics = sorted({name for row in rows for name in row.metrics} - set(_COLUMNS["Float64"]))
-    kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(metrics, "Float64")
-    lines = []
-    for row in ordered:
-        values: dict[str, Any] = {
-            "kind": row.origin,
-            "tracker": row.tracker.id,
-            "label": labels[row.variant_key],
-            "settings": "; ".join(assignments(row.variant)),
-            "provenance": row.tracker.provenance,
-            "sequence": columns[row.column_id],
-            "frames": part_words(row),
-            "split": row.sequence.split,
-            "study": row.trial_of,
-            "noise": row.sequence.noise,
-        }
-        values |= {name: row.metrics.get(name) for name in metrics}
-        lines.append([values[name] if name in values else getattr(row, name) for name in kinds])
-    return pd.DataFrame(lines, columns=list(kinds), dtype=object).astype(kinds)
+"""Type of a column of `Board.frame` to the names."""
 
 
 def load_frame(
@@ -510,13 +494,12 @@ def load_frame(
         trials: As in `build_report`.
 
     Returns:
-        The frame that `rows_frame` describes.
+        As `Board.frame`.
 
     Raises:
         ReportError: There are no runs.
     """
-    rows = load_runs(open_stores(results), get_protocol(protocol), trials=trials).rows
-    return rows_frame(rows, name_columns(rows), make_labels(rows))
+    return load_board(results, protocol, trials=trials).frame()
 
 
 def load_board(
@@ -543,65 +526,3 @@ def load_board(
     """
     rows = load_runs(open_stores(results), get_protocol(protocol), trials=trials).rows
     return make_board(rows, reference, on, rank_seen=rank_seen)
-
-
-# -- the frames that all runs of a sequence tracked, and the runs that stand for a tracker in figures
-
-MOST_COMPARED = 100
-"""Runs on one sequence of which the common frames are taken, about: of more, as many of every tracker."""
-
-
-def common_errors(
-    board: Board, protocol: Protocol, pool: Executor | None = None
-) -> tuple[dict[tuple[str, str], float], dict[str, str]]:
-    """Median ATE on the frames that all successful runs tracked, by (variant, sequence), and how many those are.
-
-    Of more than `MOST_COMPARED` runs on a sequence these are the runs of each tracker around its median error.
-    """
-    jobs = [(compared_runs(board, sequence), protocol) for sequence in board.sequences]
-    answers = run_jobs(pool, _common_of, jobs)
-    errors: dict[tuple[str, str], float] = {}
-    frames: dict[str, str] = {}
-    for sequence, (medians, words) in zip(board.sequences, answers, strict=True):
-        errors |= {(key, sequence): error for key, error in medians.items()}
-        if words:
-            frames[sequence] = words
-    return errors, frames
-
-
-def _common_of(rows: Sequence[RunRow], protocol: Protocol) -> tuple[dict[str, float], str]:
-    """Median ATE by variant on the frames that all runs tracked, and how many those are; nothing for one variant."""
-    pairs = [(row, row.estimate(protocol.trajectory)) for row in rows]
-    tracked = [(row, trajectory) for row, trajectory in pairs if trajectory is not None]
-    if len({row.variant_key for row, _ in tracked}) < 2:
-        return {}, ""
-    reduced = common_frames([trajectory for _, trajectory in tracked])
-    errors: dict[str, list[float]] = {}
-    for (row, whole), trajectory in zip(tracked, reduced, strict=True):
-        with suppress(DynslamError):
-            truth = row.ground_truth()
-            if len(trajectory) == len(whole) and protocol.lost_frames == "exclude":  # the error is that of the row
-                errors.setdefault(row.variant_key, []).append(row.metrics["ate_rmse_m"])
-            elif truth is not None:
-                errors.setdefault(row.variant_key, []).append(ate_rmse_m(trajectory, truth, protocol))
-    words = f"{len(reduced[0])} of {max(row.n_frames for row, _ in tracked)}"
-    return {key: median(values) for key, values in errors.items()}, words
-
-
-def compared_runs(board: Board, sequence: str) -> list[RunRow]:
-    """The runs on a sequence that ended and could be evaluated, copies left out.
-
-    Of more than `MOST_COMPARED` as many of each tracker: those around its (lower) median error.
-    """
-    kept = [row for cells in board.cells.values() if sequence in cells for row in cells[sequence].kept]
-    evaluated = [row for row in kept if not row.failed and "ate_rmse_m" in row.metrics]
-    if len(evaluated) <= MOST_COMPARED:
-        return evaluated
-    ordered = sorted(evaluated, key=lambda row: row.metrics["ate_rmse_m"])
-    chosen = []
-    by_tracker = grouped(ordered, lambda row: row.variant_key)
-    most = max(MOST_COMPARED // len(by_tracker), 1)
-    for runs in by_tracker.values():
-        first = max((len(runs) - most) // 2, 0)
-        chosen += runs[first : first + most]
-    return chosen

@@ -13,7 +13,7 @@ import numpy as np
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import MOST_COMPARED, STATIC_CAMERA, Board, Cell, mean_skipped, rank
+from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell, mean_skipped, rank
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
@@ -323,40 +323,6 @@ def _sequence_table(
     separators = {ranked} if 0 < ranked < len(rows) else set()
     columns = [*texts("tracker"), *sequence_columns(board, list(measures))]
     return Table(name, title, caption, columns, rows, muted, separators, brief)
-
-
-def common_frames_table(board: Board, common: Values, frames: Mapping[str, str]) -> Table | None:
-    """ATE on the frames that all evaluated runs of a sequence tracked; None where there are none.
-
-    Args:
-        board: The board.
-        common: ``(variant, sequence)`` to the median ATE there.
-        frames: Sequence to how many frames are common, in words.
-    """
-    if not common:
-        return None
-    marks = column_marks(board, common)
-    caption = (
-        "Median ATE (RMSE, millimetres) on those frames only that every successful run of the sequence tracked: a "
-        "tracker gains nothing here by losing the hard frames. Failed runs take no part."
-    )
-    counts = [sum(len(cells[name].kept) for cells in board.cells.values() if name in cells) for name in board.sequences]
-    if max(counts) > MOST_COMPARED:
-        caption += (
-            f" Of more than {MOST_COMPARED} runs on a sequence, these are the runs of every tracker around its median "
-            "error, as many of each."
-        )
-
-    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
-        words = mm(common[place]) + SEEN * cell.in_training
-        return TableCell(words, skipped_words(cell), common[place], marks.get(place, ""))
-
-    brief = "Absolute trajectory error on the common frames (RMSE, mm)"
-    table = _sequence_table(board, {"": common}, shown, "common_frames", "Error on the common frames", caption, brief)
-    table.muted_rows |= {len(table.rows)}
-    table.separators |= {len(table.rows)}
-    table.rows.append([TableCell("common frames"), *(TableCell(frames.get(name, "")) for name in board.sequences)])
-    return table
 
 
 def medians(board: Board, value: Value) -> dict[tuple[str, str], float]:

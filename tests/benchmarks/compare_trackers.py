@@ -151,12 +151,11 @@ def processor_seconds() -> tuple[float, float]:
 
 def score_pair(outcome: dict[str, dict], sequence, protocol: str) -> None:
     """Add the errors of one run of each, on common and on own frames."""
-    from dynslam_bench.evaluation import common_frames
-
     for kind in ("online", "final"):
         both = {side: outcome[side][f"_{kind}"] for side in "ab"}
         present = {side: one for side, one in both.items() if one is not None and len(one)}
-        shared = dict(zip(present, common_frames(list(present.values())), strict=True)) if present else {}
+        stamps = [one.timestamps for one in present.values()]
+        shared = {side: one.select(np.isin(one.timestamps, reduce(np.intersect1d, stamps))) for side, one in present.items()}
         for side in "ab":
             outcome[side][f"ate_{kind}_m"] = ate(shared.get(side), sequence, protocol)
             outcome[side][f"own_ate_{kind}_m"] = ate(both[side], sequence, protocol)

@@ -9,7 +9,6 @@ from dynslam_bench.evaluation import (
     PROTOCOLS,
     Evaluation,
     Protocol,
-    common_frames,
     compare_masks,
     coverage,
     evaluate,
@@ -219,20 +218,6 @@ def test_stamps_of_the_depth_images_count_for_their_frames():
     truth = walk(n=30)
     tracked = Trajectory(truth.timestamps + 0.011, truth.T_world_cam).select(np.r_[0:10, 20:30])
     assert coverage(tracked, truth.timestamps) == pytest.approx(20 / 30)
-
-
-def test_common_frames_are_those_of_all():
-    truth = walk(n=50)
-    a = truth.select(np.r_[0:30])
-    b = noisy(truth).select(np.r_[10:50])
-    c = Trajectory(truth.timestamps[::2] + 3e-4, truth.T_world_cam[::2])  # a file that rounds its stamps
-    one, two, three = common_frames([a, b, c])
-    assert np.array_equal(one.timestamps, truth.timestamps[10:30:2])
-    assert np.array_equal(two.T_world_cam, b.T_world_cam[0:20:2])
-    assert len(three) == 10
-    assert common_frames([c, a, b])[0].timestamps.tolist() == three.timestamps.tolist()
-    with pytest.raises(EvaluationError, match="no trajectories"):
-        common_frames([])
 
 
 # -- refusals

@@ -12,7 +12,6 @@ from dynslam_bench.reports import ReportData, build_report, figures
 from dynslam_bench.reports.build_report import thinned_note
 from dynslam_bench.reports.html import explore
 from dynslam_bench.reports.html.explore import FEWER_PAGES, MOST_PAGES, pages_for
-from dynslam_bench.reports.model import board as board_module
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
@@ -59,19 +58,6 @@ def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
     assert len(whole["runs"]) == len(store.ids()) == len(short["runs"]) + short["unlisted"] and short["unlisted"] > 5
     assert short["cells"] == whole["cells"] and whole["unlisted"] == 0
     assert {(run[1], run[2]) for run in short["runs"]} == {(cell[0], cell[1]) for cell in whole["cells"]}
-
-
-def test_common_frames_of_many_runs_are_those_around_every_median(monkeypatch):
-    errors = {"a": [0.5, 0.1, 0.3, 0.2, 0.4], "b": [1.0], "c": [3.0, 1.0, 2.0, 4.0]}
-    board = make_board([row(key, "s", error, seed=at) for key, some in errors.items() for at, error in enumerate(some)])
-    for most, kept in (
-        (10, errors),
-        (9, {"a": [0.2, 0.3, 0.4], "b": [1.0], "c": [1.0, 2.0, 3.0]}),
-        (1, {"a": [0.3], "b": [1.0], "c": [2.0]}),
-    ):
-        monkeypatch.setattr(board_module, "MOST_COMPARED", most)
-        compared = [(r.tracker.id, r.metrics["ate_rmse_m"]) for r in board_module.compared_runs(board, "s")]
-        assert sorted(compared) == sorted((key, error) for key, some in kept.items() for error in some)
 
 
 def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from reports_fake_store import add_run, stamps_of, truth_of
+from reports_fake_store import add_run, truth_of
 from reports_rows import PROTOCOL, rows_of
 
 from dynslam_bench.cli.app import start
@@ -12,7 +12,6 @@ from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation import evaluate
 from dynslam_bench.reports import load_board, publish
 from dynslam_bench.reports.figures import FIGURES, bar_figure
-from dynslam_bench.reports.model.board import common_errors
 from dynslam_bench.reports.tables.leaderboard import LOST_MARK, absolute_table, relative_table, subject_of, time_table
 from dynslam_bench.runs.store import RunStore
 
@@ -103,17 +102,3 @@ def test_a_site_needs_nothing_outside_of_it(store, tmp_path, capsys):
         start(["report", "publish", str(store.root), "-o", str(output)])
     assert not ended.value.code and "index.html (" in capsys.readouterr().out
     assert not (output / "study").exists() and (output / "mine.txt").read_text() == "stays"
-
-
-def test_errors_on_common_frames_are_those_of_the_evaluation(store):
-    """Of the loser's 58 of 60 frames all have the same, and the number is what `evaluate` says of them."""
-    board = load_board(store)
-    found, frames = common_errors(board, PROTOCOL)
-    assert frames["s/a"] == "58 of 60"
-    shared = np.delete(stamps_of(60), [20, 21]).round(6)
-    rows = [row for row in board.rows if row.sequence.id == "s/a" and not row.failed]
-    assert len(rows) == 3
-    for row in rows:
-        whole = store.trajectory(row.run_id)
-        metrics = evaluate(whole.select(np.isin(whole.timestamps.round(6), shared)), truth_of("s/a", 60)).metrics
-        assert found[row.variant_key, "s/a"] == pytest.approx(metrics["ate_rmse_m"], rel=1e-8)
