@@ -88,12 +88,15 @@ class AuditReport:
             for check, meaning in CHECKS.items()
         ]
         columns = [*texts("check", "what has to hold"), *numbers("numbers", "fail")]
-        caption = (
+        return Table(
+            "audit_summary",
+            "Audit of the paper's tables",
             "Claimed by the paper, audited by arithmetic; no system was run for it. "
             f"{sum(not f.holds for f in self.findings)} of {len(self.findings)} findings do not hold, so none of the "
-            "printed numbers is a target that a re-implementation could be held to."
+            "printed numbers is a target that a re-implementation could be held to.",
+            columns,
+            rows,
         )
-        return Table("audit_summary", "Audit of the paper's tables", caption, columns, rows)
 
     def details(self) -> Table:
         """Every finding that does not hold."""
@@ -115,8 +118,9 @@ class AuditReport:
             *texts("check"), *numbers("table"), *texts("system", "sequence", "quantity"),
             *numbers("printed", "held against"), *texts("remark"),
         ]  # fmt: skip
-        caption = "Metres, percent or milliseconds, as printed."
-        return Table("audit_findings", "Numbers that do not hold", caption, columns, rows)
+        return Table(
+            "audit_findings", "Numbers that do not hold", "Metres, percent or milliseconds, as printed.", columns, rows
+        )
 
     def to_markdown(self) -> str:
         """Summary and failures as Markdown."""

@@ -317,8 +317,12 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
 
 def repeatability_section(board: Board) -> Section:
     """How far the runs of a cell lie apart."""
-    caption = "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
-    blocks = figure_blocks("repeat", figures.repeat_figure(board), caption + thinned_note(board))
+    blocks = figure_blocks(
+        "repeat",
+        figures.repeat_figure(board),
+        "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
+        + thinned_note(board),
+    )
     blocks += table_blocks(tables.repeatability(board))
     return Section("repeatability", "Repeatability", "Repeatability", blocks=blocks)
 

@@ -86,8 +86,7 @@ def compare(
         for column in shared:
             cells = paired_cells(by_column_a[column], by_column_b[column])
             if all(cell.scores for cell in cells):
-                mark = f" {SEEN}" * any(cell.in_training for cell in cells)
-                paired.append((columns[column] + mark, *cells))
+                paired.append((columns[column] + (f" {SEEN}" * any(cell.in_training for cell in cells)), *cells))
         if paired:
             compared[name] = sorted(paired, key=itemgetter(0))
             differences[name] = _differences(variants_a[one][0], variants_b[other][0])

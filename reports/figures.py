@@ -109,8 +109,7 @@ def safe(text: str) -> str:
 
 def wrapped(text: str) -> str:
     """A label broken into lines of 34 characters at blanks."""
-    lines = textwrap.wrap(text, 34, break_long_words=False, break_on_hyphens=False)
-    return "<br>".join(map(safe, lines))
+    return "<br>".join(map(safe, textwrap.wrap(text, 34, break_long_words=False, break_on_hyphens=False)))
 
 
 # The report's figures as plotly-like specifications (plain data and layout), drawn by the page itself.
@@ -317,8 +316,7 @@ def mask_figure(board: Board) -> Figure | None:
 
 def _drawn(points: Sequence[P]) -> list[P]:
     """At most `MOST_POINTS` points; of more every second, third, ... from the smallest to the largest first number."""
-    step = max(1, -(-len(points) // MOST_POINTS))
-    order = sorted(range(len(points)), key=lambda at: points[at][0])[::step]
+    order = sorted(range(len(points)), key=lambda at: points[at][0])[:: max(1, -(-len(points) // MOST_POINTS))]
     return [points[at] for at in sorted(order)]
 
 

@@ -155,8 +155,7 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
         kept = ~np.eye(len(source), dtype=bool)
         pairs = [(source[rows], target[rows]) for rows in kept]
         covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
-        squares = _turned_deg(covariances, rotation) ** 2
-        return float(np.sqrt((len(source) - 1) / len(source) * squares.sum()))
+        return float(np.sqrt((len(source) - 1) / len(source) * (_turned_deg(covariances, rotation) ** 2).sum()))
     size, more = divmod(len(source), BLOCKS)  # the first blocks are longer by one where it does not come out even
     starts = np.arange(BLOCKS) * size + np.minimum(np.arange(BLOCKS), more)
     source, target = source - source.mean(axis=0), target - target.mean(axis=0)

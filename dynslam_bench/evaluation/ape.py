@@ -29,8 +29,7 @@ def absolute_errors(estimate: Array, ground_truth: Array) -> tuple[Array, Array]
         Length of the translation of E_i in metres ``[N]`` and its rotation angle in degrees ``[N]``.
     """
     translation = np.linalg.norm(estimate[:, :3, 3] - ground_truth[:, :3, 3], axis=1)
-    rotation = np.rad2deg(se3.rotation_angle(se3.inverse(ground_truth) @ estimate))
-    return translation, rotation
+    return translation, np.rad2deg(se3.rotation_angle(se3.inverse(ground_truth) @ estimate))
 
 
 def absolute_metrics(comparison: Comparison) -> dict[str, float]:

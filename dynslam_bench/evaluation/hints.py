@@ -112,8 +112,13 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
         numbers |= {"back_s": notes.back_s, "repeated_stamps": float(notes.duplicates)}
     if not evidence:
         return []
-    text = f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one"
-    return [Hint("several-recordings", text, numbers)]
+    return [
+        Hint(
+            "several-recordings",
+            f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one",
+            numbers,
+        )
+    ]
 
 
 # -- time ----------------------------------------------------------------------------------------------------------
@@ -149,8 +154,9 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     shift, left = float(fine[best]), float(near[best])
     if 0 < best < len(fine) - 1 and (bend := near[best - 1] - 2 * left + near[best + 1]) > 0:
         shift += float(0.5 * (near[best - 1] - near[best + 1]) / bend * (fine[1] - fine[0]))
-    shifted_self = _displacements(track, begin[None] + shift, window)
-    visible = float(_unexplained(moved, shifted_self)[0])  # what such a shift does to a path of this shape
+    visible = float(
+        _unexplained(moved, _displacements(track, begin[None] + shift, window))[0]
+    )  # what such a shift does to a path of this shape
     clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
     return (shift, left) if clear else (0.0, now)
 
@@ -192,12 +198,15 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
     before, after = (fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift))
     if not after < (0.9 if left < 0.05 else 0.5) * before:
         return []
-    text = (
-        f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each the "
-        f"error falls from {before:.4f} to {after:.4f} m (at its best scale); give the stamps of the images, on the "
-        "truth's clock"
-    )
-    return [Hint("time-shift", text, {"shift_s": shift, "error_m": before, "error_undone_m": after})]
+    return [
+        Hint(
+            "time-shift",
+            f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each the "
+            f"error falls from {before:.4f} to {after:.4f} m (at its best scale); give the stamps of the images, on the "
+            "truth's clock",
+            {"shift_s": shift, "error_m": before, "error_undone_m": after},
+        )
+    ]
 
 
 # -- scale and noise ---
@@ -221,11 +230,14 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
         if unit
         else "check the depth factor; score a tracker without depth under a protocol that finds the scale"
     )
-    text = (
-        f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {before:.4g} to "
-        f"{after:.4g} m; {cure}"
-    )
-    return [Hint("scale", text, {"scale": scale, "error_m": before, "error_undone_m": after})]
+    return [
+        Hint(
+            "scale",
+            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {before:.4g} to "
+            f"{after:.4g} m; {cure}",
+            {"scale": scale, "error_m": before, "error_undone_m": after},
+        )
+    ]
 
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048, "inches": 0.0254, "kilometres": 1e3}
@@ -259,8 +271,7 @@ def _jitter(positions: Array, order: int) -> float:
     """Standard deviation of white noise, per axis, that differences of some order show; metres, 0 if there are few."""
     if len(positions) < 30:
         return 0.0
-    differences = np.diff(positions, order, axis=0)
-    return float(np.median(np.abs(differences)) / (0.6745 * np.sqrt(comb(2 * order, order))))
+    return float(np.median(np.abs(np.diff(positions, order, axis=0))) / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 
 # What hints are made from: poses between their stamps, and how well positions can be aligned.
@@ -314,13 +325,11 @@ class Track:
     def covers(self, stamps: Array) -> NDArray[np.bool_]:
         """Whether stamps lie within its time and in no hole ``[...]``."""
         after = np.searchsorted(self.stamps, stamps, side="right") - 1
-        exact = self.stamps[after.clip(0)] == stamps
-        return np.asarray((after >= 0) & (~self._holes[after] | exact))
+        return np.asarray((after >= 0) & (~self._holes[after] | (self.stamps[after.clip(0)] == stamps)))
 
     def positions_at(self, stamps: Array) -> Array:
         """Positions ``[..., 3]``, on straight lines between the stamps."""
-        axes = [np.interp(stamps, self.stamps, self.positions[:, axis]) for axis in range(3)]
-        return np.stack(axes, axis=-1)
+        return np.stack([np.interp(stamps, self.stamps, self.positions[:, axis]) for axis in range(3)], axis=-1)
 
     def at(self, stamps: Array) -> Array:
         """Poses ``[N, 4, 4]``: these positions, with the rotation of the pose that is nearest in time."""
@@ -417,11 +426,17 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
     misfit = [error + fit(undone, true_poses).misfit for error, _, undone in candidates]
     best = [candidate for candidate, score in zip(candidates, misfit, strict=True) if score < min(misfit) + TIE]
     error, convention, undone = best[0]
-    text = (
-        f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
-        f"by {100 * error:.0f} % {convention.cure}"
-    ) + "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:])
-    return [Hint(convention.id, text, {"motion_error": as_read, "motion_error_undone": error})], undone
+    return [
+        Hint(
+            convention.id,
+            (
+                f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
+                f"by {100 * error:.0f} % {convention.cure}"
+            )
+            + "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:]),
+            {"motion_error": as_read, "motion_error_undone": error},
+        )
+    ], undone
 
 
 def _in_axes_of_a_body(

@@ -145,6 +145,4 @@ def hold(estimate: Trajectory, input_timestamps: ArrayLike) -> Trajectory:
     if not len(estimate):
         raise EvaluationError("no frame was tracked, so there is no pose to hold")
     stamps = np.asarray(input_timestamps, dtype=np.float64).reshape(-1)
-    tracked = tracked_frames(estimate, stamps)
-    latest = np.maximum(np.cumsum(tracked) - 1, 0)
-    return Trajectory(stamps, estimate.T_world_cam[latest])
+    return Trajectory(stamps, estimate.T_world_cam[np.maximum(np.cumsum(tracked_frames(estimate, stamps)) - 1, 0)])

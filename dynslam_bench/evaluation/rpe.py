@@ -174,8 +174,7 @@ def random_pairs(n: int, count: int) -> Index:
     from Python's generator, whose sequence changed between versions).
     """
     if count == 0 or n < np.sqrt(count):
-        grid = np.indices((n, n)).reshape(2, -1)
-        return np.ascontiguousarray(grid.T).astype(np.intp)
+        return np.ascontiguousarray(np.indices((n, n)).reshape(2, -1).T).astype(np.intp)
     return np.minimum((_uniform("rpe random pairs", 2 * count) * n).astype(np.intp), n - 1).reshape(count, 2)
 
 
@@ -240,17 +239,14 @@ def segment_errors(estimate: Array, ground_truth: Array, lengths_m: Sequence[flo
         Translational drift in percent ``[K]`` and rotational drift in degrees a metre ``[K]``; empty where the path is
         shorter than the shortest length.
     """
-    steps = np.linalg.norm(np.diff(ground_truth[:, :3, 3], axis=0), axis=1)
-    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ground_truth[:, :3, 3], axis=0), axis=1))])
     grid = np.meshgrid(np.arange(0, len(travelled), STEP), np.array(lengths_m, np.float64), indexing="ij")
     starts, metres = (values.ravel() for values in grid)
     ends = np.searchsorted(travelled, travelled[starts] + metres, side="right")
     inside = ends < len(travelled)
     metres, pairs = metres[inside], np.stack([starts, ends], axis=1)[inside]
     error = se3.inverse(_relative(estimate, pairs)) @ _relative(ground_truth, pairs)
-    translation = np.linalg.norm(error[:, :3, 3], axis=1) / metres * 100
-    rotation = np.rad2deg(se3.rotation_angle(error)) / metres
-    return translation, rotation
+    return np.linalg.norm(error[:, :3, 3], axis=1) / metres * 100, np.rad2deg(se3.rotation_angle(error)) / metres
 
 
 def segment_metrics(comparison: Comparison) -> dict[str, float]:

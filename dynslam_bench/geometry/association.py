@@ -80,11 +80,9 @@ def _candidates(
     """All pairs of indices within `max_dt` with their |dt|; both lists sorted."""
     slack = 1e-9 + 4 * np.spacing(max(np.abs(a).max(initial=0.0), np.abs(b).max(initial=0.0)))
     low = np.searchsorted(b, a - max_dt - slack, side="left")
-    high = np.searchsorted(b, a + max_dt + slack, side="right")
-    count = high - low
+    count = np.searchsorted(b, a + max_dt + slack, side="right") - low
     index_a = np.repeat(np.arange(len(a)), count)
-    offset = np.arange(len(index_a)) - np.repeat(np.cumsum(count) - count, count)
-    index_b = np.repeat(low, count) + offset
+    index_b = np.repeat(low, count) + (np.arange(len(index_a)) - np.repeat(np.cumsum(count) - count, count))
     dt = np.abs(a[index_a] - b[index_b])
     keep = dt < max_dt if strict else dt <= max_dt
     return index_a[keep], index_b[keep], dt[keep]

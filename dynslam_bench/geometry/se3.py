@@ -52,8 +52,7 @@ def log(pose: Array) -> Array:
     half = safe / 2
     factor = np.where(small, 1 / 12 + theta**2 / 720, (1 - half / np.tan(half)) / safe**2)
     skew = hat(phi)
-    inverse_jacobian = np.eye(3) - 0.5 * skew + factor * (skew @ skew)
-    rho = (inverse_jacobian @ flat[:, :3, 3:])[..., 0]
+    rho = ((np.eye(3) - 0.5 * skew + factor * (skew @ skew)) @ flat[:, :3, 3:])[..., 0]
     return np.concatenate([rho, phi], axis=-1).reshape(*pose.shape[:-2], 6)
 
 

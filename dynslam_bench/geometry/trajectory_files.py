@@ -121,8 +121,7 @@ def load_tum(path: str | Path) -> TumFile:
         out_of_order=int((np.diff(ns) < 0).sum()),
         back_s=float(-np.diff(ns).min(initial=0)) / 1e9,
     )
-    poses = se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8])
-    return TumFile(Trajectory(to_seconds(exact), poses, exact), notes)
+    return TumFile(Trajectory(to_seconds(exact), se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8]), exact), notes)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") -> None:

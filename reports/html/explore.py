@@ -123,8 +123,7 @@ def write_explore(
     jobs = []
     for (_, column), rows in grouped(ordered, lambda row: (row.run_id not in shown, row.column_id)).items():
         for first in range(0, len(rows), JOB):
-            some = rows[first : first + JOB]
-            jobs.append((some, shown, shares[column], protocol, output, deadline, most_frames))
+            jobs.append((rows[first : first + JOB], shown, shares[column], protocol, output, deadline, most_frames))
     pages: list[RunPage] = []
     missing: Counter[str] = Counter()
     for written, undrawn in run_jobs(pool, _write_pages, jobs):
@@ -135,8 +134,7 @@ def write_explore(
     write_side(output, "explore", _explore_content(board, protocol, pages, pageless))
     write_atomic(output / RUN_PAGE, render_run_page(title))
     reasons = "; ".join(f"{count} frames: {reason}" for reason, count in missing.items())
-    pictureless = f"Frames without a picture: {reasons}." if reasons else ""
-    return [note for note in (pageless, pictureless) if note]
+    return [note for note in (pageless, f"Frames without a picture: {reasons}." if reasons else "") if note]
 
 
 def pages_for(runs: int, typical: int) -> int:
@@ -475,8 +473,7 @@ def _packed_track(track: Trajectory, columns: Mapping[str, Array], most: int) ->
     """Series along a track ``[N]`` or ``[N, 3]``, thinned, broken at gaps and packed."""
     start = float(track.timestamps[0])
     widths = [1 if values.ndim == 1 else values.shape[1] for values in columns.values()]
-    together = np.column_stack(list(columns.values()))
-    stamps, values = broken(track.timestamps - start, together, most)
+    stamps, values = broken(track.timestamps - start, np.column_stack(list(columns.values())), most)
     t, *rows = packed_rows(np.vstack([stamps, values.T]))
     packed: dict[str, Any] = {"start": start, "t": t}
     for name, width in zip(columns, widths, strict=True):
@@ -500,8 +497,7 @@ def broken(stamps: Array, values: Array, most: int) -> tuple[Array, Array]:
         return stamps, values
     intervals = np.diff(stamps)
     piece = np.concatenate([[0], np.cumsum(intervals > 2 * np.median(intervals))])
-    step = max(1, -(-len(stamps) // most))
-    keep = np.arange(len(stamps)) % step == 0
+    keep = np.arange(len(stamps)) % max(1, -(-len(stamps) // most)) == 0
     edge = np.diff(piece) > 0
     keep |= np.append(edge, True) | np.append(True, edge)  # the ends of every piece stay
     kept = np.flatnonzero(keep)

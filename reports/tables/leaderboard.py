@@ -176,8 +176,9 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
     best = key in first and 2 * len(first) <= len(board.ranked)
     ratio = interval_cell(standing.ratio, ".2f", "best" if best else "")
     if standing.sequences < len(board.common):
-        text = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
-        ratio = TableCell(ratio.text, text, ratio.value)
+        ratio = TableCell(
+            ratio.text, f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip(), ratio.value
+        )
     better = f"P {standing.better:.2f}" if standing.sequences >= FEWEST else ""
     wins = TableCell(f"{standing.wins} of {standing.sequences}", better, standing.wins)
     return cells | {
@@ -396,9 +397,15 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
             trained = [name for name in board.sequences if name in cells_of and cells_of[name].in_training]
             row.append(TableCell(", ".join(board.short[name] for name in trained)))
         caption += f" {SEEN_NOTE}"
-    brief = "Absolute trajectory error (RMSE, mm), lost frames held"
     return Table(
-        "per_sequence", "Absolute trajectory error by sequence (mm)", caption, columns, rows, muted, separators, brief
+        "per_sequence",
+        "Absolute trajectory error by sequence (mm)",
+        caption,
+        columns,
+        rows,
+        muted,
+        separators,
+        "Absolute trajectory error (RMSE, mm), lost frames held",
     )
 
 
@@ -564,14 +571,17 @@ def failure_rule_table(board: Board) -> Table | None:
                 cells += [rank_cell(standings[key]), interval_cell(standings[key].ratio, ".2f")]
             else:
                 cells += [TableCell(), TableCell()]
-    caption = (
+    return Table(
+        "failure_rules",
+        "Sensitivity to the rule for lost frames and failures",
         "The same runs under three rules. Lost frames held: the report's rule, a lost frame counts as not having moved "
         "since the last tracked one. Lost frames left out: the error of the tracked frames only, which is what most "
         "papers print; a tracker gains by losing the hard frames. Failures left out too: survivors only, which also "
         "flatters trackers that fail; in the first two they count as a static camera, or worse. A ranking "
-        "that changes between the rules is decided by the rule."
+        "that changes between the rules is decided by the rule.",
+        columns,
+        rows,
     )
-    return Table("failure_rules", "Sensitivity to the rule for lost frames and failures", caption, columns, rows)
 
 
 def _tracked_error(row: RunRow) -> float | None:
@@ -602,8 +612,13 @@ def failures(board: Board) -> Table | None:
         ]
         for row in sorted(failed, key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key))
     ]
-    caption = "Runs that crashed, took too long or too much, broke their contract, were lost, or cannot be evaluated."
-    return Table("failures", "Failures", caption, columns, rows)
+    return Table(
+        "failures",
+        "Failures",
+        "Runs that crashed, took too long or too much, broke their contract, were lost, or cannot be evaluated.",
+        columns,
+        rows,
+    )
 
 
 def repeatability(board: Board) -> Table | None:
@@ -620,12 +635,15 @@ def repeatability(board: Board) -> Table | None:
     rows = [cells for key in board.trackers if (cells := _spread_cells(board, key))]
     if not rows:
         return None
-    caption = (
+    return Table(
+        "repeatability",
+        "Repeatability",
         "How far the runs of one tracker on one sequence lie apart when only seed, start offset or sensor noise "
         "differ. Differences between trackers that are smaller than this are noise. Copies (several seeds, one result "
-        "to the last digit) are no repeats: they are counted as deterministic and take no part. Neither do failures."
+        "to the last digit) are no repeats: they are counted as deterministic and take no part. Neither do failures.",
+        columns,
+        rows,
     )
-    return Table("repeatability", "Repeatability", caption, columns, rows)
 
 
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
@@ -651,8 +669,7 @@ def machines(board: Board) -> Table:
     counts = Counter(row.machine_words or "not recorded" for row in board.rows)
     columns = [Column("runs"), Column("machine and versions", numeric=False)]
     rows = [[number(count), TableCell(name)] for name, count in counts.most_common()]
-    caption = "Times of different machines are not comparable."
-    return Table("machines", "Machines and versions", caption, columns, rows)
+    return Table("machines", "Machines and versions", "Times of different machines are not comparable.", columns, rows)
 
 
 # -- the implemented paper's Tables 1 to 3, made of our own runs
@@ -714,8 +731,15 @@ def time_table(board: Board) -> Table | None:
     def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
         return number(measures[kind][place], ".1f")
 
-    brief = "Error in percent of a static camera, accuracy, and time of a frame"
-    return _sequence_table(board, measures, shown, "paper_accuracy", "Accuracy, error and time", caption, brief)
+    return _sequence_table(
+        board,
+        measures,
+        shown,
+        "paper_accuracy",
+        "Accuracy, error and time",
+        caption,
+        "Error in percent of a static camera, accuracy, and time of a frame",
+    )
 
 
 def _share(row: RunRow) -> float | None:
@@ -740,8 +764,15 @@ def _statistics_table(
         words = mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell)
         return TableCell(words, value=error, emphasis=marks[kind].get(place, ""))
 
-    caption = f"{source} Millimetres (metres in the CSV), median over the runs that succeeded."
-    table = _sequence_table(board, errors, shown, name, title, caption, brief)
+    table = _sequence_table(
+        board,
+        errors,
+        shown,
+        name,
+        title,
+        f"{source} Millimetres (metres in the CSV), median over the runs that succeeded.",
+        brief,
+    )
     if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
         table.caption += f" {LOST_NOTE}"
     keys = {key for key, _ in errors["rmse"]}

@@ -155,7 +155,9 @@ def score_pair(outcome: dict[str, dict], sequence, protocol: str) -> None:
         both = {side: outcome[side][f"_{kind}"] for side in "ab"}
         present = {side: one for side, one in both.items() if one is not None and len(one)}
         stamps = [one.timestamps for one in present.values()]
-        shared = {side: one.select(np.isin(one.timestamps, reduce(np.intersect1d, stamps))) for side, one in present.items()}
+        shared = {
+            side: one.select(np.isin(one.timestamps, reduce(np.intersect1d, stamps))) for side, one in present.items()
+        }
         for side in "ab":
             outcome[side][f"ate_{kind}_m"] = ate(shared.get(side), sequence, protocol)
             outcome[side][f"own_ate_{kind}_m"] = ate(both[side], sequence, protocol)
