@@ -41,7 +41,7 @@ from dynslam_bench.envs.spaces import (
     stats_space,
 )
 from dynslam_bench.evaluation import OnlineError, OnlineSample, Protocol, evaluate, get_protocol
-from dynslam_bench.evaluation.prepare import tracked_frames
+from dynslam_bench.evaluation.comparison import tracked_frames
 from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings

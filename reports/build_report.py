@@ -119,6 +119,7 @@ def build_report(
         )  # fmt: skip
         on_progress(0, None, "putting the tables and figures together")
         again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
+        none_failed = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
         sections = [
             leaderboard_section(board, protocol, loaded),
             Section("explore", "Explore", "Explore", explore_notes, [Block("explore")]),
@@ -126,9 +127,11 @@ def build_report(
             errors_section(board, protocol),
             paper_section(board, protocol),
             trajectories_section(board, protocol),
-            repeatability_section(board),
+            Section(
+                "repeatability", "Repeatability", "Repeatability", blocks=table_blocks(tables.repeatability(board))
+            ),
             masks_section(board),
-            failures_section(board),
+            Section("failures", "Failures", "Failures", blocks=table_blocks(tables.failures(board)) or none_failed),
             provenance_section(board, loaded, again),
         ]
     on_progress(0, None, "writing")
@@ -315,37 +318,15 @@ def trajectories_section(board: Board, protocol: Protocol) -> Section:
     )  # fmt: skip
 
 
-def repeatability_section(board: Board) -> Section:
-    """How far the runs of a cell lie apart."""
-    blocks = figure_blocks(
-        "repeat",
-        figures.repeat_figure(board),
-        "One point a run that succeeded: its error over the median of the same tracker on the same sequence."
-        + thinned_note(board),
-    )
-    blocks += table_blocks(tables.repeatability(board))
-    return Section("repeatability", "Repeatability", "Repeatability", blocks=blocks)
-
-
-def thinned_note(board: Board) -> str:
-    """What a figure with a point for every run says where there are too many."""
-    most = figures.MOST_POINTS
-    if all(len(board.runs(key)) <= most for key in board.trackers):
-        return ""
-    return f" Of trackers with more than {most} runs fewer are drawn, from the best to the worst."
-
-
 def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
-    blocks = figure_blocks("masks", figures.mask_figure(board), "One point a run." + thinned_note(board))
-    blocks += table_blocks(tables.mask_quality(board))
+    caption = "One point a run."
+    if any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers):
+        caption += (
+            f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
+        )
+    blocks = figure_blocks("masks", figures.mask_figure(board), caption) + table_blocks(tables.mask_quality(board))
     return Section("masks", "Mask quality and pose error", "Masks", blocks=blocks)
-
-
-def failures_section(board: Board) -> Section:
-    """Every run that failed, or that none did."""
-    nothing = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
-    return Section("failures", "Failures", "Failures", blocks=table_blocks(tables.failures(board)) or nothing)
 
 
 def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:

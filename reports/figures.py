@@ -5,8 +5,7 @@ from __future__ import annotations
 import html
 import textwrap
 from collections.abc import Sequence
-from statistics import median
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -114,9 +113,8 @@ def wrapped(text: str) -> str:
 
 # The report's figures as plotly-like specifications (plain data and layout), drawn by the page itself.
 
-P = TypeVar("P", bound=tuple[Any, ...])
 MOST_POINTS = 400
-"""Points of one tracker in figures that have one for every run; of more runs as many, from the best to the worst."""
+"""Points of one tracker in the figure of masks; of more runs as many, from the best to the worst."""
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "pentagon", "hexagon", "star")
 
 
@@ -230,52 +228,6 @@ def speed_figure(board: Board) -> Figure | None:
     }
 
 
-def repeat_figure(board: Board) -> Figure | None:
-    """The ATE of every run that succeeded over their median in its cell; None where no cell has several."""
-    palette = colours(board)
-    traces: list[dict[str, Any]] = []
-    everything = [0.9, 1.1]
-    for key in board.trackers:
-        points = []
-        for sequence in board.sequences:
-            runs = board.cells[key][sequence].succeeded if sequence in board.cells[key] else ()
-            if len(runs) > 1:
-                base = max(median(row.score_m or 0.0 for row in runs), FLOOR_M)
-                points += [(max(row.score_m or 0.0, FLOOR_M) / base, f"{safe(sequence)}, {row.repeat}") for row in runs]
-        if points:
-            everything += [ratio for ratio, _ in points]
-            points = _drawn(points)
-            traces.append(
-                {
-                    "type": "box",
-                    "x": rounded([ratio for ratio, _ in points]),
-                    "name": wrapped(board.labels[key]),
-                    "text": [text for _, text in points],
-                    "orientation": "h",
-                    "boxpoints": "all",
-                    "jitter": 0.5,
-                    "pointpos": 0,
-                    "fillcolor": "rgba(0,0,0,0)",
-                    "line": {"width": 0},
-                    "marker": {"size": 7, "opacity": 0.75, "color": palette[key]},
-                    "hovertemplate": "%{text}<br>%{x:.3f} × median<extra></extra>",
-                }
-            )
-    if not traces:
-        return None
-    return {
-        "data": traces,
-        "layout": layout_of(
-            height=110 + 34 * len(traces),
-            xaxis=log_axis("ATE over the median of the same tracker on the same sequence", everything),
-            yaxis={"autorange": "reversed", "automargin": True, "gridcolor": GRID},
-            shapes=[guide(x=1.0)],
-            margin={"l": 20, "r": 30, "t": 40, "b": 60},
-            showlegend=False,
-        ),
-    }
-
-
 def mask_figure(board: Board) -> Figure | None:
     """Quality of the masks against the pose error, one point a run; None where no run has it."""
     palette = colours(board)
@@ -288,7 +240,8 @@ def mask_figure(board: Board) -> Figure | None:
                 words = f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}"
                 points.append((1000 * max(row.score_m, FLOOR_M), row.mask_iou, words))
         if points:
-            points = _drawn(points)
+            if len(points) > MOST_POINTS:
+                points = sorted(points)[:: -(-len(points) // MOST_POINTS)]
             everything += [error_mm for error_mm, _, _ in points]
             traces.append(
                 {
@@ -312,12 +265,6 @@ def mask_figure(board: Board) -> Figure | None:
             yaxis=log_axis("ATE (mm)", everything),
         ),
     }
-
-
-def _drawn(points: Sequence[P]) -> list[P]:
-    """At most `MOST_POINTS` points; of more every second, third, ... from the smallest to the largest first number."""
-    order = sorted(range(len(points)), key=lambda at: points[at][0])[:: max(1, -(-len(points) // MOST_POINTS))]
-    return [points[at] for at in sorted(order)]
 
 
 # The paper's Figures 9 to 12, drawn of our own runs: bars of the absolute error, one figure a statistic.

@@ -39,8 +39,8 @@ def evaluate(
 ) -> None:
     """Evaluate a trajectory file against a ground-truth file."""
     from dynslam_bench.evaluation import get_protocol, hints
+    from dynslam_bench.evaluation.comparison import truth_of_file
     from dynslam_bench.evaluation.evaluate import evaluate_loaded
-    from dynslam_bench.evaluation.prepare import truth_of_file
 
     loaded, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
     result = evaluate_loaded(loaded, truth, protocol)

@@ -2,11 +2,11 @@
 
 from dynslam_bench.evaluation.ape import static_camera
 from dynslam_bench.evaluation.compare_protocols import ComparisonRow, compare_protocols
+from dynslam_bench.evaluation.comparison import coverage, hold
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_files, pose_errors
 from dynslam_bench.evaluation.hints import Hint, hints
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
 from dynslam_bench.evaluation.online import OnlineError, OnlineSample
-from dynslam_bench.evaluation.prepare import coverage, hold
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, RPESpec, get_protocol
 
 __all__ = [

@@ -61,8 +61,7 @@ class Similarity:
 
     def apply(self, poses: Array) -> Array:
         """Poses ``[N, 4, 4]`` moved; rotations stay rotations."""
-        moved = poses.copy()
-        moved[:, :3, :3] = self.rotation @ poses[:, :3, :3]
+        moved = se3.with_rotation(poses, self.rotation @ poses[:, :3, :3])
         moved[:, :3, 3] = self.scale * poses[:, :3, 3] @ self.rotation.T + self.translation
         return moved
 

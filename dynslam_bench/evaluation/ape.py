@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynslam_bench.core.errors import EvaluationError
-from dynslam_bench.evaluation.comparison import Comparison, compare
-from dynslam_bench.evaluation.prepare import hold
+from dynslam_bench.evaluation.comparison import Comparison, compare, hold
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import associate
@@ -46,19 +45,16 @@ def statistics(error: NDArray[np.float64]) -> dict[str, float]:
 
     ``rmse**2 == mean**2 + std**2`` holds (a published table that breaks it is wrong). Empty input gives an empty dict.
     """
-    n = len(error)
-    if not n:
+    if not len(error):
         return {}
-    ordered = np.sort(error)  # one sort for three of them: reports take thousands of these
-    mean, sse = float(error.sum()) / n, float((error * error).sum())
-    off = error - mean
+    sse = float((error * error).sum())
     return {
-        "rmse": math.sqrt(sse / n),
-        "mean": mean,
-        "median": 0.5 * float(ordered[(n - 1) // 2] + ordered[n // 2]),
-        "std": math.sqrt(float((off * off).sum()) / n),
-        "min": float(ordered[0]),
-        "max": float(ordered[-1]),
+        "rmse": math.sqrt(sse / len(error)),
+        "mean": float(error.mean()),
+        "median": float(np.median(error)),
+        "std": float(error.std()),
+        "min": float(error.min()),
+        "max": float(error.max()),
         "sse": sse,
     }
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.evaluation.comparison import truth_of_file
 from dynslam_bench.evaluation.evaluate import evaluate
-from dynslam_bench.evaluation.prepare import truth_of_file
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Alignment, Protocol, RPESpec
 from dynslam_bench.geometry.trajectory import Trajectory
 

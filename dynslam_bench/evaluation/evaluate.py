@@ -11,8 +11,7 @@ from pydantic import field_validator
 
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.ape import absolute_errors, absolute_metrics, static_camera_metrics
-from dynslam_bench.evaluation.comparison import AssociationRecord, Comparison, compare
-from dynslam_bench.evaluation.prepare import apply_policy, truth_of_file
+from dynslam_bench.evaluation.comparison import AssociationRecord, Comparison, apply_policy, compare, truth_of_file
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
 from dynslam_bench.geometry.trajectory import Trajectory

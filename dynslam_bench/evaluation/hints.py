@@ -195,16 +195,16 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
     both = truth.covers(stamps) & truth.covers(stamps + shift)
     if both.sum() < MIN_POSES:
         return []
-    before, after = (fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift))
-    if not after < (0.9 if left < 0.05 else 0.5) * before:
+    error, undone = (fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift))
+    if not undone < (0.9 if left < 0.05 else 0.5) * error:
         return []
     return [
         Hint(
             "time-shift",
-            f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each the "
-            f"error falls from {before:.4f} to {after:.4f} m (at its best scale); give the stamps of the images, on the "
-            "truth's clock",
-            {"shift_s": shift, "error_m": before, "error_undone_m": after},
+            f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each "
+            f"the error falls from {error:.4f} to {undone:.4f} m (at its best scale); give the stamps of the images, on "
+            "the truth's clock",
+            {"shift_s": shift, "error_m": error, "error_undone_m": undone},
         )
     ]
 
@@ -214,8 +214,8 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
 
 def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     best = fit(poses, truth.at(stamps))
-    scale, before, after = best.scale, best.se3_m, best.sim3_m
-    if not (scale > 0 and abs(np.log(scale)) > np.log(SCALE_FACTOR) and after < min(0.4 * before, 0.2 * best.extent_m)):
+    scale, error, undone = best.scale, best.se3_m, best.sim3_m
+    if not (scale > 0 and abs(np.log(scale)) > np.log(SCALE_FACTOR) and undone < min(0.4 * error, 0.2 * best.extent_m)):
         return []
     window = min(DISPLACEMENT_S, (stamps[-1] - stamps[0]) / 6)
     moved, true = (_displacements(track, stamps, window) for track in (Track(stamps, poses), truth))
@@ -233,9 +233,9 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     return [
         Hint(
             "scale",
-            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {before:.4g} to "
-            f"{after:.4g} m; {cure}",
-            {"scale": scale, "error_m": before, "error_undone_m": after},
+            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {error:.4g} "
+            f"to {undone:.4g} m; {cure}",
+            {"scale": scale, "error_m": error, "error_undone_m": undone},
         )
     ]
 
@@ -429,10 +429,8 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
     return [
         Hint(
             convention.id,
-            (
-                f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
-                f"by {100 * error:.0f} % {convention.cure}"
-            )
+            f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
+            f"by {100 * error:.0f} % {convention.cure}"
             + "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:]),
             {"motion_error": as_read, "motion_error_undone": error},
         )
@@ -449,10 +447,11 @@ def _in_axes_of_a_body(
         undone = convention.undo(poses)
         motions = _relative(undone, pairs)
         error, varies = _compare(motions, true, R_est_cam=_axes(motions, true))
-        worse = 2 * fit(undone, true_poses).misfit > fit(poses, true_poses).misfit
-        if error < min(EXPLAINED, as_turned / CLEARLY) and varies > VARIES:
-            if convention.id != "inverted-poses" or not worse:
-                return [(error, convention, undone)]
+        fits = convention.id != "inverted-poses" or (
+            2 * fit(undone, true_poses).misfit <= fit(poses, true_poses).misfit
+        )
+        if error < min(EXPLAINED, as_turned / CLEARLY) and varies > VARIES and fits:
+            return [(error, convention, undone)]
     return []
 
 
@@ -488,8 +487,7 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
         motion is always the same, and then many wrong poses explain it.
     """
     if R_est_cam is not None:
-        motions = motions.copy()
-        motions[:, :3, :3] = R_est_cam.T @ motions[:, :3, :3] @ R_est_cam
+        motions = se3.with_rotation(motions, R_est_cam.T @ motions[:, :3, :3] @ R_est_cam)
         motions[:, :3, 3] = motions[:, :3, 3] @ R_est_cam
     if len(true) < MIN_POSES:
         return np.inf, 0.0
@@ -517,12 +515,6 @@ def _reordered(poses: Array) -> Array:
     return se3.from_quaternion(position, np.roll(quaternion, -1, axis=1))
 
 
-def _turned_back(poses: Array) -> Array:
-    turned = poses.copy()
-    turned[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
-    return turned
-
-
 @dataclass(frozen=True)
 class Convention:
     """What poses may be in place of camera-to-world matrices.
@@ -538,18 +530,6 @@ class Convention:
     what: str
     cure: str
     undo: Callable[[Array], Array]
-
-
-def _with_axes(name: str, R_named_camera: Array) -> Convention:
-    """Orientations of axes that are not the camera's (x right, y down, z forward)."""
-
-    def undo(poses: Array) -> Array:
-        poses = poses.copy()
-        poses[:, :3, :3] = poses[:, :3, :3] @ R_named_camera
-        return poses
-
-    cure = "after turning them; give those of a camera with x right, y down, z forward"
-    return Convention("camera-axes", f"the orientations seem to have the axes {name}", cure, undo)
 
 
 CONVENTIONS = (
@@ -569,10 +549,20 @@ CONVENTIONS = (
         "inverted-rotations",
         "the rotations seem to be world to camera, the positions are not",
         "after transposing each rotation; give those of T_world_cam, camera to world",
-        _turned_back,
+        lambda poses: se3.with_rotation(poses, poses[:, :3, :3].transpose(0, 2, 1)),
     ),
-    _with_axes("y up, z back (OpenGL)", np.diag([1.0, -1.0, -1.0])),
-    _with_axes("x forward, y left, z up (ROS)", np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])),
+    Convention(
+        "camera-axes",
+        "the orientations seem to have the axes y up, z back (OpenGL)",
+        "after turning them; give those of a camera with x right, y down, z forward",
+        lambda poses: se3.with_rotation(poses, poses[:, :3, :3] @ np.diag([1.0, -1.0, -1.0])),
+    ),
+    Convention(
+        "camera-axes",
+        "the orientations seem to have the axes x forward, y left, z up (ROS)",
+        "after turning them; give those of a camera with x right, y down, z forward",
+        lambda poses: se3.with_rotation(poses, poses[:, :3, :3] @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+    ),
 )
 """The likeliest first."""
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.geometry import se3
+
 Array = NDArray[np.float64]
 Matrix = tuple[tuple[float, float, float], ...]
 
@@ -35,9 +37,7 @@ def nearest_rotation(matrix: Array | Matrix) -> Array:
 
 def in_camera_axes(T_world_body: Array, R_body_cam: Matrix) -> Array:
     """Poses ``[N, 4, 4]`` of a body with the orientations of the camera on it; positions stay the body's."""
-    poses = T_world_body.copy()
-    poses[:, :3, :3] = poses[:, :3, :3] @ nearest_rotation(R_body_cam)
-    return poses
+    return se3.with_rotation(T_world_body, T_world_body[:, :3, :3] @ nearest_rotation(R_body_cam))
 
 
 def bonn_camera(poses: Array) -> Array:
@@ -61,9 +61,7 @@ def bonn_as_droid_w(poses: Array) -> Array:
     Args:
         poses: Positions of the markers with the camera's orientations ``[N, 4, 4]``, as Bonn's sequences give them.
     """
-    markers = poses.copy()
-    markers[:, :3, :3] = poses[:, :3, :3] @ nearest_rotation(BONN_R_BODY_CAM).T
+    markers = se3.with_rotation(poses, poses[:, :3, :3] @ nearest_rotation(BONN_R_BODY_CAM).T)
     corrected = BONN_T_ROS.T @ markers @ BONN_T_ROS @ BONN_T_M
     relative = np.linalg.inv(corrected[0]) @ corrected
-    relative[:, :3, :3] = nearest_rotation(relative[:, :3, :3])
-    return np.asarray(relative)
+    return se3.with_rotation(relative, nearest_rotation(relative[:, :3, :3]))

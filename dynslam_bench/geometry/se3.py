@@ -107,6 +107,13 @@ def transform(pose: Array, points: Array) -> Array:
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
+def with_rotation(pose: Array, rotation: Array) -> Array:
+    """The poses ``[..., 4, 4]`` with other rotations ``[..., 3, 3]``."""
+    turned = pose.copy()
+    turned[..., :3, :3] = rotation
+    return turned
+
+
 def is_pose(pose: object, tolerance: float = 1e-4) -> bool:
     """Whether the value is a finite 4x4 rigid transformation: orthonormal rotation, determinant 1, last row 0 0 0 1."""
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or not np.issubdtype(pose.dtype, np.floating):

@@ -14,7 +14,7 @@ from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.envs.arguments import Frames, open_frames
-from dynslam_bench.evaluation.prepare import STAMP_TOLERANCE
+from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import write_tum

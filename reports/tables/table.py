@@ -163,10 +163,10 @@ def csv_text(frame: pd.DataFrame) -> str:
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """
-    written = frame.rename(columns=_harmless)
+    written = frame.rename(columns=_no_formula)
     for name in written.columns:
         if written[name].dtype in ("object", "string"):
-            written[name] = written[name].astype(object).map(_harmless)
+            written[name] = written[name].astype(object).map(_no_formula)
     return written.to_csv(index=False, lineterminator="\n")
 
 
@@ -200,7 +200,8 @@ def _words(cell: TableCell) -> str:
     return " ".join(part for part in (cell.text, cell.small, cell.tag) if part)
 
 
-def _harmless(value: object) -> object:
+def _no_formula(value: object) -> object:
+    """The value; words that a spreadsheet would take for a formula begin with a quote."""
     if not isinstance(value, str):
         return value
     return ("'" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else "") + printable(value)

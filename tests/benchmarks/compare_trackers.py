@@ -22,6 +22,7 @@ import json
 import os
 import sys
 import time
+from functools import reduce
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
@@ -151,6 +152,8 @@ def processor_seconds() -> tuple[float, float]:
 
 def score_pair(outcome: dict[str, dict], sequence, protocol: str) -> None:
     """Add the errors of one run of each, on common and on own frames."""
+    import numpy as np
+
     for kind in ("online", "final"):
         both = {side: outcome[side][f"_{kind}"] for side in "ab"}
         present = {side: one for side, one in both.items() if one is not None and len(one)}
