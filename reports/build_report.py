@@ -253,9 +253,7 @@ def speed_section(board: Board) -> Section:
     caption = (
         "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
         "include segmentation and exclude decoding; they hold for the machine named below."
-    )
-    if any(row.cached for row in board.rows):
-        caption += f" {tables.CACHED_NOTE}"
+    ) + f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
     blocks = figure_blocks("speed", figures.speed_figure(board), caption)
     return Section("speed", "Accuracy against speed", "Speed", blocks=blocks)
 

@@ -84,7 +84,9 @@ def compare(
         only_b -= sum(len(by_column_b[column]) for column in shared)
         paired = []
         for column in shared:
-            cells = paired_cells(by_column_a[column], by_column_b[column])
+            sides = by_column_a[column], by_column_b[column]
+            repeats = set[tuple[int, int, int, str]].intersection(*({row.repeat_key for row in side} for side in sides))
+            cells = [make_cell([row for row in side if row.repeat_key in repeats] or side) for side in sides]
             if all(cell.scores for cell in cells):
                 paired.append((columns[column] + (f" {SEEN}" * any(cell.in_training for cell in cells)), *cells))
         if paired:
@@ -93,17 +95,15 @@ def compare(
     if not compared:
         raise ReportError("none of the runs in common has ground truth", "nothing can be compared")
     overall = {name: ratio_interval(np.log([ratio_of(*pair) for pair in paired])) for name, paired in compared.items()}
-    table = _table(f"{name_a} (A) against {name_b} (B)", _caption(evaluated, differences), compared, overall)
-    return Comparison(overall, table, only_a, only_b, differences)
-
-
-def _caption(protocol: str, differences: Mapping[str, list[str]]) -> str:
-    changed = [f"{name}: {', '.join(words)}" for name, words in differences.items() if words]
-    return (
-        f"{protocol}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
+    changed = "; ".join(f"{name}: {', '.join(words)}" for name, words in differences.items() if words)
+    caption = (
+        f"{evaluated}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
         "share none; failures count as a static camera, or worse. B / A below 1: B is better. Brackets: "
-        f"Student's 95 % interval over sequences, from {FEWEST} of them on."
-    ) + (f" What differs: {'; '.join(changed)}." if changed else " The settings are the same.")
+        f"Student's 95 % interval over sequences, from {FEWEST} of them on. "
+        + (f"What differs: {changed}." if changed else "The settings are the same.")
+    )
+    table = _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall)
+    return Comparison(overall, table, only_a, only_b, differences)
 
 
 def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRow], str]:
@@ -146,16 +146,9 @@ def _differences(first: RunRow, second: RunRow) -> list[str]:
     words = []
     for name in sorted({*first.variant, *second.variant}):
         if first.variant.get(name) != second.variant.get(name):
-            before, after = (setting_text(row.variant.get(name, "default")) for row in (first, second))
-            words.append(f"{name}: {before} in A, {after} in B")
+            value_a, value_b = (setting_text(row.variant.get(name, "default")) for row in (first, second))
+            words.append(f"{name}: {value_a} in A, {value_b} in B")
     return words
-
-
-def paired_cells(a: Sequence[RunRow], b: Sequence[RunRow]) -> tuple[Cell, Cell]:
-    """The cells of both sides in one column: of the repeats that both have, or of all where they share none."""
-    repeats = {row.repeat_key for row in a} & {row.repeat_key for row in b}
-    cell_a, cell_b = (make_cell([row for row in side if row.repeat_key in repeats] or side) for side in (a, b))
-    return cell_a, cell_b
 
 
 def ratio_of(_: str, a: Cell, b: Cell) -> float:

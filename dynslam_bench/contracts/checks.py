@@ -88,8 +88,10 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
     Lazily, the most basic first: what comes later takes for granted that the earlier is in order.
     """
     if not isinstance(result, TrackResult):
-        wrap = "track() returns a TrackResult; wrap a bare pose: TrackResult(T_world_cam, 'ok')"
-        yield Fault(f"a {type(result).__name__}, not a TrackResult", wrap)
+        yield Fault(
+            f"a {type(result).__name__}, not a TrackResult",
+            "track() returns a TrackResult; wrap a bare pose: TrackResult(T_world_cam, 'ok')",
+        )
         return
     if result.state not in STATES:
         yield Fault(f"state {result.state!r}", f"expected one of {', '.join(STATES)}")
@@ -140,8 +142,7 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
         TrackerContractError: It has a fault.
     """
     for fault in faults(result, frame):
-        where = f"tracker '{tracker}' at frame {frame.index}"
-        raise TrackerContractError(f"{where} returned {fault.found}", fault.cause)
+        raise TrackerContractError(f"tracker '{tracker}' at frame {frame.index} returned {fault.found}", fault.cause)
     assert isinstance(result, TrackResult)
     stats = {str(key): float(value) for key, value in result.stats.items() if math.isfinite(value)}
     pose = None if result.T_world_cam is None else np.asarray(result.T_world_cam, dtype=np.float64)
@@ -180,16 +181,19 @@ def _pose_faults(pose: object) -> Iterator[Fault]:
     elif pose.dtype.kind not in "fiu" or pose.dtype == np.float16:  # positions in float16 are rounded to millimetres
         yield Fault(f"a pose of the type {pose.dtype}, expected real numbers of enough digits", "return float64")
     elif not np.isfinite(pose).all():
-        bad = int(np.count_nonzero(~np.isfinite(pose)))
-        yield Fault(f"a pose with {bad} values that are not finite", "a solver diverged; say 'lost' instead")
+        yield Fault(
+            f"a pose with {np.count_nonzero(~np.isfinite(pose))} values that are not finite",
+            "a solver diverged; say 'lost' instead",
+        )
     elif (far := float(np.abs(pose).max())) > FARTHEST_M:
         yield Fault(f"a pose {far:.3g} m away", "a solver diverged; say 'lost' instead")
     elif not se3.is_pose(pose.astype(np.float64)):
         rotation = pose[:3, :3].astype(np.float64)
-        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        words = f"|R R^T - I| = {off:.2g}, det R = {float(np.linalg.det(rotation)):.4g}"
-        cause = "the rotation drifted from orthonormal, or world-to-camera scale is mixed in"
-        yield Fault(f"a pose that is no rigid transformation: {words}", cause)
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        yield Fault(
+            f"a pose that is no rigid transformation: |R R^T - I| = {off:.2g}, det R = {np.linalg.det(rotation):.4g}",
+            "the rotation drifted from orthonormal, or world-to-camera scale is mixed in",
+        )
 
 
 def _is_number(value: object) -> bool:

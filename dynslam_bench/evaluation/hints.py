@@ -202,8 +202,8 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
         Hint(
             "time-shift",
             f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each "
-            f"the error falls from {error:.4f} to {undone:.4f} m (at its best scale); give the stamps of the images, on "
-            "the truth's clock",
+            f"the error falls from {error:.4f} to {undone:.4f} m (at its best scale); give the stamps of the images, "
+            "on the truth's clock",
             {"shift_s": shift, "error_m": error, "error_undone_m": undone},
         )
     ]

@@ -94,10 +94,9 @@ class Camera:
 
     def unproject(self, pixels: NDArray[np.floating], depth: NDArray[np.floating]) -> NDArray[np.float64]:
         """Points ``[..., 3]`` of the camera frame (metres) at undistorted pixels ``[..., 2]`` and z-depth ``[...]``."""
-        pixels = np.asarray(pixels, dtype=np.float64)
-        depth = np.asarray(depth, dtype=np.float64)
-        rays = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
-        return np.concatenate([rays * depth[..., None], depth[..., None]], axis=-1)
+        z = np.asarray(depth, dtype=np.float64)[..., None]
+        rays = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        return np.concatenate([rays * z, z], axis=-1)
 
     def undistort_points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         """Undistorted pixels ``[N, 2]`` of the distorted pixels ``[N, 2]``, same intrinsics."""

@@ -72,13 +72,13 @@ def to_seconds(ns: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def refuse_close(
-    ns: NDArray[np.int64], where: str, kind: type[DynslamError], line_of: Callable[[int], int | None] = lambda _: None
+    ns: NDArray[np.int64], source: str, kind: type[DynslamError], line_of: Callable[[int], int | None] = lambda _: None
 ) -> None:
     """Refuse stamps that differ by less than `LEAST_GAP_NS`; equal ones are not looked at.
 
     Args:
         ns: Stamps in nanoseconds ``[N]``, ascending.
-        where: The file or the sequence.
+        source: The file or the sequence.
         kind: What is raised.
         line_of: The line of a stamp in the file; None where it is not known.
 
@@ -93,7 +93,7 @@ def refuse_close(
     lines = [line for line in (line_of(first), line_of(second)) if line is not None]
     at = f" line{'s' * (len(lines) > 1)} {' and '.join(map(str, lines))}" if lines else ""
     raise kind(
-        f"{where}{at}: stamps {format_ns(first)} and {format_ns(second)} s are {second - first} ns apart "
+        f"{source}{at}: stamps {format_ns(first)} and {format_ns(second)} s are {second - first} ns apart "
         f"({len(close)} such pairs)",
         "stamps less than 1 us apart cannot be told apart: remove one of each pair",
     )

@@ -271,8 +271,6 @@ def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | No
 
 # Trajectory files of either format: TUM's, which carry their stamps, and KITTI's, whose stamps lie in another file.
 
-KITTI_VALUES = 12
-
 
 def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> TumFile:
     """Read a trajectory with the counts of what was not taken as it stands.
@@ -286,7 +284,7 @@ def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> T
         TrajectoryError: A file cannot be read, is malformed, or the stamps do not fit the poses.
     """
     path = Path(path)
-    if timestamps is None or len(next(_lines(path), (0, []))[1]) != KITTI_VALUES:
+    if timestamps is None or len(next(_lines(path), (0, []))[1]) != 12:
         return load_tum(path)
     trajectory = read_kitti(path, timestamps)
     return TumFile(trajectory, FileNotes(lines=len(trajectory)))

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dynslam_bench.contracts.sequence import Sequence as FrameSequence
 from dynslam_bench.core.errors import DynslamError, RunError
@@ -115,9 +116,8 @@ def write_explore(
     typical = {row.run_id for name in board.sequences for row in board.typical_runs(name).values()}
     paged = _paged(board, typical, most_pages)
     shown = {row.run_id for row in paged if row.failed or row.run_id in typical}
-    newest = sorted(paged, key=lambda row: row.started, reverse=True)
-    by_column = grouped(sorted(newest, key=lambda row: row.offset), lambda row: row.column_id)
-    shares = {column: exact_shares(rows) for column, rows in by_column.items()}
+    newest = sorted(sorted(paged, key=lambda row: row.started, reverse=True), key=lambda row: row.offset)
+    shares = {column: exact_shares(rows) for column, rows in grouped(newest, lambda row: row.column_id).items()}
     ordered = sorted(paged, key=lambda row: (row.run_id not in shown, row.column_id))
     deadline = time.time() + picture_seconds
     jobs = []
@@ -234,16 +234,15 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
     page_of = {page.run_id: page for page in pages}
     kept = {row.run_id for cells in board.cells.values() for cell in cells.values() for row in cell.kept}
     first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
-    listed = board.rows  # a page of a hundred thousand would open slowly, and nobody reads them
-    if len(board.rows) > MOST_LISTED:
-        listed = [row for row in board.rows if row.run_id in page_of or row.run_id in first]
+    all_listed = len(board.rows) <= MOST_LISTED  # a page of a hundred thousand would open slowly
+    listed = [row for row in board.rows if all_listed or row.run_id in page_of or row.run_id in first]
     runs = []
     for row in sorted(listed, key=lambda r: (place[r.variant_key], column[board.sequence(r)], r.repeat_key)):
         page = page_of.get(row.run_id)
         values = [significant(_value(row, metric), 5) for metric in metrics]
         flags = (row.run_id in kept) + 2 * (page is not None and page.pictured) + 4 * (page is None)
-        where = [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat]
-        runs.append([*where, row.ending, flags, values, page.quantiles_mm if page else []])
+        cell = place[row.variant_key], column[board.sequence(row)]
+        runs.append([row.run_id, *cell, row.repeat, row.ending, flags, values, page.quantiles_mm if page else []])
     tags: dict[str, set[str]] = {}
     for row in board.rows:
         tags.setdefault(board.sequence(row), set()).update(row.sequence.tags)
@@ -286,7 +285,6 @@ def _tracker(board: Board, key: str, at: int) -> dict[str, Any]:
     runs, first = board.runs(key), board.first(key)
     standing = next((standing for standing in board.standings if standing.key == key), None)
     ended = [row for row in runs if not row.failed]
-    counts = Counter(row.failed for row in runs)
     return {
         "label": board.labels[key],
         "id": first.tracker.id,
@@ -296,7 +294,7 @@ def _tracker(board: Board, key: str, at: int) -> dict[str, Any]:
         "colour": COLOURS[at % len(COLOURS)],
         "rank": "–" if standing is None else rank_cell(standing).text,
         "ratio": None if standing is None else significant(standing.ratio.value, 4),
-        "success": [counts[False], len(runs)],
+        "success": [len(ended), len(runs)],
         "coverage": significant(float(np.mean([row.coverage for row in runs])), 4),
         "speed": significant(middle(row.real_time_factor for row in timed(ended)), 3),
         "memory": significant(middle(row.peak_memory_mb for row in ended), 4),
@@ -377,15 +375,14 @@ def run_content(
 
 def _facts(row: RunRow, record: RunRecord, rpe: Sequence[RPESpec]) -> list[list[str | float | None]]:
     """Name, number and unit of what is known of a run."""
-    rpe_facts = [
-        (f"RPE over {spec.describe()}", row.metrics.get(spec.metric("trans")), 1000, "mm/s" if spec.rate else "mm")
-        for spec in rpe
-    ]
     facts: list[tuple[str, float | None, int, str]] = [
         ("ATE, lost frames held", row.score_m, 1000, "mm"),
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, "mm"),
         ("ATE of the final trajectory", row.final_ate_m, 1000, "mm"),
-        *rpe_facts,
+        *(
+            (f"RPE over {spec.describe()}", row.metrics.get(spec.metric("trans")), 1000, "mm/s" if spec.rate else "mm")
+            for spec in rpe
+        ),
         ("coverage", row.coverage, 100, "%"),
         ("frame time", row.frame_ms, 1, "ms"),
         ("real time", row.real_time_factor, 1, "×"),
@@ -402,10 +399,10 @@ def _log(row: RunRow) -> str:
     if not path.is_file():
         return ""
     with path.open("rb") as file:
-        before = max(file.seek(0, os.SEEK_END) - _LOG_BYTES, 0)
-        file.seek(before)
+        skipped = max(file.seek(0, os.SEEK_END) - _LOG_BYTES, 0)
+        file.seek(skipped)
         text = file.read(_LOG_BYTES)
-    return (f"... {before} bytes before\n" if before else "") + text.decode(errors="replace")
+    return (f"... {skipped} bytes before\n" if skipped else "") + text.decode(errors="replace")
 
 
 def _series(frames: RunFrames, most: int) -> dict[str, Any]:
@@ -512,10 +509,7 @@ def broken(stamps: Array, values: Array, most: int) -> tuple[Array, Array]:
 def _angles(track: Trajectory, true: Trajectory) -> Array:
     """Yaw, pitch and roll (about the camera's y, x and z) from the first true pose, in degrees ``[N, 3]``."""
     turned = true.T_world_cam[0, :3, :3].T @ track.T_world_cam[:, :3, :3]
-    yaw = np.arctan2(turned[:, 0, 2], turned[:, 2, 2])
-    pitch = np.arcsin(np.clip(-turned[:, 1, 2], -1, 1))
-    roll = np.arctan2(turned[:, 1, 0], turned[:, 1, 1])
-    return np.asarray(np.degrees(np.unwrap(np.stack([yaw, pitch, roll], axis=1), axis=0)))
+    return np.asarray(np.degrees(np.unwrap(Rotation.from_matrix(turned).as_euler("YXZ"), axis=0)))
 
 
 # -- the frames of a run, from its ``frames.csv``

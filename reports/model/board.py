@@ -8,7 +8,9 @@ from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
 from statistics import geometric_mean, median
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+import pandas as pd
 
 from dynslam_bench.core.errors import ReportError, did_you_mean
 from dynslam_bench.core.toml import assignments
@@ -18,10 +20,6 @@ from dynslam_bench.reports.model.names import make_labels, name_columns, shorten
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
 from dynslam_bench.runs.store import RunStore, part_words
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 STATIC_CAMERA = "static camera (from ground truth)"
 DEFAULT_REFERENCE = "orb-slam2"
@@ -152,8 +150,6 @@ class Board:
             the tracker), and every metric of the protocol under its own name, the unit at its end (``ate_rmse_m``,
             ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
         """
-        import pandas as pd
-
         metrics = sorted({name for row in self.rows for name in row.metrics} - set(_COLUMNS["Float64"]))
         kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(metrics, "Float64")
         lines = []

@@ -16,13 +16,18 @@ import pandas as pd
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol
 
 CLAIMED = "claimed by the paper"
-_FPS = 30.0
-_SITTING = {"static": 680, "xyz": 1219, "halfsphere": 1074, "rpy": 795}
-_WALKING = {"static": 717, "xyz": 825, "halfsphere": 1021, "rpy": 866}
-_LEAST_FRAMES = {f"tum/fr3/sitting_{name}": frames for name, frames in _SITTING.items()}
-_LEAST_FRAMES |= {f"tum/fr3/walking_{name}": frames for name, frames in _WALKING.items()}
-_LEAST_FRAMES |= {"bonn/crowd": 425}
-"""So many frames a recording has at least. TUM: the pairs of colour and depth in the association files that are
+_LEAST_FRAMES = {
+    "tum/fr3/sitting_static": 680,
+    "tum/fr3/sitting_xyz": 1219,
+    "tum/fr3/sitting_halfsphere": 1074,
+    "tum/fr3/sitting_rpy": 795,
+    "tum/fr3/walking_static": 717,
+    "tum/fr3/walking_xyz": 825,
+    "tum/fr3/walking_halfsphere": 1021,
+    "tum/fr3/walking_rpy": 866,
+    "bonn/crowd": 425,
+}
+"""Least number of frames of a recording, at 30 Hz. TUM: the pairs of colour and depth in the association files that are
 published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last frame of an excerpt that is numbered as
 in the whole, counted from 0. Of others no source was read."""
 RECORD = "record"
@@ -98,7 +103,7 @@ def static_camera_errors() -> dict[tuple[str, str], float]:
 def least_length_s(sequence: str) -> float | None:
     """How long a published recording lasts at least, in seconds; None where that is not known."""
     frames = _LEAST_FRAMES.get(sequence)
-    return None if frames is None else frames / _FPS
+    return None if frames is None else frames / 30.0
 
 
 def is_excerpt(sequence: str, duration_s: float) -> bool:

@@ -82,7 +82,8 @@ def standings(cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Se
     logs = {key: _log_medians(cell, names) for key, cell in cells.items()}
     p_values = {key: paired_p_value(logs[key], base) for key in ranked}
     tested = {key: p for key, p in p_values.items() if p is not None}
-    corrected = holm(tested) if attainable_p(len(names), len(tested)) <= 0.05 else {}
+    shown = attainable_p(len(names), len(tested)) <= 0.05
+    corrected = dict(zip(tested, holm([*tested.values()]).tolist(), strict=True)) if shown else {}
     ranked_logs = {key: logs[key] for key in ranked}
     means = [round(float(np.mean(log)), 12) for log in ranked_logs.values()]
     ranks = dict(zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True))
@@ -143,8 +144,7 @@ def separable(logs: Mapping[str, Array]) -> dict[tuple[str, str], bool]:
         varied = np.ptp(differences, axis=1) > 0
         p_values[varied] = scipy.stats.ttest_1samp(differences[varied], 0.0, axis=1).pvalue
         p_values[~varied & (differences[:, 0] != 0)] = 0.0  # the same ratio on every sequence
-    corrected = holm({str(at): float(p) for at, p in enumerate(p_values)})
-    return {pair: corrected[str(at)] <= FAMILY_ERROR for at, pair in enumerate(pairs)}
+    return dict(zip(pairs, (holm(p_values) <= FAMILY_ERROR).tolist(), strict=True))
 
 
 def rank_groups(logs: Mapping[str, Array]) -> dict[str, tuple[int, int]]:
@@ -173,14 +173,11 @@ def attainable_p(sequences: int, tests: int = 1) -> float:
     return min(1.0, max(tests, 1) * 2.0 / 2.0**sequences)
 
 
-def holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    """Holm's step-down correction for several comparisons."""
-    corrected: dict[str, float] = {}
-    running = 0.0
-    for position, (key, p) in enumerate(sorted(p_values.items(), key=lambda item: item[1])):
-        running = max(running, min(1.0, p * (len(p_values) - position)))
-        corrected[key] = running
-    return corrected
+def holm(p_values: Sequence[float] | Array) -> Array:
+    """Holm's step-down correction of several p values ``[K]``."""
+    order = np.argsort(p_values, kind="stable")
+    steps = np.minimum(1.0, np.asarray(p_values)[order] * np.arange(len(order), 0, -1))
+    return np.asarray(np.maximum.accumulate(steps)[np.argsort(order)])
 
 
 def power_note(standings: Sequence[Standing], sequences: int, fewest_repeats: int) -> str:

@@ -15,7 +15,7 @@ from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell, mean_skipped, rank
 from dynslam_bench.reports.model.published import ReportedCell
-from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
+from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (
     Column,
@@ -149,7 +149,7 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
     coverage = float(np.mean([row.coverage for row in runs]))
     hinted = _hinted(runs)
     masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
-    tracker = runs[0].tracker
+    tracker, skipped = runs[0].tracker, mean_skipped(runs)
     cells = {
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
@@ -158,15 +158,13 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
         "× real time": speed_cell(ended),
         "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
         "rows": TableCell(tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items())),
+        "F skipped": TableCell() if skipped is None else TableCell(percent(skipped), value=skipped),
         "provenance": TableCell(
             _NAMES.get(tracker.provenance, tracker.provenance),
             f"{masks} masks" if masks else "",
             tip=_PROVENANCE.get(tracker.provenance, ""),
         ),
     }
-    skipped = mean_skipped(runs)
-    if skipped is not None:
-        cells["F skipped"] = TableCell(percent(skipped), value=skipped)
     if key in board.hopeless:
         return cells | {"ATE ratio": TableCell("nothing succeeded", emphasis="failed")}
     if standing is None:
@@ -364,10 +362,8 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         rows.append([TableCell(board.labels[key], tag="imported" * board.first(key).imported), *cells])
     rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
     separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
-    lines: dict[tuple[str, str], dict[str, ReportedCell]] = {}
-    for published in reported:
-        lines.setdefault((published.system, published.tag), {}).setdefault(published.sequence, published)
-    for (name, tag), line in lines.items():
+    for (name, tag), published in grouped(reported, lambda cell: (cell.system, cell.tag)).items():
+        line = {cell.sequence: cell for cell in reversed(published)}
         printed = [line.get(sequence) for sequence in board.sequences]
         cells = [TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell() for p in printed]
         rows.append([TableCell(name, tag=tag), *cells])
@@ -658,10 +654,10 @@ def _spread_cells(board: Board, key: str) -> list[TableCell]:
     for name, cell in several.items():
         errors = [row.score_m or 0.0 for row in cell.succeeded]
         spreads[name] = max(errors) / max(min(errors), FLOOR_M)
-    where = max(spreads, key=lambda name: (spreads[name], name))
+    widest = max(spreads, key=lambda name: (spreads[name], name))
     size = f"{median(len(cell.succeeded) for cell in several.values()):g}"
-    ratios = [number(median(spreads.values()), ".2f"), number(spreads[where], ".2f")]
-    return [*counts, TableCell(size), *ratios, TableCell(where)]
+    ratios = [number(median(spreads.values()), ".2f"), number(spreads[widest], ".2f")]
+    return [*counts, TableCell(size), *ratios, TableCell(widest)]
 
 
 def machines(board: Board) -> Table:
@@ -713,12 +709,11 @@ def relative_table(board: Board, protocol: Protocol) -> Table | None:
 
 def time_table(board: Board) -> Table | None:
     """Table 3: accuracy, error and time of a frame; None if nothing was scored."""
-    columns: dict[str, Value] = {
-        "accuracy (%)": lambda row: None if (share := _share(row)) is None else 100 - share,
-        "error (%)": _share,
-        "time (ms)": lambda row: None if _share(row) is None else row.frame_ms,
+    measures = {
+        "accuracy (%)": medians(board, lambda row: None if (share := _share(row)) is None else 100 - share),
+        "error (%)": medians(board, _share),
+        "time (ms)": medians(board, lambda row: None if _share(row) is None else row.frame_ms),
     }
-    measures = {name: medians(board, value) for name, value in columns.items()}
     if not measures["error (%)"]:
         return None
     caption = (

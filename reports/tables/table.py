@@ -241,10 +241,11 @@ _NAMES_PT = 92.0
 _HEADING = 11
 OUR_BACK_END = " (our back end)"
 _STAR = r"\rlap{$^*$}"
-_LATEX = {character: f"\\{character}" for character in "&%$#_{}"}
-_LATEX |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "|": r"\textbar{}"}
-_LATEX |= {"<": r"\textless{}", ">": r"\textgreater{}", "·": r"\textperiodcentered{}", "—": "---", "–": "--"}
-_LATEX |= {
+_LATEX = {
+    **{character: f"\\{character}" for character in "&%$#_{}"},
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "|": r"\textbar{}"},
+    **{"<": r"\textless{}", ">": r"\textgreater{}", "·": r"\textperiodcentered{}", "—": "---", "–": "--"},
+    **{"†": r"$^\dagger$", "‡": r"$^\ddagger$", "…": r"\ldots{}", "’": "'", "“": "``", "”": "''", '"': "''"},
     "×": r"$\times$",
     "±": r"$\pm$",
     "≤": r"$\leq$",
@@ -254,7 +255,6 @@ _LATEX |= {
     "§": r"\S{}",
     "¶": r"\P{}",
 }
-_LATEX |= {"†": r"$^\dagger$", "‡": r"$^\ddagger$", "…": r"\ldots{}", "’": "'", "“": "``", "”": "''", '"': "''"}
 
 
 def to_latex(table: Table, protocol: str = "") -> str:
