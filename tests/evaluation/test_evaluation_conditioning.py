@@ -81,10 +81,8 @@ def test_the_uncertainty_is_that_of_repetition() -> None:
     """Where errors are small, it is the spread of the rotations that independent errors give."""
     truth = straight(0.1)
     fits = [align(disturbed(truth, 0.005, seed, frames=1.0), truth, "se3") for seed in range(40)]
-    angles = np.array([np.rad2deg(se3.rotation_angle(_pose(fit.rotation)))[0] for fit in fits])
-    spread = np.sqrt((angles**2).mean())
-    stated = np.median([fit.uncertainty_deg for fit in fits])
-    assert 0.6 * spread < stated < 1.8 * spread
+    spread = np.sqrt((np.array([np.rad2deg(se3.rotation_angle(_pose(fit.rotation)))[0] for fit in fits]) ** 2).mean())
+    assert 0.6 * spread < np.median([fit.uncertainty_deg for fit in fits]) < 1.8 * spread
 
 
 def test_an_exact_estimate_and_a_short_one() -> None:

@@ -78,8 +78,7 @@ def test_estimates_of_every_length_are_taken():
 @pytest.mark.parametrize("every", [1, 3])
 def test_time_shifts_are_measured(seconds, every):
     estimate = tracked(TRUTH, every=every)
-    late = Trajectory(estimate.timestamps + seconds, estimate.T_world_cam)
-    (hint,) = hints(late, TRUTH)
+    (hint,) = hints(Trajectory(estimate.timestamps + seconds, estimate.T_world_cam), TRUTH)
     assert hint.id == "time-shift"
     assert hint.numbers["shift_s"] == pytest.approx(-seconds, abs=0.01)
     assert hint.numbers["error_undone_m"] < 0.5 * hint.numbers["error_m"]
@@ -102,8 +101,7 @@ def test_conventions_are_named(seed):
     estimate = tracked(truth, seed)
     assert ids(posed(estimate, se3.inverse(estimate.T_world_cam)), truth) == ["inverted-poses"]
     assert ids(w_first(estimate), truth) == ["quaternion-order"]
-    flipped = estimate.T_world_cam @ np.diag([1.0, -1.0, -1.0, 1.0])
-    (hint,) = hints(posed(estimate, flipped), truth)
+    (hint,) = hints(posed(estimate, estimate.T_world_cam @ np.diag([1.0, -1.0, -1.0, 1.0])), truth)
     assert hint.id == "camera-axes" and "OpenGL" in hint.text
     turned = estimate.T_world_cam.copy()
     turned[:, :3, :3] = turned[:, :3, :3].transpose(0, 2, 1)
@@ -118,8 +116,7 @@ def test_two_faults_are_both_named():
 
 
 def test_a_truth_with_axes_of_its_own_is_no_fault_of_the_estimate():
-    marker = se3.exp(np.array([0.02, 0.01, 0.0, 2.0, -0.7, 0.4]))
-    truth = posed(TRUTH, TRUTH.T_world_cam @ marker)
+    truth = posed(TRUTH, TRUTH.T_world_cam @ se3.exp(np.array([0.02, 0.01, 0.0, 2.0, -0.7, 0.4])))
     assert ids(ESTIMATE, truth) == []
     assert ids(posed(ESTIMATE, se3.inverse(ESTIMATE.T_world_cam)), truth) == ["inverted-poses"]
 
@@ -158,16 +155,14 @@ def test_poses_read_from_the_truth_are_named():
     for axis in range(3):
         between[:, axis, 3] = np.interp(stamps, measured.timestamps, measured.positions[:, axis])
     assert ids(Trajectory(stamps, between), measured) == ["below-truth-noise"]
-    rng = np.random.default_rng(0)
-    drift = np.cumsum(rng.normal(0, 1e-5, (len(at), 3)), axis=0)
+    drift = np.cumsum(np.random.default_rng(0).normal(0, 1e-5, (len(at), 3)), axis=0)
     between[:, :3, 3] += drift + [[0.003, 0, 0]] * np.sin(stamps - stamps[0])[:, None]
     assert ids(Trajectory(stamps, between), measured) == ["below-truth-noise"]
     assert ids(tracked(measured, drift=0.0, jitter=3e-4, every=3), measured) == []
 
 
 def test_a_camera_that_stands_still_may_be_followed_exactly():
-    stamps = 100 + np.arange(60) / 30
-    still = Trajectory(stamps, np.tile(np.eye(4), (60, 1, 1)))
+    still = Trajectory(100 + np.arange(60) / 30, np.tile(np.eye(4), (60, 1, 1)))
     assert ids(still, still) == []
     noisy = hand_held(600, rate=100.0)
     noisy = posed(noisy, np.tile(np.eye(4), (600, 1, 1)))

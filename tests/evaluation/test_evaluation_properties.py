@@ -75,8 +75,7 @@ def test_sim3_finds_the_scale_and_se3_does_not():
 def test_yaw_alignment_undoes_a_turn_about_z_and_nothing_else():
     about_z = se3.exp(np.array([1.0, -2.0, 0.5, 0, 0, 0])) @ se3.exp(np.array([0, 0, 0, 0, 0, 1.2]))
     protocol = Protocol(id="x", alignment="yaw")
-    result = evaluate(TRUTH.transformed(about_z), TRUTH, protocol)
-    assert result.metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    assert evaluate(TRUTH.transformed(about_z), TRUTH, protocol).metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
     tilted = TRUTH.transformed(se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))
     assert evaluate(tilted, TRUTH, protocol).metrics["ate_rmse_m"] > 0.01
 
@@ -128,8 +127,7 @@ def test_motion_on_a_line_is_aligned_to_the_minimum_and_the_roll_comes_from_the_
 
 def test_a_hole_in_the_ground_truth_is_measured_and_named():
     truth = walk(n=300)
-    hole = truth.select(np.r_[0:100, 160:300])
-    result = evaluate(noisy(truth), hole)
+    result = evaluate(noisy(truth), truth.select(np.r_[0:100, 160:300]))
     assert result.n_pairs == 240
     assert (result.association.in_holes, result.association.outside, result.association.taken) == (60, 0, 0)
     assert result.association.largest_hole_s == pytest.approx(61 / 30, abs=1e-5)
@@ -138,12 +136,8 @@ def test_a_hole_in_the_ground_truth_is_measured_and_named():
 
 def test_poses_outside_and_doubly_claimed_are_told_apart():
     truth = walk(n=100)
-    late = truth.select(slice(0, 80))
-    result = evaluate(noisy(truth), late)
-    assert result.association.outside == 20
-    sparse = truth.select(slice(0, None, 2))
-    wide = Protocol(id="x", max_dt=0.05)
-    claimed = evaluate(noisy(truth), sparse, wide)
+    assert evaluate(noisy(truth), truth.select(slice(0, 80))).association.outside == 20
+    claimed = evaluate(noisy(truth), truth.select(slice(0, None, 2)), Protocol(id="x", max_dt=0.05))
     assert claimed.n_pairs == 50
     assert claimed.association.taken == 50
 
@@ -175,8 +169,7 @@ def test_lost_frame_policies():
     assert held.coverage == pytest.approx(0.8)
     frozen = truth.T_world_cam.copy()
     frozen[40:60] = frozen[39]
-    by_hand = evaluate(Trajectory(truth.timestamps, frozen), truth)
-    close(held.metrics, by_hand.metrics)
+    close(held.metrics, evaluate(Trajectory(truth.timestamps, frozen), truth).metrics)
     fails = held_protocol.model_copy(update={"lost_frames": "fail"})
     with pytest.raises(EvaluationError, match=r"20 of 100 frames were lost \(coverage 80.0 %\)"):
         evaluate(tracked, truth, fails, input_timestamps=truth.timestamps)

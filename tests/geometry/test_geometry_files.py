@@ -24,8 +24,7 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 def random_trajectory(n=50, seed=0, start=1305031102.175304):
     rng = np.random.default_rng(seed)
-    stamps = np.round(start + np.cumsum(rng.uniform(0.01, 0.05, n)), 6)
-    return Trajectory(stamps, se3.exp(rng.normal(0, 1, (n, 6))))
+    return Trajectory(np.round(start + np.cumsum(rng.uniform(0.01, 0.05, n)), 6), se3.exp(rng.normal(0, 1, (n, 6))))
 
 
 def write(tmp_path, text, name="trajectory.txt"):
@@ -47,8 +46,7 @@ def test_tum_round_trip(tmp_path):
 
 
 def test_tum_quaternion_order_is_xyzw(tmp_path):
-    path = write(tmp_path, "1.0 0.1 0.2 0.3 0 0 0.7071067811865476 0.7071067811865476\n")
-    pose = read_tum(path).T_world_cam[0]
+    pose = read_tum(write(tmp_path, "1.0 0.1 0.2 0.3 0 0 0.7071067811865476 0.7071067811865476\n")).T_world_cam[0]
     assert np.allclose(pose[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert np.allclose(pose[:3, 3], [0.1, 0.2, 0.3])
 
@@ -111,8 +109,7 @@ def test_stamps_that_no_file_tells_apart_make_no_trajectory():
 
 
 def test_empty_trajectory_formats_to_its_header():
-    empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-    assert format_tum(empty) == "# timestamp tx ty tz qx qy qz qw\n"
+    assert format_tum(Trajectory(np.zeros(0), np.zeros((0, 4, 4)))) == "# timestamp tx ty tz qx qy qz qw\n"
 
 
 def test_kitti_round_trip_and_evo(tmp_path):
@@ -121,8 +118,7 @@ def test_kitti_round_trip_and_evo(tmp_path):
     again = read_kitti(tmp_path / "poses.txt", tmp_path / "times.txt")
     assert np.array_equal(again.timestamps, original.timestamps)
     assert np.allclose(again.T_world_cam, original.T_world_cam, atol=1e-8)
-    file_interface = pytest.importorskip("evo.tools.file_interface")
-    evo = file_interface.read_kitti_poses_file(str(tmp_path / "poses.txt"))
+    evo = pytest.importorskip("evo.tools.file_interface").read_kitti_poses_file(str(tmp_path / "poses.txt"))
     assert np.allclose(np.array(evo.poses_se3), again.T_world_cam, atol=1e-8)
 
 

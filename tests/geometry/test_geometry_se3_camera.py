@@ -45,8 +45,7 @@ def test_inverse_transform_and_hat():
     poses = se3.exp(twists(1.0))
     assert np.allclose(se3.inverse(poses) @ poses, np.eye(4), atol=1e-12)
     points = np.random.default_rng(1).normal(size=(7, 3))
-    moved = se3.transform(poses[0], points)
-    assert np.allclose(moved, [(poses[0] @ np.append(p, 1))[:3] for p in points])
+    assert np.allclose(se3.transform(poses[0], points), [(poses[0] @ np.append(p, 1))[:3] for p in points])
     a, b = points[:3], points[3:6]
     assert np.allclose((se3.hat(a) @ b[..., None])[..., 0], np.cross(a, b))
 

@@ -21,8 +21,7 @@ POSE = "0 0 0 0 0 0 1"
 
 
 def test_text_and_nanoseconds_are_one_anothers() -> None:
-    rng = np.random.default_rng(0)
-    for ns in [0, 1, -1, EUROC, 2**63 - 1, *rng.integers(-(2**62), 2**62, 2000).tolist()]:
+    for ns in [0, 1, -1, EUROC, 2**63 - 1, *np.random.default_rng(0).integers(-(2**62), 2**62, 2000).tolist()]:
         text = stamps.format_ns(ns)
         assert stamps.parse_ns(text) == ns == int(Decimal(text).scaleb(9))
 
@@ -64,8 +63,7 @@ def test_files_keep_nanoseconds(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("".join(f"{text} {POSE}\n" for text in texts))
     read = read_tum(tmp_path / "a.txt")
     write_tum(tmp_path / "b.txt", read.select(slice(3, None)))
-    lines = (tmp_path / "b.txt").read_text().splitlines()[1:]
-    assert [line.split()[0] for line in lines] == texts[3:]
+    assert [line.split()[0] for line in (tmp_path / "b.txt").read_text().splitlines()[1:]] == texts[3:]
     write_kitti(tmp_path / "k.txt", read, tmp_path / "times.txt")
     assert (tmp_path / "times.txt").read_text().split() == texts
     assert read_kitti(tmp_path / "k.txt", tmp_path / "times.txt").timestamps_ns.tolist() == read.timestamps_ns.tolist()

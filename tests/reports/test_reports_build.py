@@ -34,8 +34,7 @@ def test_the_page_is_complete_in_itself(made):
 def test_every_run_has_its_side_file_and_a_cell_that_leads_to_it(made):
     store, paths = made
     ids = set(store.ids())
-    folder = paths.html.parent / "data"
-    assert {path.stem.removeprefix("run-") for path in folder.glob("run-*.js")} == ids
+    assert {path.stem.removeprefix("run-") for path in (paths.html.parent / "data").glob("run-*.js")} == ids
     linked = set(re.findall(r"run\.html#([0-9a-f]{16})", paths.html.read_text()))
     assert linked <= ids and len(linked) == 22  # 5 trackers on 4 sequences, an import, and the run that failed
     explore = page_data(paths.html.parent, "explore")
@@ -103,8 +102,7 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     paths = build_report(store, tmp_path, reference="orb-slam3")
     assert "static camera (from ground truth)" in rows_of(paths.csv["per_sequence"])[-1]["tracker"]
     assert ReportData.read(paths.data).reference == "static camera (from ground truth)"
-    board = rows_of(paths.csv["leaderboard"])
-    assert float(board[0]["ATE ratio"]) < 0.2
+    assert float(rows_of(paths.csv["leaderboard"])[0]["ATE ratio"]) < 0.2
 
 
 def test_small_and_odd_results(tmp_path):

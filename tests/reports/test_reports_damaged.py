@@ -38,8 +38,7 @@ def store(tmp_path):
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_table_of_frames_costs_only_its_own_figures(store, tmp_path, damage):
     hurt, other = store.ids()[:2]
-    path = store.folder(hurt) / "frames.csv"
-    path.write_bytes(DAMAGE[damage])
+    (store.folder(hurt) / "frames.csv").write_bytes(DAMAGE[damage])
     paths = build_report(store, tmp_path / "report", picture_seconds=0)
     assert any("frames.csv" in note for note in page_data(paths.html.parent, f"run-{hurt}")["notes"])
     assert (
@@ -62,8 +61,7 @@ def test_a_tracker_that_always_crashes_is_not_called_repeatable():
     rows += [crashed("c", s, seed=seed) for s in "st" for seed in (0, 1)]
     rows += [row("half", "s", 0.2), row("half", "s", 0.3, seed=1), row("half", "t", 0.2), crashed("half", "t", seed=1)]
     board = make_board(rows)
-    spread = repeatability(board)
-    assert {cells[0].text: cells[1].text for cells in spread.rows} == {"GOOD": "2", "HALF": "1"}
+    assert {cells[0].text: cells[1].text for cells in repeatability(board).rows} == {"GOOD": "2", "HALF": "1"}
     assert [trace["name"] for trace in repeat_figure(board)["data"]] == ["GOOD", "HALF"]
 
 

@@ -137,8 +137,7 @@ def test_a_failure_is_hatched_says_how_and_is_never_best(explored):
 
 
 def test_a_cell_leads_to_its_run_and_the_run_to_its_like(explored, report):
-    link = explored.run("one('#explore-table td a').href")
-    explored.open(report.run, anchor="#" + link.partition("#")[2])
+    explored.open(report.run, anchor="#" + explored.run("one('#explore-table td a').href").partition("#")[2])
     explored.until("one('.card')")
     assert "DynaSLAM" in explored.run("document.title") and explored.faults == []
     explored.run("choose(one('#run-choice select'))")
@@ -154,8 +153,9 @@ def test_a_run_shows_its_figures_settings_log_and_command(browser, report):
     text = browser.run("one('main').innerText")
     assert "dynslam-bench run ours" in text and "a log" in text and "20 of 50 features culled" in text
     assert "image that shows people (%)" in browser.run("one('#over-time svg').textContent")
-    gaps = browser.run("one('#poses svg .line[stroke-width=\"1.8\"]').getAttribute('d').split('M').length - 1")
-    assert gaps == 2  # the lost frame breaks the line
+    assert (
+        browser.run("one('#poses svg .line[stroke-width=\"1.8\"]').getAttribute('d').split('M').length - 1") == 2
+    )  # the lost frame breaks the line
 
 
 def test_angles_that_only_the_alignment_made_are_called_unreliable(browser, tmp_path, monkeypatch):
@@ -183,8 +183,7 @@ def test_the_slider_moves_image_track_and_cursor(browser, report):
     first = browser.run(state)
     assert "frame 0" in first[0] and "frame 39" in last[0]
     assert first[1] != last[1]
-    shown = {url.rpartition("/")[2] for url in browser.fetched if "/frames/" in url}
-    assert {"0.webp", "39.webp"} <= shown
+    assert {"0.webp", "39.webp"} <= {url.rpartition("/")[2] for url in browser.fetched if "/frames/" in url}
     compare = "all('#frames .view')[all('#frames .view').length - 1].style.clipPath"
     browser.run("slide(all('#frames input[type=range]').at(-1), 80)")
     assert "80%" in browser.run(compare)

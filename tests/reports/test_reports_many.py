@@ -101,8 +101,7 @@ def test_csv_of_every_kind_of_column():
 def test_rows_are_written_one_a_line_and_read_back(tmp_path):
     rows = [row(run_id=digest([at], 16), reason="postgresql://me:secret@db/x") for at in range(3)]
     for some in (rows, rows[:1], []):
-        data = ReportData(title="t", protocol="p", reference="r", version="1", rows=some)
-        data.write(tmp_path / "report.json")
+        ReportData(title="t", protocol="p", reference="r", version="1", rows=some).write(tmp_path / "report.json")
         text = (tmp_path / "report.json").read_text()
         read = ReportData.read(tmp_path / "report.json")
         assert [each.run_id for each in read.rows] == [each.run_id for each in some]

@@ -29,8 +29,7 @@ def cells(rng, trackers, sequences=6, runs=4, spread=0.1):
 
 
 def test_ratio_is_the_geometric_mean_of_medians():
-    rng = np.random.default_rng(0)
-    data = cells(rng, {"a": 0.5, "ref": 1.0})
+    data = cells(np.random.default_rng(0), {"a": 0.5, "ref": 1.0})
     (a, ref) = standings(data, data["ref"], ["a", "ref"])
     expected = stats.gmean([np.median(data["a"][s]) / np.median(data["ref"][s]) for s in data["a"]])
     assert a.key == "a"
@@ -55,8 +54,7 @@ def test_the_interval_of_a_ratio_is_students():
 
 def test_ranks_groups_and_mean_ranks():
     data = cells(np.random.default_rng(2), {"best": 0.1, "middle": 0.5, "worst": 5.0}, spread=0.01)
-    found = standings(data, data["middle"], ["worst", "middle", "best"])
-    places = [(s.key, s.group, s.mean_rank) for s in found]
+    places = [(s.key, s.group, s.mean_rank) for s in standings(data, data["middle"], ["worst", "middle", "best"])]
     assert places == [("best", (1, 1), 1.0), ("middle", (2, 2), 2.0), ("worst", (3, 3), 3.0)]
 
 
@@ -88,8 +86,7 @@ def test_equal_trackers_share_their_rank():
 
 
 def test_unranked_and_incomplete_trackers_come_last_and_take_no_rank():
-    rng = np.random.default_rng(4)
-    data = cells(rng, {"a": 0.5, "ref": 1.0, "oracle": 0.01})
+    data = cells(np.random.default_rng(4), {"a": 0.5, "ref": 1.0, "oracle": 0.01})
     data["partial"] = {"s0": data["a"]["s0"]}
     found = standings(data, data["ref"], ["a", "ref"])
     assert [s.key for s in found] == ["a", "ref", "oracle", "partial"]
@@ -137,6 +134,5 @@ def test_holm(p_values, corrected):
 @pytest.mark.parametrize("shape", ["normal", "heavy tails", "unequal spread", "skewed"])
 @pytest.mark.parametrize("sequences", [3, 5, 8, 20])
 def test_groups_hold_the_true_order(shape, sequences):
-    quality = np.sort(np.random.default_rng(0).normal(0, 0.25, 5))
-    right, _ = simulate(shape, quality, sequences, 200)
+    right, _ = simulate(shape, np.sort(np.random.default_rng(0).normal(0, 0.25, 5)), sequences, 200)
     assert right >= 0.95

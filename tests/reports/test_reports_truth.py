@@ -102,8 +102,7 @@ def test_one_more_sequence_takes_nobodys_rank():
     assert [board.labels[k] for k in board.ranked] == ["A", "B", "ORB-SLAM2"]
     assert board.common == ["s", "t", "u"]
     assert board.reference_name == "ORB-SLAM2"
-    everything = make_board(uneven(), on="all")
-    assert everything.ranked == []
+    assert make_board(uneven(), on="all").ranked == []
 
 
 def test_missing_cells_are_named_with_the_commands_that_fill_them():
@@ -219,8 +218,7 @@ def test_times_from_the_cache_are_marked(tmp_path):
 
 
 def test_the_share_without_fundamental_matrix_stands_beside_every_number():
-    rows = [row("ours", s, epipolar_skipped=0.98) for s in "st"] + [row("plain", s, 0.2) for s in "st"]
-    board = make_board(rows)
+    board = make_board([row("ours", s, epipolar_skipped=0.98) for s in "st"] + [row("plain", s, 0.2) for s in "st"])
     table = leaderboard(board, PROTOCOL)
     column = [c.name for c in table.columns].index("F skipped")
     assert {cells[2].text: cells[column].text for cells in table.rows} == {"OURS": "98 %", "PLAIN": ""}
@@ -297,8 +295,7 @@ def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
     assert frame["failed"].tolist() == [False, True] and frame["ending"][1] == "crashed at 30/120"
     assert str(frame["score_m"].dtype) == "Float64" and frame["ate_rmse_m"][0] == frame["score_m"][0] > 0
     assert frame["epipolar_skipped"][1] is pd.NA
-    paths = build_report(store, tmp_path / "report")
-    assert list(rows_of(paths.csv["runs"])[0]) == list(frame.columns)
+    assert list(rows_of(build_report(store, tmp_path / "report").csv["runs"])[0]) == list(frame.columns)
 
 
 def test_who_follows_people_on_few_frames_is_not_shown_as_the_better_one():
@@ -316,7 +313,6 @@ def test_what_is_no_better_than_not_moving_is_named():
     assert "No better than a static camera, although their runs ended: FROZEN on 1 of 2 sequences." in (
         leaderboard(board, PROTOCOL).caption
     )
-    table = per_sequence(board, PROTOCOL, [])
-    small = {cells[0].text: [cell.small for cell in cells[1:]] for cells in table.rows}
+    small = {cells[0].text: [cell.small for cell in cells[1:]] for cells in per_sequence(board, PROTOCOL, []).rows}
     assert "no better than a static camera" in small["FROZEN"][0]
     assert not any("no better" in text for name in ("GOOD", "CONTROL", "FLAKY") for text in small[name])
