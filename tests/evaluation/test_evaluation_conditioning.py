@@ -81,7 +81,8 @@ def test_the_uncertainty_is_that_of_repetition() -> None:
     """Where errors are small, it is the spread of the rotations that independent errors give."""
     truth = straight(0.1)
     fits = [align(disturbed(truth, 0.005, seed, frames=1.0), truth, "se3") for seed in range(40)]
-    spread = np.sqrt((np.array([np.rad2deg(se3.rotation_angle(_pose(fit.rotation)))[0] for fit in fits]) ** 2).mean())
+    turned = se3.with_rotation(np.tile(np.eye(4), (len(fits), 1, 1)), np.array([fit.rotation for fit in fits]))
+    spread = np.sqrt((np.rad2deg(se3.rotation_angle(turned)) ** 2).mean())
     assert 0.6 * spread < np.median([fit.uncertainty_deg for fit in fits]) < 1.8 * spread
 
 
@@ -90,9 +91,3 @@ def test_an_exact_estimate_and_a_short_one() -> None:
     assert align(straight(0.05, 23), straight(0.05, 23), "se3").uncertainty_deg == pytest.approx(0.0, abs=1e-5)
     assert align(straight(0.05, 2), straight(0.05, 2), "se3").uncertainty_deg is None
     assert align(straight(0.05), straight(0.05), "origin").uncertainty_deg is None
-
-
-def _pose(rotation: np.ndarray) -> np.ndarray:
-    pose = np.eye(4)[None].copy()
-    pose[0, :3, :3] = rotation
-    return pose

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynslam_bench.evaluation import evaluate, hints
+from dynslam_bench.evaluation import hints
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import load_tum, write_tum
@@ -194,11 +194,10 @@ def test_bad_trackers_get_none(kind, seed):
 
 
 def test_no_number_changes():
-    before = evaluate(ESTIMATE, TRUTH).to_json()
-    stamps, poses = ESTIMATE.timestamps.copy(), ESTIMATE.T_world_cam.copy()
-    hints(posed(ESTIMATE, se3.inverse(ESTIMATE.T_world_cam)), TRUTH)
-    assert evaluate(ESTIMATE, TRUTH).to_json() == before
-    assert np.array_equal(stamps, ESTIMATE.timestamps) and np.array_equal(poses, ESTIMATE.T_world_cam)
+    estimate = posed(ESTIMATE, se3.inverse(ESTIMATE.T_world_cam))
+    kept = estimate.timestamps.copy(), estimate.T_world_cam.copy()
+    hints(estimate, TRUTH)
+    assert np.array_equal(kept[0], estimate.timestamps) and np.array_equal(kept[1], estimate.T_world_cam)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs the trajectories in ../shared/data")

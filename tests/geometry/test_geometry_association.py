@@ -44,27 +44,6 @@ def test_equals_the_slow_rule(seed, strict):
     assert (np.diff(first[index_first]) > 0).all()
 
 
-def test_the_limit_is_strict_or_not():
-    assert len(associate([0.0], [0.5], 0.5)[0]) == 0
-    assert len(associate([0.0], [0.5], 0.5, strict=False)[0]) == 1
-
-
-def test_the_closer_pair_wins_and_the_other_goes_without():
-    index_first, index_second = associate([0.0, 0.010], [0.008], 0.02)
-    assert index_first.tolist() == [1]
-    assert index_second.tolist() == [0]
-
-
-def test_permutation_gives_the_same_pairs():
-    rng = np.random.default_rng(0)
-    first, second = np.sort(rng.uniform(0, 3, 90)), np.sort(rng.uniform(0, 3, 90))
-    index_first, index_second = associate(first, second, 0.02)
-    shuffle = rng.permutation(90)
-    other_first, other_second = associate(first[shuffle], second, 0.02)
-    assert np.array_equal(first[shuffle][other_first], first[index_first])
-    assert np.array_equal(other_second, index_second)
-
-
 def test_empty_lists():
     for first, second in ([], []), ([1.0], []), ([], [1.0]):
         index_first, index_second = associate(first, second, 0.02)

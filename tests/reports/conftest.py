@@ -4,6 +4,7 @@ import pytest
 from reports_fake_store import add_run, fill
 
 from dynslam_bench.reports import build_report
+from dynslam_bench.runs.store import RunStore
 
 
 @pytest.fixture(scope="session")
@@ -13,3 +14,9 @@ def made(tmp_path_factory):
     store = fill(root / "results")
     add_run(store, "orb-slam3", "synthetic/walking_xyz", kind="imported", label="ORB-SLAM3", error=0.08, frame_s=None)
     return store, build_report(store, root / "report")
+
+
+@pytest.fixture
+def store(tmp_path):
+    """An empty store."""
+    return RunStore(tmp_path / "results")

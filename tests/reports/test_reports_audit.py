@@ -31,12 +31,28 @@ def keys(findings):
     return {(f.table, f.system, f.sequence.rpartition("_")[0].rpartition("/")[2], f.quantity) for f in findings}
 
 
-def test_every_cell_breaks_the_identity_of_rmse_mean_and_deviation(report):
-    findings = report.failed("rmse-identity")
-    assert len(findings) == len(report.of("rmse-identity")) == 28
-    assert sum(abs(f.printed - f.expected) > 0.002 for f in findings) == 27
-    ours = {f.sequence: f.expected for f in findings if f.system == OURS and f.table == 1}
+@pytest.mark.parametrize(
+    ("check", "numbers", "failed"),
+    [
+        ("rmse-identity", 28, 28),
+        ("rmse-at-least-mean", 28, 10),
+        ("improvement", 96, 6),
+        ("accuracy", 28, 14),
+    ],
+)
+def test_so_many_numbers_fail_each_check(report, check, numbers, failed):
+    assert (len(report.of(check)), len(report.failed(check))) == (numbers, failed)
+
+
+def test_the_expected_numbers_are_those_of_the_identities(report):
+    ours = {f.sequence: f.expected for f in report.of("rmse-identity") if f.system == OURS and f.table == 1}
     assert ours == pytest.approx({"tum/fr3/sitting_xyz": 0.2324, "tum/fr3/walking_xyz": 0.2211}, abs=5e-5)
+    repeated = {f.system: round(f.expected, 4) for f in report.failed("improvement") if "repeats" in f.remark}
+    assert repeated == {
+        "DGS-SLAM": 40.1006, "YOLO-SLAM": 34.5505, "ORB-SLAM2": 29.6030,
+        "OPF-SLAM": 22.6091, "DynaTM-SLAM": 17.1883, "DI-SLAM": 11.8456,
+    }  # fmt: skip
+    assert {f.quantity for f in report.failed("accuracy")} == {"error_percent"}
 
 
 def test_ten_cells_have_an_rmse_below_the_mean(report):
@@ -47,17 +63,6 @@ def test_ten_cells_have_an_rmse_below_the_mean(report):
         (2, "OPF-SLAM", "sitting", "rpe_rmse"), (2, "DynaTM-SLAM", "sitting", "rpe_rmse"),
         (2, "DI-SLAM", "sitting", "rpe_rmse"),
     }  # fmt: skip
-
-
-def test_one_column_of_improvements_repeats_another(report):
-    assert len(report.of("improvement")) == 96
-    failed = report.failed("improvement")
-    assert {(f.table, f.sequence, f.quantity) for f in failed} == {(2, "tum/fr3/walking_xyz", "rpe_rmse")}
-    assert {f.system: round(f.expected, 4) for f in failed} == {
-        "DGS-SLAM": 40.1006, "YOLO-SLAM": 34.5505, "ORB-SLAM2": 29.6030,
-        "OPF-SLAM": 22.6091, "DynaTM-SLAM": 17.1883, "DI-SLAM": 11.8456,
-    }  # fmt: skip
-    assert all("repeats the column of tum/fr3/sitting_xyz" in f.remark for f in failed)
 
 
 def test_systems_that_are_worse_than_not_moving(report):
@@ -73,15 +78,6 @@ def test_systems_that_are_worse_than_not_moving(report):
         ("DGS-SLAM", "sitting"), ("YOLO-SLAM", "sitting"), ("ORB-SLAM2", "sitting"), ("OPF-SLAM", "sitting"),
         ("DGS-SLAM", "walking"), ("YOLO-SLAM", "walking"),
     }  # fmt: skip
-
-
-def test_accuracy_is_a_deviation_in_disguise(report):
-    errors = [f for f in report.of("accuracy") if f.quantity == "error_percent"]
-    assert len(errors) == 14
-    assert not any(f.holds for f in errors)
-    assert max(abs(f.printed - f.expected) for f in errors) == pytest.approx(0.21, abs=0.005)
-    sums = [f for f in report.of("accuracy") if f.quantity == "accuracy_percent"]
-    assert all(f.holds for f in sums)
 
 
 def test_summary_and_details(report):
@@ -125,17 +121,6 @@ def test_never_moving_can_be_recomputed_from_ground_truth():
 # -- the data
 
 
-def test_the_papers_tables_are_complete():
-    values = list(claimed().query("kind == 'value'").itertuples())
-    assert len(values) == 7 * 8 + 7 * 8 + 7 * 6
-    assert len(claimed()) - len(values) == 96
-    by_key = {(c.table, c.system, c.sequence, c.quantity): c.value for c in values}
-    assert by_key[1, OURS, "tum/fr3/sitting_xyz", "ape_rmse"] == 0.2159
-    assert by_key[2, OURS, "tum/fr3/walking_xyz", "rpe_rmse"] == 0.1667
-    assert by_key[2, OURS, "tum/fr3/walking_xyz", "rpe_std"] == 0.1257
-    assert by_key[3, OURS, "tum/fr3/walking_xyz", "time_ms"] == 32.69
-
-
 def test_published_numbers_are_plausible_and_sourced():
     rows = list(published().itertuples())
     assert len(rows) > 400
@@ -153,9 +138,6 @@ def test_published_numbers_are_plausible_and_sourced():
             assert np.hypot(mean, spread) == pytest.approx(rmse, abs=2e-4)
     keys = [(p.system, p.sequence, p.metric, p.source) for p in rows]
     assert len(set(keys)) == len(keys)
-    found = {(p.system, p.sequence): p.value for p in rows if p.source == "DynaSLAM paper" and p.metric == "ate_rmse_m"}
-    assert found["DynaSLAM N+G", "tum/fr3/walking_xyz"] == 0.015
-    assert found["ORB-SLAM2", "tum/fr3/walking_xyz"] == 0.459
 
 
 def test_reported_rows_do_not_mix_alignments():
@@ -211,19 +193,9 @@ def test_records_stand_beside_their_own_protocol_only():
 
 def test_the_page_of_records_is_the_data():
     page = (Path(__file__).resolve().parents[2] / "docs" / "published.md").read_text(encoding="utf-8")
-    lines = []
-    for r in records().itertuples():
-        protocol = f"`{r.protocol}`" if r.protocol else "-"
-        cells = (
-            f"`{r.sequence}`",
-            f"{r.value:g}",
-            r.system,
-            r.input,
-            r.alignment,
-            protocol,
-            r.hardware,
-            r.source,
-            r.how,
-        )
-        lines.append("| " + " | ".join(cells) + " |")
+    lines = [
+        f"| `{r.sequence}` | {r.value:g} | {r.system} | {r.input} | {r.alignment} | "
+        f"{f'`{r.protocol}`' if r.protocol else '-'} | {r.hardware} | {r.source} | {r.how} |"
+        for r in records().itertuples()
+    ]
     assert [line for line in page.splitlines() if line.startswith("| `")] == lines

@@ -82,39 +82,6 @@ def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report
         assert len(figures) >= 4 and max(figures) <= width
 
 
-def test_settings_are_read_without_scrolling(browser, report):
-    for width in WIDTHS:
-        open_page(browser, report, "run", width)
-        right = browser.run("all('#s-settings td').map((cell) => Math.round(cell.getBoundingClientRect().right))")
-        assert len(right) == 4 and max(right) <= width, (width, right)
-
-
-def test_the_button_for_the_theme_covers_no_tab(browser, report):
-    for page in PAGES:
-        for width in WIDTHS:
-            open_page(browser, report, page, width)
-            beside = """[one('nav .tabs'), one('nav .theme')].map((each) => each.getBoundingClientRect())
-              .flatMap(({left, right}) => [left, right])"""
-            tabs_left, tabs_right, left, right = browser.run(beside)
-            assert 0 <= tabs_left < tabs_right <= left < right <= width, (page, width)
-            reach = browser.run("(({scrollWidth, clientWidth}) => [scrollWidth, clientWidth])(one('nav'))")
-            assert reach[0] <= reach[1], "the tabs scroll, not the bar"
-
-
-def test_no_word_of_a_figure_stands_outside_of_it(browser, report):
-    """Names of sequences below a narrow figure neither run out of it nor over its legend."""
-    for width in WIDTHS:
-        open_page(browser, report, "report", width)
-        outside = browser.run("""all('.chart svg').flatMap((drawing) => {
-          const box = drawing.getBoundingClientRect();
-          return [...drawing.querySelectorAll('text')].filter((text) => {
-            const own = text.getBoundingClientRect();
-            return own.left < box.left - 4 || own.right > box.right + 4 || own.bottom > box.bottom + 4;
-          }).map((text) => text.textContent);
-        })""")
-        assert outside == [], (width, outside)
-
-
 def test_the_leaderboard_fits_and_keeps_the_tracker_in_sight(browser, report):
     browser.open(report.html, 1400)
     assert browser.run("(({scrollWidth, clientWidth}) => scrollWidth - clientWidth)(leaderboard.parentElement)") <= 0

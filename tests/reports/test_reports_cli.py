@@ -31,8 +31,7 @@ def strict(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
-    store = RunStore(tmp_path / "results")
+def test_the_sequences_to_rank_on_are_a_switch(store, cli, tmp_path):
     for name in ("s/a", "s/b"):
         add_run(store, "orb-slam2", name)
         add_run(store, "ours", name, error=0.02)

@@ -9,11 +9,9 @@ from dynslam_bench.reports.model.board import make_board, missing_commands
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
 from dynslam_bench.reports.model.row import run_command
-from dynslam_bench.runs.store import RunStore
 
 
-def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_recordings_that_share_a_folders_name_keep_their_columns(store, tmp_path):
     for place, error in (("/data/chess/seq-01", 0.01), ("/data/fire/seq-01", 0.2)):
         for tracker in ("a", "b"):
             add_run(store, tracker, "folder/seq-01", error=error, content=place, block=place[6:11], place=place)
@@ -26,8 +24,7 @@ def test_recordings_that_share_a_folders_name_keep_their_columns(tmp_path):
     assert {cells[1].text for cells in found.table.rows} == {"chess/seq-01", "fire/seq-01", "all 2 sequences"}
 
 
-def test_columns_of_two_cameras_are_named_by_them(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_columns_of_two_cameras_are_named_by_them(store):
     right = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
     add_run(store, "a", "folder/s", camera=right, block="right")
     add_run(store, "b", "folder/s", camera=right | {"fx": 400.0}, block="wrong")
@@ -35,8 +32,7 @@ def test_columns_of_two_cameras_are_named_by_them(tmp_path):
     assert board.sequences == ["folder/s (camera 640x480, f 400 525)", "folder/s (camera 640x480, f 525 525)"]
 
 
-def test_the_same_frames_are_one_column_in_every_spelling(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_the_same_frames_are_one_column_in_every_spelling(store):
     add_run(store, "a", "synthetic/walking_xyz?frames=60", block="b1")
     add_run(store, "b", "synthetic/walking_xyz", frames=(0, 60), block="b1")
     add_run(store, "b", "synthetic/walking_xyz?noise=3", frames=(0, 60), block="b1", noise=3)
@@ -81,8 +77,7 @@ def test_names_lose_what_all_share(names, short):
     assert list(shortened(names)) == names and " ".join(shortened(names).values()) == short
 
 
-def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(store):
     given = "/home/me/mine.py:SPEC"
     for name, value in (("s/a", "True"), ("s/b", True)):
         add_run(store, "mine", name, overrides={"loop": value}, settings={"loop": True}, given=given)

@@ -5,7 +5,7 @@ from reports_fake_store import add_frames, add_run
 from reports_rows import PROTOCOL, crashed, page_data, row
 
 from dynslam_bench.reports import build_report
-from dynslam_bench.reports.figures import log_axis, mask_figure, repeat_figure
+from dynslam_bench.reports.figures import log_axis, mask_figure
 from dynslam_bench.reports.html.explore import exact_shares
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
@@ -62,7 +62,6 @@ def test_a_tracker_that_always_crashes_is_not_called_repeatable():
     rows += [row("half", "s", 0.2), row("half", "s", 0.3, seed=1), row("half", "t", 0.2), crashed("half", "t", seed=1)]
     board = make_board(rows)
     assert {cells[0].text: cells[1].text for cells in repeatability(board).rows} == {"GOOD": "2", "HALF": "1"}
-    assert [trace["name"] for trace in repeat_figure(board)["data"]] == ["GOOD", "HALF"]
 
 
 def test_figures_show_millimetres_and_enough_ticks():

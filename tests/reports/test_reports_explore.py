@@ -3,18 +3,16 @@
 import pandas as pd
 import pytest
 from reports_browser import needs_browser
-from reports_fake_store import add_frames, add_run, fill
+from reports_fake_store import add_run, fill
 from test_reports_browser import browser, open_page, report, run_of
 
 from dynslam_bench.reports import build_report
-from dynslam_bench.runs.store import RunStore
 
 __all__ = ["browser", "report"]  # fixtures
 
 pytestmark = needs_browser
 ROWS = "all('#explore-table tbody tr').map((row) => row.cells[0].textContent)"
 HEADS = "all('#explore-table thead th').map((head) => head.textContent)"
-CELL = "one('#explore-table tbody tr td:last-child a').textContent"
 
 
 def explore(browser, report, anchor=""):
@@ -111,22 +109,6 @@ def test_columns_are_chosen_one_by_one(explored):
         assert (label in explored.run(HEADS)) == shown and explored.run("location.hash") != ""
 
 
-def test_numbers_are_those_of_the_table_below(explored):
-    name = explored.run("one('#explore-table tbody tr').cells[0].textContent")
-    shown = explored.run(
-        "Object.fromEntries([...one('#explore-table tbody tr').cells].slice(3)"
-        ".map((cell, at) => [all('#explore-table thead th')[at + 3].textContent,"
-        " cell.querySelector('a')?.textContent ?? cell.textContent]))"
-    )
-    below = explored.run(f"""(() => {{
-      const table = one("#per_sequence"), heads = [...table.tHead.rows].at(-1).cells;
-      const row = [...table.tBodies[0].rows].find((each) => each.cells[0].textContent.trim() === {name!r});
-      const cells = [...row.cells].slice(1);
-      return Object.fromEntries(cells.map((cell, at) => [heads[at + 1].textContent, cell.firstChild.textContent]));
-    }})()""")
-    assert shown == below and len(shown) == 5
-
-
 def test_a_failure_is_hatched_says_how_and_is_never_best(explored):
     failed = explored.run(
         "all('#explore-table tbody small a').filter((each) => each.textContent === '✕').map((each) => each.title)"
@@ -158,8 +140,7 @@ def test_a_run_shows_its_figures_settings_log_and_command(browser, report):
     )  # the lost frame breaks the line
 
 
-def test_angles_that_only_the_alignment_made_are_called_unreliable(browser, tmp_path, monkeypatch):
-    store = RunStore(tmp_path / "r")
+def test_angles_that_only_the_alignment_made_are_called_unreliable(store, browser, tmp_path, monkeypatch):
     add_run(store, "ours", "s/a")
     add_run(store, "imported", "s/a", kind="imported")
     captions = []
@@ -187,42 +168,6 @@ def test_the_slider_moves_image_track_and_cursor(browser, report):
     compare = "all('#frames .view')[all('#frames .view').length - 1].style.clipPath"
     browser.run("slide(all('#frames input[type=range]').at(-1), 80)")
     assert "80%" in browser.run(compare)
-
-
-def test_error_against_dynamic_pixels_rises_as_it_was_made(explored):
-    figure = explored.run(
-        "$('explore-share').chart.figure.data.filter((trace) => trace.name.startsWith('Ours')).map((trace) => trace.y)"
-    )
-    assert len(figure) == 1
-    known = [value for value in figure[0] if value is not None]
-    assert len(known) == 2 and known[1] > 1.4 * known[0]  # 40 to 60 % and above; the other bins hold too few frames
-
-
-def test_a_figure_hides_what_is_clicked_and_tells_what_is_pointed_at(browser, report):
-    browser.open(report.html)
-    browser.run("draw(document.getElementById('speed'))")
-    count = "all('#speed svg .point').length"
-    before = browser.run(count)
-    browser.run("all('#speed .legend button').at(-1).click()")
-    assert browser.run(count) == before - 1
-    browser.run("""(() => {
-      const mark = one("#speed svg .point").getBoundingClientRect(), chart = one("#speed .chart");
-      const at = {clientX: mark.x + mark.width / 2, clientY: mark.y + mark.height / 2};
-      chart.dispatchEvent(new PointerEvent("pointermove", at));
-    })()""")
-    assert "real time" in browser.run("one('#speed .tip.on').textContent")
-
-
-def test_figures_name_trackers_as_they_are_called_and_only_those_that_they_show(browser, tmp_path):
-    store = RunStore(tmp_path / "results")
-    for name, status in (("a <b>&amp;</b> 'quoted' \N{SNOWMAN}", "ok"), ("orb-slam2", "ok"), ("dead", "crashed")):
-        add_frames(store.folder(add_run(store, name, "s/<i>", label=name, n=40, status=status)), 40)
-    explore(browser, build_report(store, tmp_path / "report", picture_seconds=0))
-    for place in ("boxes", "share"):
-        browser.until(f"one('#explore-{place} .legend button')")
-        shown = browser.run(f"all('#explore-{place} .legend button').map((each) => each.textContent.trim())")
-        assert set(shown) == {"a <b>&amp;</b> 'quoted' \N{SNOWMAN}", "orb-slam2"}
-    assert "<i>" in browser.run("one('#explore-boxes svg').textContent")
 
 
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):

@@ -38,9 +38,8 @@ def rows_of(board: Board, tracker: str) -> dict[str, list[str]]:
     ],
 )
 def test_runs_of_two_programs_are_two_rows_and_the_older_is_not_ranked(
-    before: dict[str, object], after: dict[str, object], name: str, tmp_path: Path
+    store: RunStore, before: dict[str, object], after: dict[str, object], name: str
 ) -> None:
-    store = RunStore(tmp_path / "r")
     for sequence in SEQUENCES:
         add_run(store, "orb-slam2", sequence, error=0.02)
     add_run(store, "mine", SEQUENCES[0], error=0.01, identity=made_by(**before), started="2026-01-01T00:00:00+00:00")
@@ -53,8 +52,7 @@ def test_runs_of_two_programs_are_two_rows_and_the_older_is_not_ranked(
     assert newer <= {"2026-01-02"} and sorted(older) == [False, True]
 
 
-def test_a_program_that_ran_everything_again_supersedes_the_older_one(tmp_path: Path) -> None:
-    store = RunStore(tmp_path / "r")
+def test_a_program_that_ran_everything_again_supersedes_the_older_one(store: RunStore) -> None:
     for day, source in enumerate("12", start=1):
         for sequence in SEQUENCES:
             started = f"2026-01-0{day}T00:00:00+00:00"
@@ -64,8 +62,7 @@ def test_a_program_that_ran_everything_again_supersedes_the_older_one(tmp_path: 
     assert list(rows_of(load_board(store), "mine")) == ["mine"]
 
 
-def test_masks_of_two_networks_on_two_kinds_of_sequences_are_one_row(tmp_path: Path) -> None:
-    store = RunStore(tmp_path / "r")
+def test_masks_of_two_networks_on_two_kinds_of_sequences_are_one_row(store: RunStore) -> None:
     add_run(store, "mine", SEQUENCES[0], identity=made_by(weights={"embedded": "aaaa"}))
     add_run(store, "mine", "bonn/crowd", identity=made_by(weights={"coco": "bbbb"}))
     assert list(rows_of(load_board(store), "mine")) == ["mine"]
@@ -75,17 +72,15 @@ def test_masks_of_two_networks_on_two_kinds_of_sequences_are_one_row(tmp_path: P
     ("made", "label"), [({"identity": {}}, "orb-slam2 · identity unverified"), ({"kind": "imported"}, "orb-slam2")]
 )
 def test_a_run_of_an_older_identity_scheme_and_an_import_are_never_the_reference(
-    made: dict[str, object], label: str, tmp_path: Path
+    store: RunStore, made: dict[str, object], label: str
 ) -> None:
-    store = RunStore(tmp_path / "r")
     add_run(store, "orb-slam2", SEQUENCES[0], **made)
     add_run(store, "mine", SEQUENCES[0])
     board = load_board(store)
     assert list(rows_of(board, "orb-slam2")) == [label] and board.reference is None
 
 
-def test_a_verified_program_stays_ranked_beside_newer_runs_that_are_not_verified(tmp_path: Path) -> None:
-    store = RunStore(tmp_path / "r")
+def test_a_verified_program_stays_ranked_beside_newer_runs_that_are_not_verified(store: RunStore) -> None:
     add_run(store, "mine", SEQUENCES[0], identity=made_by(source="1"), started="2026-01-01T00:00:00+00:00")
     add_run(store, "mine", SEQUENCES[1], identity={}, started="2026-01-02T00:00:00+00:00")
     rows = load_runs([store], PROTOCOL).rows

@@ -82,8 +82,7 @@ def test_no_name_is_more_than_a_name():
     assert "## a # b" in markdown and "\nc # d &lt;i>" in markdown
 
 
-def test_a_spreadsheet_takes_no_name_for_a_formula(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_a_spreadsheet_takes_no_name_for_a_formula(store, tmp_path):
     for label in ("=cmd|' /C calc'!A0", "+1", "@sum", "-2+3", "\x1b[2J\u202e"):
         add_run(store, f"t{label}", "s/a", label=label, n=40)
     paths = build_report(store, tmp_path / "report", title="one\n# two\n<script>")

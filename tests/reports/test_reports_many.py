@@ -9,14 +9,13 @@ from dynslam_bench.core import reading
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, figures
-from dynslam_bench.reports.build_report import thinned_note
+from dynslam_bench.reports.build_report import masks_section
 from dynslam_bench.reports.html import explore
 from dynslam_bench.reports.html.explore import FEWER_PAGES, MOST_PAGES, pages_for
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_csv, to_markdown
-from dynslam_bench.runs import RunStore
 
 PROTOCOL = get_protocol("tum-rgbd/v1")
 
@@ -30,8 +29,7 @@ def opened(monkeypatch):
     return found
 
 
-def test_fifty_known_runs_cost_no_file_each(tmp_path, opened):
-    store = RunStore(tmp_path / "results")
+def test_fifty_known_runs_cost_no_file_each(store, tmp_path, opened):
     for number in range(50):
         add_run(store, f"tracker-{number % 5}", f"s/{number % 2}", number // 10, n=20)
     load_runs([store], PROTOCOL)
@@ -67,17 +65,13 @@ def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
     assert "All of it. These are the first 3 of 5 rows; all stand in csv/long.csv." in to_markdown(long)
 
 
-def test_figures_thin_many_points_and_say_so(tmp_path, monkeypatch):
+def test_the_figure_of_masks_thins_many_points_and_keeps_the_best(tmp_path, monkeypatch):
     board = make_board(load_runs([fill(tmp_path / "results", sequences=["s/a", "s/b"], seeds=range(4))], PROTOCOL).rows)
-    whole = figures.repeat_figure(board)
-    assert thinned_note(board) == ""
+    whole = figures.mask_figure(board)
     monkeypatch.setattr(figures, "MOST_POINTS", 3)
-    thin = figures.repeat_figure(board)
-    assert "more than 3 runs" in thinned_note(board)
-    best = [[min(trace["x"]) for trace in figure["data"]] for figure in (whole, thin)]
-    assert best[0] == best[1] and {len(trace["x"]) for trace in thin["data"]} <= {2, 3}
-    assert {len(trace["text"]) for trace in thin["data"]} <= {2, 3}
-    assert {len(trace["x"]) for trace in figures.mask_figure(board)["data"]} <= {2, 3}
+    thin = figures.mask_figure(board)
+    assert {len(trace["x"]) for trace in thin["data"]} <= {2, 3} and "more than 3 runs" in str(masks_section(board))
+    assert [min(trace["y"]) for trace in thin["data"]] == [min(trace["y"]) for trace in whole["data"]]
 
 
 def test_csv_of_every_kind_of_column():

@@ -20,9 +20,8 @@ from dynslam_bench.runs.store import RunStore
 # -- what ranks
 
 
-def test_losing_frames_is_not_free(tmp_path):
+def test_losing_frames_is_not_free(store, tmp_path):
     """The loser is better where it tracks, and far off once its lost frames count as not having moved."""
-    store = RunStore(tmp_path / "r")
     for name in ("s/a", "s/b"):
         add_run(store, "steady", name, error=0.02)
         add_run(store, "loser", name, error=0.005, lost=range(40, 95))
@@ -127,8 +126,7 @@ def test_commands_carry_settings_and_repeats():
 # -- what stands where
 
 
-def test_parts_get_no_published_rows(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_parts_get_no_published_rows(store, tmp_path):
     add_run(store, "orb-slam2", "tum/fr3/walking_xyz", frames=(0, 200), block="part", duration_s=6.7)
     add_run(store, "orb-slam2", "bonn/crowd", block="excerpt", duration_s=6.7)
     add_run(store, "orb-slam2", "tum/fr3/walking_rpy", block="whole", duration_s=30.6)
@@ -158,8 +156,7 @@ def test_a_final_trajectory_stands_in_no_online_table(tmp_path):
     assert note in paths.markdown.read_text() and len(rows_of(alone.csv["final_trajectory"])) == 1
 
 
-def test_imports_of_several_files_are_repeats_and_not_dropped(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_imports_of_several_files_are_repeats_and_not_dropped(store):
     for day in (1, 2, 3):
         add_run(store, "orb-slam3", "s/a", kind="imported", started=f"2026-01-0{day}T00:00:00+00:00")
     loaded = load_runs([store], PROTOCOL)
@@ -190,8 +187,7 @@ def test_offsets_and_noise_are_repeats_of_one_cell():
     assert not cell.deterministic
 
 
-def test_a_deterministic_trackers_offsets_keep_apart_in_the_store(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_a_deterministic_trackers_offsets_keep_apart_in_the_store(store):
     for offset, seed in ((0, 0), (0, 1), (2, 0), (2, 1)):
         add_run(store, "a", "s/a", seed, offset=offset, block="b", copy_of=offset)
     loaded = load_runs([store], PROTOCOL)
@@ -202,8 +198,7 @@ def test_a_deterministic_trackers_offsets_keep_apart_in_the_store(tmp_path):
 # -- what stands beside the numbers
 
 
-def test_times_from_the_cache_are_marked(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_times_from_the_cache_are_marked(store):
     add_run(store, "cached", "s/a", cached=True, frame_s=0.01)
     add_run(store, "both", "s/a", cached=True, frame_s=0.01)
     add_run(store, "both", "s/b", frame_s=0.05)
@@ -228,8 +223,7 @@ def test_the_share_without_fundamental_matrix_stands_beside_every_number():
     assert "F skipped" not in [c.name for c in leaderboard(make_board([row()]), PROTOCOL).columns]
 
 
-def test_the_page_of_a_run_stacks_stages_alone_and_claims_no_share_of_people_where_there_are_no_masks(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_the_page_of_a_run_stacks_stages_alone_and_claims_no_share_of_people_where_there_are_no_masks(store, tmp_path):
     shown = {}
     for name, known in {"exact": {}, "own": {"exact": False}, "none": {"exact": False, "masks": False}}.items():
         run_id = add_run(store, name, f"s/{name}", n=40)
@@ -285,8 +279,7 @@ def test_bold_is_not_given_to_most():
 # -- frames
 
 
-def test_the_frame_holds_all_runs_with_types_and_units(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_the_frame_holds_all_runs_with_types_and_units(store, tmp_path):
     add_run(store, "a", "s/a", offset=2, block="b", skipped=0.5, overrides={"x.y": 3})
     add_run(store, "b", "s/a", status="crashed", reason="boom", block="b", noise=4)
     frame = load_frame(store)
