@@ -151,12 +151,9 @@ def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int 
 def _write(
     sections: Sequence[Section], board: Board, protocol: Protocol, output: Path, title: str, trials: int
 ) -> ReportPaths:
-    counts = [
-        (len(board.labels), "tracker"),
-        (len(board.sequences) + len(board.unscored), "sequence"),
-        (len(board.rows), "run"),
-    ]
-    facts = [(str(count), name + "s" * (count != 1)) for count, name in counts]
+    n_sequences = len(board.sequences) + len(board.unscored)
+    counts = {"tracker": len(board.labels), "sequence": n_sequences, "run": len(board.rows)}
+    facts = [(str(count), name + "s" * (count != 1)) for name, count in counts.items()]
     facts.append((str(sum(row.failed for row in board.rows)), "failed"))
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. This page works without a network."
@@ -182,16 +179,14 @@ def _write(
     write_atomic(paths.markdown, f"{head}{notes}{texts}\n{footer}\n")
     latex = [to_latex(table, protocol.id) for name, table in shown.items() if name not in _NOT_IN_LATEX]
     write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
-    data = ReportData(
+    ReportData(
         title=title,
         protocol=protocol.describe(),
         reference=board.reference_name,
         version=dynslam_bench.__version__,
         rows=board.rows,
-    )
-    data.write(paths.data)
-    charts = {block.figure: block.chart for block in blocks if block.figure}
-    page = render(sections, charts, title=title, protocol=protocol.describe(), facts=facts, footer=footer)
+    ).write(paths.data)
+    page = render(sections, title=title, protocol=protocol.describe(), facts=facts, footer=footer)
     write_atomic(paths.html, page)
     return paths
 
@@ -264,8 +259,8 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
     if not board.sequences:
         return section
     excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
-    recorded = [row for row in board.rows if not row.sequence.id.startswith("synthetic/")]
-    parts = sorted(excerpts | {board.sequence(row) for row in recorded if part_words(row)})
+    shortened = {board.sequence(r) for r in board.rows if part_words(r) and not r.sequence.id.startswith("synthetic/")}
+    parts = sorted(excerpts | shortened)
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     whole = [name for name in board.sequences if name not in parts]
@@ -279,8 +274,7 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
             f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
             "are of the whole recordings is not checked."
         )
-    table_of_errors = tables.per_sequence(board, protocol, published)
-    section.blocks.append(Block("table", "Absolute trajectory error", table_of_errors))
+    section.blocks.append(Block("table", "Absolute trajectory error", tables.per_sequence(board, protocol, published)))
     lost = any(row.coverage < 1 and not row.failed for row in board.rows)
     section.blocks += table_blocks(
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,

@@ -48,14 +48,13 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
     write_atomic(tuner.folder / PLOTS_FILE, _plots(tuner))
-    result, figures = [Block("table", table=candidates)], {}
+    result = [Block("table", table=candidates)]
     if figure := _ratio_figure(summary):
-        figures["ratios"] = figure
         caption = (
             "Ratio to the default settings and its 95 % interval: on the instances of the choice (confirm), which no "
             "trial had seen, and, for the choice alone, on the held-out instances and on recordings."
         )
-        result.append(Block("figure", figure="ratios", caption=caption))
+        result.append(Block("figure", figure="ratios", chart=figure, caption=caption))
     plots = Markup('<a href="{}">Optuna\'s plots</a>: history, slices, importances, intermediate values, Pareto front')
     conclusion = [summary.conclusion, *filter(None, [seen_note(summary.seen)])]
     sections = [
@@ -72,7 +71,6 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     ]  # fmt: skip
     html = render(
         sections,
-        figures,
         title=f"Study {spec.name}: {spec.tracker}",
         protocol=summary.protocol,
         facts=[

@@ -145,8 +145,7 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
         return 0.0, 1.0
     lags = np.arange(-most, most + 1)
     lag = int(lags[np.argmin(_unexplained(own[at], expected[at + lags[:, None]]))])
-    coarse = lag * step
-    fine = coarse + np.linspace(-1, 1, 9) * step
+    fine = lag * step + np.linspace(-1, 1, 9) * step
     begin, moved = grid[at], own[at]
     near = _unexplained(moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window))
     now, near = float(near[-1]), near[:-1]

@@ -243,9 +243,10 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
         flags = (row.run_id in kept) + 2 * (page is not None and page.pictured) + 4 * (page is None)
         cell = place[row.variant_key], column[board.sequence(row)]
         runs.append([row.run_id, *cell, row.repeat, row.ending, flags, values, page.quantiles_mm if page else []])
-    tags: dict[str, set[str]] = {}
-    for row in board.rows:
-        tags.setdefault(board.sequence(row), set()).update(row.sequence.tags)
+    tags = {
+        name: sorted({tag for row in rows for tag in row.sequence.tags})
+        for name, rows in grouped(board.rows, board.sequence).items()
+    }
     by_tracker = grouped(pages, lambda page: page.variant_key)
     by_share = {place[key]: error_by_share(by_tracker.get(key, [])) for key in keys}
     return {
@@ -257,8 +258,7 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
         "metrics": metrics,
         "trackers": [_tracker(board, key, at) for at, key in enumerate(keys)],
         "sequences": [
-            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": sorted(tags[n])}
-            for n in names
+            {"name": n, "short": board.short.get(n, n), "group": board.groups[n], "tags": tags[n]} for n in names
         ],
         "static": [significant(board.static_camera.get(name), 5) for name in names],
         "cells": [
@@ -276,8 +276,7 @@ def _explore_content(board: Board, protocol: Protocol, pages: Sequence[RunPage],
 def _cell(cell: Cell, metrics: Sequence[Mapping[str, str]], rank_seen: bool) -> list[Any]:
     """How many runs of a cell there are and failed, what speaks against it, and the median of every number."""
     doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.in_training and not rank_seen)
-    values = [[_value(row, metric) for row in cell.kept] for metric in metrics]
-    medians = [middle(value for value in of_runs if value is None or np.isfinite(value)) for of_runs in values]
+    medians = [middle(_value(row, metric) for row in cell.kept) for metric in metrics]
     return [len(cell.rows), cell.failed, doubt, [significant(value, 5) for value in medians]]
 
 
@@ -678,9 +677,8 @@ class Pictures:
         if not path.is_file():
             if time.time() >= self.deadline:
                 raise DynslamError("not drawn in the time for pictures", "make the report again: it goes on there")
-            image = self._sequence(record)[index].rgb
-            size = _shrunk_size(image, _WIDTH)
-            shrunk = cv2.resize(np.ascontiguousarray(image[:, :, ::-1]), size, interpolation=cv2.INTER_AREA)
+            bgr = np.ascontiguousarray(self._sequence(record)[index].rgb[:, :, ::-1])
+            shrunk = cv2.resize(bgr, _shrunk_size(bgr, _WIDTH), interpolation=cv2.INTER_AREA)
             write_atomic(path, _encoded(".webp", np.asarray(shrunk), cv2.IMWRITE_WEBP_QUALITY, _QUALITY))
         return path.relative_to(self.output).as_posix()
 

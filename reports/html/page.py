@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -87,7 +87,6 @@ def figure_blocks(name: str, chart: Figure | None, caption: str = "") -> list[Bl
 
 def render(
     sections: Sequence[Section],
-    figures: Mapping[str, Figure],
     *,
     title: str,
     protocol: str,
@@ -98,16 +97,17 @@ def render(
 
     Args:
         sections: What to show, in order.
-        figures: Specifications of figures by the ids that the sections name.
         title: Heading.
         protocol: One line below it.
         facts: Numbers and what they count.
         footer: Last line.
     """
-    explores = any(block.kind == "explore" for section in sections for block in section.blocks)
+    blocks = [block for section in sections for block in section.blocks]
+    explores = any(block.kind == "explore" for block in blocks)
+    figures = {block.figure: block.chart for block in blocks if block.figure}
     return _render(
         "report.html.j2", _EXPLORE if explores else (), title=title, protocol=protocol, facts=facts, sections=sections,
-        footer=footer, figures=Markup(to_script(dict(figures))), explores=explores,
+        footer=footer, figures=Markup(to_script(figures)), explores=explores,
     )  # fmt: skip
 
 

@@ -252,8 +252,7 @@ class ReportData(Record):
             DynslamError: The folder cannot be written.
         """
         head = self.model_copy(update={"rows": []}).to_line().removesuffix("]}")
-        last = len(self.rows) - 1
-        rows = (row.to_line() + "," * (at < last) for at, row in enumerate(self.rows))
+        rows = (row.to_line() + "," * (row is not self.rows[-1]) for row in self.rows)
         write_lines(path, chain([head], rows, ["]}"]))
 
 
@@ -299,9 +298,7 @@ def _outcome(
     n_tracked, frames_due = evaluation.n_tracked, record.n_frames - record.n_dropped
     if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:
         return {}
-    outcome: dict[str, Any] = {}
-    if evaluation.coverage is not None:
-        outcome = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
+    outcome: dict[str, Any] = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
     if n_tracked and not record.failed and n_tracked < LOST_COVERAGE * frames_due:
         outcome["status"] = "lost"
         outcome["reason"] = f"the final trajectory has poses of {n_tracked} of {frames_due} frames"

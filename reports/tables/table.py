@@ -148,8 +148,7 @@ def to_markdown(table: Table) -> str:
         "| " + " | ".join(_escape_markdown(name) for name in names) + " |",
         "| " + " | ".join("---:" if column.numeric else "---" for column in table.columns) + " |",
     ]
-    for row in table.rows:
-        lines.append("| " + " | ".join(_markdown_cell(cell) for cell in row) + " |")
+    lines += ["| " + " | ".join(map(_markdown_cell, row)) + " |" for row in table.rows]
     return "\n".join([*lines, "", prose(table.caption), ""])
 
 
@@ -163,10 +162,8 @@ def csv_text(frame: pd.DataFrame) -> str:
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """
-    written = frame.rename(columns=_no_formula)
-    for name in written.columns:
-        if written[name].dtype in ("object", "string"):
-            written[name] = written[name].astype(object).map(_no_formula)
+    words = frame.select_dtypes(["object", "string"]).astype(object).map(_no_formula)
+    written = frame.assign(**words).rename(columns=_no_formula)
     return written.to_csv(index=False, lineterminator="\n")
 
 
@@ -188,16 +185,13 @@ def _escape_markdown(text: str) -> str:
 
 
 def _markdown_cell(cell: TableCell) -> str:
-    text = _escape_markdown(cell.text)
-    if text and cell.emphasis in ("best", "second"):
-        mark = "**" if cell.emphasis == "best" else "*"
-        text = f"{mark}{text}{mark}"
-    parts = [text, _escape_markdown(cell.small), f"({cell.tag})" if cell.tag else ""]
-    return " ".join(part for part in parts if part)
+    mark = {"best": "**", "second": "*"}.get(cell.emphasis, "") if cell.text else ""
+    parts = [mark + _escape_markdown(cell.text) + mark, _escape_markdown(cell.small), f"({cell.tag})" * bool(cell.tag)]
+    return " ".join(filter(None, parts))
 
 
 def _words(cell: TableCell) -> str:
-    return " ".join(part for part in (cell.text, cell.small, cell.tag) if part)
+    return " ".join(filter(None, (cell.text, cell.small, cell.tag)))
 
 
 def _no_formula(value: object) -> object:
@@ -393,7 +387,7 @@ def _cell(cell: TableCell) -> str:
     text = escape_latex(cell.text.replace(OUR_BACK_END, ""))
     if text and cell.emphasis in ("best", "second"):
         text = f"\\text{'bf' if cell.emphasis == 'best' else 'it'}{{{text}}}"
-    text += _STAR if OUR_BACK_END in cell.text else ""
+    text += _STAR * (OUR_BACK_END in cell.text)
     return f"{text}~{{\\scriptsize {escape_latex(cell.small)}}}" if cell.small.startswith("[") else text
 
 
