@@ -2,7 +2,7 @@
 
 from dynslam_bench.evaluation.ape import static_camera
 from dynslam_bench.evaluation.compare_protocols import ComparisonRow, compare_protocols
-from dynslam_bench.evaluation.comparison import coverage, hold
+from dynslam_bench.evaluation.comparison import hold
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_files, pose_errors
 from dynslam_bench.evaluation.hints import Hint, hints
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
@@ -21,7 +21,6 @@ __all__ = [
     "RPESpec",
     "compare_masks",
     "compare_protocols",
-    "coverage",
     "evaluate",
     "evaluate_files",
     "get_protocol",

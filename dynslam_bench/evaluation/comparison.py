@@ -343,17 +343,6 @@ def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray
     return tracked
 
 
-def coverage(estimate: Trajectory, input_timestamps: ArrayLike) -> float:
-    """Tracked frames over associated input frames; 0 for no input frames.
-
-    Args:
-        estimate: Poses of the frames whose state was ``ok``.
-        input_timestamps: Stamps in seconds of all frames of the sequence (after colour-depth association).
-    """
-    tracked = tracked_frames(estimate, input_timestamps)
-    return float(tracked.mean()) if len(tracked) else 0.0
-
-
 def hold(estimate: Trajectory, input_timestamps: ArrayLike) -> Trajectory:
     """The trajectory with a pose for every input frame: lost frames stay at the last tracked pose.
 

@@ -50,30 +50,20 @@ class MaskCounts:
         return _ratio(self.true_positive, self.true_positive + self.false_negative)
 
 
-def compare_masks(
-    predicted: NDArray[np.bool_], truth: NDArray[np.bool_], valid: NDArray[np.bool_] | None = None
-) -> MaskCounts:
+def compare_masks(predicted: NDArray[np.bool_], truth: NDArray[np.bool_]) -> MaskCounts:
     """Count the pixels on which two masks ``[H, W]`` agree and differ; counts of frames can be added.
 
     Args:
         predicted: True where a pixel is held for dynamic.
         truth: True where it is.
-        valid: Pixels that count; None for all.
 
     Raises:
         EvaluationError: The masks differ in shape.
     """
-    shapes = [np.shape(predicted), np.shape(truth)] + ([np.shape(valid)] if valid is not None else [])
-    if len(set(shapes)) != 1:
-        raise EvaluationError(f"masks differ in shape: {' and '.join(map(str, shapes))}")
     p, t = np.asarray(predicted, dtype=bool), np.asarray(truth, dtype=bool)
-    counted = np.ones(p.shape, dtype=bool) if valid is None else np.asarray(valid, dtype=bool)
-    return MaskCounts(
-        int((p & t & counted).sum()),
-        int((p & ~t & counted).sum()),
-        int((~p & t & counted).sum()),
-        int((~p & ~t & counted).sum()),
-    )
+    if p.shape != t.shape:
+        raise EvaluationError(f"masks differ in shape: {p.shape} and {t.shape}")
+    return MaskCounts(int((p & t).sum()), int((p & ~t).sum()), int((~p & t).sum()), int((~p & ~t).sum()))
 
 
 def _ratio(part: int, whole: int) -> float | None:

@@ -74,10 +74,6 @@ class Trajectory:
         exact = None if self.exact_ns is None else self.exact_ns[index]
         return Trajectory(self.timestamps[index], self.T_world_cam[index], exact)
 
-    def with_poses(self, T_world_cam: NDArray[np.float64]) -> Trajectory:
-        """Other poses ``[N, 4, 4]`` at the same stamps."""
-        return Trajectory(self.timestamps, T_world_cam, self.exact_ns)
-
     def with_exact(self, exact: Mapping[float, int]) -> Trajectory:
         """The same trajectory with the nanoseconds of those stamps that a table of seconds to nanoseconds holds."""
         stamps = self.timestamps.tolist()
@@ -85,7 +81,3 @@ class Trajectory:
             return self
         ns = [exact[stamp] if stamp in exact else ns_of(stamp) for stamp in stamps]
         return Trajectory(self.timestamps, self.T_world_cam, np.array(ns, dtype=np.int64))
-
-    def transformed(self, T_new_world: NDArray[np.float64]) -> Trajectory:
-        """The same trajectory in another world frame: ``T_new_world @ T_world_cam``."""
-        return self.with_poses(T_new_world @ self.T_world_cam)

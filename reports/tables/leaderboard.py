@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import zip_longest
 from statistics import median
 
@@ -56,14 +57,9 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     standings = {standing.key: standing for standing in board.standings}
     epipolar = any(row.epipolar_skipped is not None for row in board.rows)
     columns = [
-        Column(
-            name,
-            numeric=name not in _WORDS,
-            meaning=meaning.replace("{reference}", board.reference_name),
-            latex=name not in _NOT_IN_LATEX,
-        )
-        for name, meaning in _MEANINGS.items()
-        if epipolar or name != "F skipped"
+        replace(column, meaning=column.meaning.replace("{reference}", board.reference_name))
+        for column in COLUMNS
+        if epipolar or column.name != "F skipped"
     ]
     rows = []
     for key in board.trackers:
@@ -76,26 +72,38 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators(), brief)
 
 
-_MEANINGS = {
-    "#": "ranks that the data leave open; several: not separable from the others with that rank",
-    "success": "runs that ended and could be evaluated, of all",
-    "tracker": "",
-    "ATE ratio": "geometric mean over sequences of the median ATE over that of {reference}",
-    "mean rank": "mean over sequences of the rank there",
-    "wins": "sequences with a smaller median ATE than the reference; behind it the probability that a run has a "
-    "smaller error than one of the reference",
-    "p": "paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it could never be "
-    "below 0.05",
-    "coverage": "tracked frames over associated input frames",
-    "× real time": "frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
-    "segmentation included, decoding excluded",
-    "MB": "peak resident memory",
-    "F skipped": "share of the tracked frames on which the epipolar test had no say, since F was not used",
-    "rows": "",
-    "provenance": "",
-}
-_WORDS = ("tracker", "rows", "provenance")
-_NOT_IN_LATEX = ("mean rank", "MB", "F skipped", "rows", "provenance")
+COLUMNS = (
+    Column("#", meaning="ranks that the data leave open; several: not separable from the others with that rank"),
+    Column("success", meaning="runs that ended and could be evaluated, of all"),
+    Column("tracker", numeric=False),
+    Column("ATE ratio", meaning="geometric mean over sequences of the median ATE over that of {reference}"),
+    Column("mean rank", meaning="mean over sequences of the rank there", latex=False),
+    Column(
+        "wins",
+        meaning="sequences with a smaller median ATE than the reference; behind it the probability that a run has a "
+        "smaller error than one of the reference",
+    ),
+    Column(
+        "p",
+        meaning="paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it could never "
+        "be below 0.05",
+    ),
+    Column("coverage", meaning="tracked frames over associated input frames"),
+    Column(
+        "× real time",
+        meaning="frame interval over mean frame time, above 1 it keeps up; behind it the median frame time, "
+        "segmentation included, decoding excluded",
+    ),
+    Column("MB", meaning="peak resident memory", latex=False),
+    Column(
+        "F skipped",
+        meaning="share of the tracked frames on which the epipolar test had no say, since F was not used",
+        latex=False,
+    ),
+    Column("rows", numeric=False, latex=False),
+    Column("provenance", numeric=False, latex=False),
+)
+"""The leaderboard's columns; `_leaderboard_cells` fills them."""
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:

@@ -20,4 +20,9 @@ def noisy(truth, seed=1, size=0.01):
 
 
 def turned(trajectory, seed):
-    return trajectory.transformed(se3.exp(np.random.default_rng(seed).normal(0, 2, 6)))
+    return moved(trajectory, se3.exp(np.random.default_rng(seed).normal(0, 2, 6)))
+
+
+def moved(trajectory, T_new_world):
+    """The trajectory in another world frame."""
+    return Trajectory(trajectory.timestamps, T_new_world @ trajectory.T_world_cam)

@@ -119,17 +119,3 @@ def test_relative_errors(estimate, truth, alignment, mode, delta, unit):
         for name, value in rpe.get_all_statistics().items():
             key = f"rpe_{spec.key}_{part}_{name}_{ending}{'2' if name == 'sse' else ''}"
             assert ours.metrics[key] == pytest.approx(value, abs=1e-9, rel=1e-9), key
-
-
-def test_the_registered_evo_protocol_is_evos_default():
-    truth = smooth(3)
-    estimate = perturbed(truth, 3)
-    ours = evaluate(estimate, truth, "evo-default")
-    pair = sync.associate_trajectories(to_evo(truth), to_evo(estimate))
-    ape, rpe = metrics.APE(), metrics.RPE()
-    ape.process_data(pair)
-    rpe.process_data(pair)
-    assert ours.metrics["ate_rmse_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), abs=1e-9)
-    assert ours.metrics["rpe_1f_trans_rmse_m"] == pytest.approx(
-        rpe.get_statistic(metrics.StatisticsType.rmse), abs=1e-9
-    )

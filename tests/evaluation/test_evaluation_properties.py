@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-from evaluation_walks import noisy, turned, walk
+from evaluation_walks import moved, noisy, turned, walk
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation import (
     PROTOCOLS,
-    Evaluation,
     Protocol,
     compare_masks,
-    coverage,
     evaluate,
     evaluate_files,
     get_protocol,
@@ -57,8 +55,8 @@ def test_the_world_frame_of_the_estimate_does_not_matter(name):
 def test_yaw_alignment_undoes_a_turn_about_z_and_nothing_else():
     about_z = se3.exp(np.array([1.0, -2.0, 0.5, 0, 0, 0])) @ se3.exp(np.array([0, 0, 0, 0, 0, 1.2]))
     protocol = Protocol(id="x", alignment="yaw")
-    assert evaluate(TRUTH.transformed(about_z), TRUTH, protocol).metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
-    tilted = TRUTH.transformed(se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))
+    assert evaluate(moved(TRUTH, about_z), TRUTH, protocol).metrics["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    tilted = moved(TRUTH, se3.exp(np.array([0, 0, 0, 0.3, 0, 0])))
     assert evaluate(tilted, TRUTH, protocol).metrics["ate_rmse_m"] > 0.01
 
 
@@ -133,7 +131,6 @@ def test_the_tolerance_of_the_nearest_match_is_strict_or_not(strict):
 def test_coverage_counts_input_frames():
     truth = walk(n=100)
     tracked = noisy(truth).select(np.r_[0:40, 60:100])
-    assert coverage(tracked, truth.timestamps) == pytest.approx(0.8)
     result = evaluate(tracked, truth, input_timestamps=truth.timestamps)
     assert (result.n_input, result.n_tracked, result.coverage) == (100, 80, pytest.approx(0.8))
     assert "80.0 % of 100 frames tracked" in result.summary()
@@ -192,7 +189,7 @@ def test_foreign_stamps_are_refused_with_their_count():
 def test_stamps_of_the_depth_images_count_for_their_frames():
     truth = walk(n=30)
     tracked = Trajectory(truth.timestamps + 0.011, truth.T_world_cam).select(np.r_[0:10, 20:30])
-    assert coverage(tracked, truth.timestamps) == pytest.approx(20 / 30)
+    assert evaluate(tracked, truth, input_timestamps=truth.timestamps).coverage == pytest.approx(20 / 30)
 
 
 # -- refusals
@@ -236,12 +233,6 @@ def test_a_short_trajectory_leaves_out_what_is_not_defined():
 
 
 # -- files
-
-
-def test_the_record_survives_the_disk(tmp_path):
-    result = evaluate(noisy(walk()), walk(), input_timestamps=walk().timestamps)
-    (tmp_path / "m.json").write_text(result.to_json())
-    assert Evaluation.read(tmp_path / "m.json") == result
 
 
 def test_files_and_their_notes(tmp_path):
@@ -301,7 +292,6 @@ def test_mask_counts():
     total = counts + compare_masks(truth, truth)
     assert total.true_positive == 15
     assert total.iou == pytest.approx(15 / 25)
-    assert compare_masks(predicted, truth, valid=truth).false_positive == 0
 
 
 def test_masks_without_anything_are_not_scored_and_shapes_must_agree():

@@ -82,16 +82,6 @@ def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report
         assert len(figures) >= 4 and max(figures) <= width
 
 
-def test_the_leaderboard_fits_and_keeps_the_tracker_in_sight(browser, report):
-    browser.open(report.html, 1400)
-    assert browser.run("(({scrollWidth, clientWidth}) => scrollWidth - clientWidth)(leaderboard.parentElement)") <= 0
-    browser.open(report.html, 360)
-    browser.run("leaderboard.parentElement.scrollLeft = 9999")
-    browser.settle()
-    box = browser.run("(({left, right}) => [left, right])(one('#leaderboard tbody .sticky').getBoundingClientRect())")
-    assert 0 <= box[0] < box[1] <= 200
-
-
 CONTRAST = (Path(__file__).parent / "contrast.js").read_text().partition("\n")[2]
 
 

@@ -1,7 +1,6 @@
 """Rows that a report keeps for the next one: the same as if every run was read, whatever has changed since."""
 
 import json
-import os
 import shutil
 import sqlite3
 
@@ -116,16 +115,6 @@ def test_what_changed_shows_at_once(store, reads, change):
     assert after == rows_of(store) and (after == before) == (change is forgotten)
 
 
-def test_a_damaged_index_is_made_again(store, reads):
-    before = rows_of(store)
-    whole = index_of(store).read_bytes()
-    for damage in (b"", b"{", whole[:5000], whole[:2000] + b"\xff" * 4000 + whole[6000:]):
-        index_of(store).write_bytes(damage)
-        assert rows_of(store) == before == rows_of(store)
-    reads.clear()
-    assert rows_of(store) == before and reads == []
-
-
 @pytest.mark.parametrize("change", ["value = '{'", "value = x'ff'", "run_id = '0000000000000000'", "state = 'x'"])
 def test_rows_that_somebody_made_count_as_missing(store, reads, change):
     before = rows_of(store)
@@ -136,14 +125,6 @@ def test_rows_that_somebody_made_count_as_missing(store, reads, change):
         other = f"(SELECT max(value) FROM computed WHERE {report})"
         index.execute(f"UPDATE computed SET value = {other} WHERE {report} AND run_id = ?", (second,))
     assert rows_of(store) == before and first in reads
-
-
-@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: path.symlink_to("nowhere")])
-def test_a_store_whose_index_cannot_be_written_is_reported(store, make):
-    before = rows_of(store)
-    index_of(store).unlink()
-    make(index_of(store))
-    assert rows_of(store) == before
 
 
 def test_each_protocol_has_rows_of_its_own(store, reads):
