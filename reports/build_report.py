@@ -177,8 +177,11 @@ def _write(
     texts = "\n".join(map(to_markdown, shown.values()))
     head = f"# {prose(title)}\n\n{protocol.describe()}\n\n{counted}\n\n"
     write_atomic(paths.markdown, f"{head}{notes}{texts}\n{footer}\n")
-    latex = [to_latex(table, protocol.id) for name, table in shown.items() if name not in _NOT_IN_LATEX]
-    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex))
+    write_atomic(
+        paths.latex,
+        "% needs \\usepackage{booktabs}\n"
+        + "\n".join([to_latex(table, protocol.id) for name, table in shown.items() if name not in _NOT_IN_LATEX]),
+    )
     ReportData(
         title=title,
         protocol=protocol.describe(),
@@ -186,8 +189,7 @@ def _write(
         version=dynslam_bench.__version__,
         rows=board.rows,
     ).write(paths.data)
-    page = render(sections, title=title, protocol=protocol.describe(), facts=facts, footer=footer)
-    write_atomic(paths.html, page)
+    write_atomic(paths.html, render(sections, title=title, protocol=protocol.describe(), facts=facts, footer=footer))
     return paths
 
 
@@ -442,8 +444,9 @@ def publish(
             shutil.copyfile(source, target)
         pages.append((f"study/{STUDY_PAGE}", "Study", "What tuning the settings gained, and how sure that is."))
     template = Environment(autoescape=True, trim_blocks=True).from_string(resource("site.html.j2"))
-    page = template.render(title=title, pages=pages, note=note, version=dynslam_bench.__version__)
-    write_atomic(output / "index.html", page)
+    write_atomic(
+        output / "index.html", template.render(title=title, pages=pages, note=note, version=dynslam_bench.__version__)
+    )
     write_atomic(output / ".nojekyll", "")
     sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
     return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)

@@ -102,8 +102,9 @@ def compare(
         f"Student's 95 % interval over sequences, from {FEWEST} of them on. "
         + (f"What differs: {changed}." if changed else "The settings are the same.")
     )
-    table = _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall)
-    return Comparison(overall, table, only_a, only_b, differences)
+    return Comparison(
+        overall, _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall), only_a, only_b, differences
+    )
 
 
 def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRow], str]:

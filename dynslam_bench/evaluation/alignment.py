@@ -151,8 +151,7 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
     if len(source) < 3:
         return None
     if len(source) < 2 * BLOCKS:
-        kept = ~np.eye(len(source), dtype=bool)
-        pairs = [(source[rows], target[rows]) for rows in kept]
+        pairs = [(source[rows], target[rows]) for rows in ~np.eye(len(source), dtype=bool)]
         covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
         return float(np.sqrt((len(source) - 1) / len(source) * (_turned_deg(covariances, rotation) ** 2).sum()))
     size, more = divmod(len(source), BLOCKS)  # the first blocks are longer by one where it does not come out even

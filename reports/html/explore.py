@@ -557,8 +557,12 @@ def read_frames(row: RunRow, exact: Mapping[int, float]) -> RunFrames:
         return RunFrames({}, np.zeros(0), np.zeros(0))
     errors_m, own = columns["frame_error_trans_m"], columns.get("stat_mask_fraction")
     if exact:
-        share = [exact.get(index + row.offset, np.nan) for index in columns["index"].tolist()]
-        return RunFrames(columns, errors_m, np.array(share), EXACT)
+        return RunFrames(
+            columns,
+            errors_m,
+            np.array([exact.get(index + row.offset, np.nan) for index in columns["index"].tolist()]),
+            EXACT,
+        )
     if own is not None and own.any():  # else it may have no masks
         return RunFrames(columns, errors_m, own, "the tracker's own masks")
     return RunFrames(columns, errors_m, np.full(len(errors_m), np.nan))
@@ -589,8 +593,9 @@ def read_table(path: Path, wanted: Callable[[str], bool]) -> Columns | None:
     try:
         if not path.is_file() or not path.stat().st_size:
             return None
-        content = io.BytesIO(read_bytes(path, limit=TABLE_BYTES))
-        table = pd.read_csv(content, usecols=wanted, dtype=kinds, low_memory=False)
+        table = pd.read_csv(
+            io.BytesIO(read_bytes(path, limit=TABLE_BYTES)), usecols=wanted, dtype=kinds, low_memory=False
+        )
     except (DynslamError, ValueError, OverflowError, OSError) as error:
         raise RunError(f"{CSV_FILE} is damaged: {error}") from error
     if not isinstance(table.index, pd.RangeIndex):

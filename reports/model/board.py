@@ -454,8 +454,9 @@ def missing_commands(board: Board) -> list[str]:
         repeats += ["--offset", *map(str, offsets)] if offsets != [0] else []
         others = grouped((by_sequence[name][0] for name in names), lambda row: tuple(part_options(row)))
         for part, rows in others.items():
-            places = [row.place or row.sequence.id for row in rows]
-            commands.append(command_with(board.first(key), [*places, *part, *repeats]))
+            commands.append(
+                command_with(board.first(key), [*[row.place or row.sequence.id for row in rows], *part, *repeats])
+            )
     return commands
 
 
@@ -520,5 +521,5 @@ def load_board(
     Raises:
         ReportError: As `make_board`.
     """
-    rows = load_runs(open_stores(results), get_protocol(protocol), trials=trials).rows
-    return make_board(rows, reference, on, rank_seen=rank_seen)
+    loaded = load_runs(open_stores(results), get_protocol(protocol), trials=trials)
+    return make_board(loaded.rows, reference, on, rank_seen=rank_seen)

@@ -78,8 +78,7 @@ def claimed() -> pd.DataFrame:
     over the system), value, digits (decimals as printed).
     """
     frame = _read("claimed.csv")
-    digits = frame["value"].str.partition(".")[2].str.len()
-    return frame.astype({"table": int, "value": float}).assign(digits=digits)
+    return frame.astype({"table": int, "value": float}).assign(digits=frame["value"].str.partition(".")[2].str.len())
 
 
 @cache

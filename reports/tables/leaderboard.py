@@ -68,8 +68,16 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     caption = _caption(board, protocol, epipolar)
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
     brief += ", with 95 % intervals" * any(math.isfinite(standing.ratio.low) for standing in board.standings)
-    muted = board.unranked_rows(board.trackers)
-    return Table("leaderboard", "Leaderboard", caption, columns, rows, muted, board.separators(), brief)
+    return Table(
+        "leaderboard",
+        "Leaderboard",
+        caption,
+        columns,
+        rows,
+        board.unranked_rows(board.trackers),
+        board.separators(),
+        brief,
+    )
 
 
 COLUMNS = (
@@ -362,8 +370,9 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
     sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
     usual = sizes.most_common(1)[0][0] if sizes else 1
-    medians = {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
-    marks = column_marks(board, medians)
+    marks = column_marks(
+        board, {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
+    )
     rows = []
     for key in board.trackers:
         cells = [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
@@ -529,8 +538,8 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         ratio = cell.median / max(base, FLOOR_M)
         colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
         tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
-    shown = mm(cell.median) + SEEN * cell.in_training
-    return TableCell(shown, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
+    text = mm(cell.median) + SEEN * cell.in_training
+    return TableCell(text, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
 
 
 def _spread(cell: Cell) -> str:
@@ -764,8 +773,11 @@ def _statistics_table(
 
     def shown(cell: Cell, place: tuple[str, str], kind: str) -> TableCell:
         error = errors[kind][place]
-        words = mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell)
-        return TableCell(words, value=error, emphasis=marks[kind].get(place, ""))
+        return TableCell(
+            mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell),
+            value=error,
+            emphasis=marks[kind].get(place, ""),
+        )
 
     table = _sequence_table(
         board,
