@@ -60,7 +60,7 @@ def statistics(error: NDArray[np.float64]) -> dict[str, float]:
 
 
 def named(prefix: str, error: NDArray[np.float64], unit: str) -> dict[str, float]:
-    """The statistics under their metric names, e.g. ``ate_rmse_m``, ..., ``ate_sse_m2``."""
+    """The statistics under their metric names, e.g. ``ate_rmse_m``; the sum of squares has the unit squared."""
     return {f"{prefix}_{name}_{unit}{'2' if name == 'sse' else ''}": value for name, value in statistics(error).items()}
 
 
