@@ -85,10 +85,11 @@ def compare(
         paired = []
         for column in shared:
             sides = by_column_a[column], by_column_b[column]
-            repeats = set[tuple[int, int, int, str]].intersection(*({row.repeat_key for row in side} for side in sides))
-            cells = [make_cell([row for row in side if row.repeat_key in repeats] or side) for side in sides]
-            if all(cell.scores for cell in cells):
-                paired.append((columns[column] + (f" {SEEN}" * any(cell.in_training for cell in cells)), *cells))
+            repeats = {row.repeat_key for row in sides[0]} & {row.repeat_key for row in sides[1]}
+            a_cell, b_cell = (make_cell([row for row in side if row.repeat_key in repeats] or side) for side in sides)
+            if a_cell.scores and b_cell.scores:
+                mark = f" {SEEN}" * (a_cell.in_training or b_cell.in_training)
+                paired.append((columns[column] + mark, a_cell, b_cell))
         if paired:
             compared[name] = sorted(paired, key=itemgetter(0))
             differences[name] = _differences(variants_a[one][0], variants_b[other][0])
