@@ -153,9 +153,8 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     shift, left = float(fine[best]), float(near[best])
     if 0 < best < len(fine) - 1 and (bend := near[best - 1] - 2 * left + near[best + 1]) > 0:
         shift += float(0.5 * (near[best - 1] - near[best + 1]) / bend * (fine[1] - fine[0]))
-    visible = float(
-        _unexplained(moved, _displacements(track, begin[None] + shift, window))[0]
-    )  # what such a shift does to a path of this shape
+    shifted_self = _displacements(track, begin[None] + shift, window)
+    visible = float(_unexplained(moved, shifted_self)[0])  # what such a shift does to a path of this shape
     clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
     return (shift, left) if clear else (0.0, now)
 

@@ -162,8 +162,10 @@ def csv_text(frame: pd.DataFrame) -> str:
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """
-    words = frame.select_dtypes(["object", "string"]).astype(object).map(_no_formula)
-    written = frame.assign(**words).rename(columns=_no_formula)
+    written = frame.rename(columns=_no_formula)
+    for name in written.columns:
+        if written[name].dtype in ("object", "string"):
+            written[name] = written[name].astype(object).map(_no_formula)
     return written.to_csv(index=False, lineterminator="\n")
 
 
