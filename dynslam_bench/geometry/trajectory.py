@@ -74,6 +74,10 @@ class Trajectory:
         exact = None if self.exact_ns is None else self.exact_ns[index]
         return Trajectory(self.timestamps[index], self.T_world_cam[index], exact)
 
+    def with_poses(self, T_world_cam: NDArray[np.float64]) -> Trajectory:
+        """Other poses ``[N, 4, 4]`` at the same stamps."""
+        return Trajectory(self.timestamps, T_world_cam, self.exact_ns)
+
     def with_exact(self, exact: Mapping[float, int]) -> Trajectory:
         """The same trajectory with the nanoseconds of those stamps that a table of seconds to nanoseconds holds."""
         stamps = self.timestamps.tolist()

@@ -23,8 +23,7 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.calibration import Quantity, calibrate
-from dynslam_bench.sequences.synthetic import families
-from dynslam_bench.sequences.synthetic import open_synthetic
+from dynslam_bench.sequences.synthetic import families, open_synthetic
 
 SHARED = Path(__file__).resolve().parents[3] / "shared/data"
 REAL = ("tum/rgbd_dataset_freiburg1_xyz", "tum/rgbd_dataset_freiburg1_rpy", "bonn/rgbd_bonn_crowd")
