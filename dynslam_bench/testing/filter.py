@@ -135,9 +135,9 @@ def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
 
 def _declaration(candidate: DynamicFilter) -> None:
     require(isinstance(candidate.name, str) and candidate.name, f"the name is {candidate.name!r}")
-    known, tags = get_args(Need), get_args(Provenance)
-    unknown = sorted(candidate.needs - set(known))
-    require(not unknown, f"unknown needs {unknown}", f"known are {', '.join(sorted(known))}")
+    needs, tags = get_args(Need), get_args(Provenance)
+    unknown = sorted(candidate.needs - set(needs))
+    require(not unknown, f"unknown needs {unknown}", f"known are {', '.join(sorted(needs))}")
     require(candidate.provenance in tags, f"provenance is {candidate.provenance!r}", f"one of {', '.join(tags)}")
 
 
