@@ -102,7 +102,7 @@ class StudyResult:
 
     @property
     def preset(self) -> Path:
-        """The chosen settings, for ``run(settings=...)`` and ``--settings``."""
+        """The best settings, for ``run(settings=...)`` and ``--settings``."""
         return self.tuner.folder / "best.toml"
 
 
@@ -272,6 +272,8 @@ def tune(
     results: str | Path = "results",
     jobs: int = 1,
     trials: int | None = None,
+    more_scenes: int = 0,
+    more_trials: int = 0,
     on_event: Callable[..., None] | None = None,
     on_run: Callable[..., None] | None = None,
     on_note: Callable[[str], None] | None = None,
@@ -283,6 +285,8 @@ def tune(
         results: The results folder.
         jobs: Trials at a time.
         trials: Finished trials, in place of the study's own number.
+        more_scenes: Rendered scenes to add to those that choose and judge.
+        more_trials: Trials to add.
         on_event: Called with every `StudyEvent`.
         on_run: Called with every `RunEvent`.
         on_note: Called with a line at every step of the final check.
@@ -294,7 +298,9 @@ def tune(
 
     spec = read_study(Path(study)) if isinstance(study, str | Path) else study
     spec = spec if trials is None else spec.model_copy(update={"trials": trials})
-    tuner = run_study(spec, results=results, jobs=jobs, on_event=on_event, on_run=on_run)
+    tuner = run_study(
+        spec, results=results, jobs=jobs, scenes=more_scenes, trials=more_trials, on_event=on_event, on_run=on_run
+    )
     summary = finish(tuner, on_note, jobs=jobs)
     return StudyResult(summary, write_page(tuner, summary), tuner)
 

@@ -19,7 +19,7 @@ def error_and_time(run: Outcome) -> float:
 
 def main(results: str = "results", frames: int = 20) -> None:
     study = Study(
-        name="in-python", tracker="constant-velocity", results=results, trials=4, pilot=False, recorded=(),
+        name="in-python", tracker="constant-velocity", results=results, trials=4, recorded=(),
         tune=[
             ProblemInstance("synthetic/walking_xyz?scene=0", frames=(0, frames)),
             f"synthetic/sitting_xyz?scene=1-2&frames={frames}",

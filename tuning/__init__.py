@@ -1,7 +1,7 @@
 """Optuna studies over the environments: search space, trials as runs, held-out check, presets.
 
-`Study` is all of it from Python: run, pilot, screen, finish, and a stored one as a pandas frame. Its steps by
-themselves: `read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on
+`Study` is all of it from Python: preview, run or ask and tell, extend, finish, and a stored one as a pandas frame.
+Its steps: `read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on
 held-out instances, `write_page` shows it all. `search_space` and `distributions` serve studies of your own.
 """
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.final_runs import finish, read_preset_text
     from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
     from dynslam_bench.tuning.page import write_page
-    from dynslam_bench.tuning.preliminary import pilot_of, screen_study
+    from dynslam_bench.tuning.plan import Plan, Preview
     from dynslam_bench.tuning.samplers import EmfoaSampler
     from dynslam_bench.tuning.space import distributions, search_space
     from dynslam_bench.tuning.study import Study, run_study
     from dynslam_bench.tuning.study_file import SpaceSpec, StudySpec, read_study
-    from dynslam_bench.tuning.summary import StudySummary
-    from dynslam_bench.tuning.tuner import StudyEvent, Tuner
+    from dynslam_bench.tuning.summary import StudySummary, Verdict
+    from dynslam_bench.tuning.tuner import Evaluation, StudyEvent, Tuner
 
 _HOMES = {
     "instances": ("ProblemInstance", "parse_instances"),
@@ -28,17 +28,20 @@ _HOMES = {
     "evaluate": ("Outcome",),
     "final_runs": ("finish", "read_preset_text"),
     "page": ("write_page",),
-    "preliminary": ("pilot_of", "screen_study"),
+    "plan": ("Plan", "Preview"),
     "study": ("Study", "run_study"),
     "space": ("distributions", "search_space"),
-    "tuner": ("StudyEvent", "Tuner"),
+    "tuner": ("Evaluation", "StudyEvent", "Tuner"),
     "study_file": ("SpaceSpec", "StudySpec", "read_study"),
-    "summary": ("StudySummary",),
+    "summary": ("StudySummary", "Verdict"),
 }
 
 __all__ = [
     "EmfoaSampler",
+    "Evaluation",
     "Outcome",
+    "Plan",
+    "Preview",
     "ProblemInstance",
     "SpaceSpec",
     "Study",
@@ -46,14 +49,13 @@ __all__ = [
     "StudySpec",
     "StudySummary",
     "Tuner",
+    "Verdict",
     "distributions",
     "finish",
     "parse_instances",
-    "pilot_of",
     "read_preset_text",
     "read_study",
     "run_study",
-    "screen_study",
     "search_space",
     "write_page",
 ]

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,6 +40,13 @@ class Outcome:
     frame_s: float
     processor_s: float
     rtf: float
+
+
+class Configuration(NamedTuple):
+    """A tracker and the overrides of its settings, by dotted name."""
+
+    tracker: str
+    settings: Mapping[str, Any]
 
 
 FOREIGN = "transfer"

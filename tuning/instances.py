@@ -175,6 +175,59 @@ def scenes(instances: Iterable[ProblemInstance]) -> dict[str, list[ProblemInstan
     return groups
 
 
+def further_scenes(
+    instances: Iterable[ProblemInstance], count: int, taken: Iterable[str], numbers: range
+) -> list[ProblemInstance]:
+    """Further scenes of rendered sequences, one of each sequence in turn, each with the starts and seeds of its first.
+
+    Args:
+        instances: Those to be continued.
+        count: Scenes.
+        taken: Scenes, as `scene_of` gives them, that are in use.
+        numbers: Scene numbers to choose from.
+
+    Raises:
+        StudyError: None of the instances is rendered, or the numbers are used up.
+    """
+    taken, models = set(taken), dict[str, list[ProblemInstance]]()
+    for group in scenes(instances).values():
+        if group[0].sequence.startswith("synthetic/"):
+            models.setdefault(parse_synthetic_id(group[0].sequence).name, group)
+    added: list[list[ProblemInstance]] = []
+    for number, group in product(numbers, models.values()):
+        moved = [
+            replace(instance, sequence=str(replace(parse_synthetic_id(instance.sequence), scene=number)))
+            for instance in group
+        ]
+        if len(added) < count and moved[0].scene not in taken:
+            added.append(moved)
+    if len(added) < count:
+        raise StudyError(
+            f"{count} further scenes cannot be made, only {len(added)}",
+            "scenes can be made of rendered sequences alone",
+        )
+    return [instance for group in added for instance in group]
+
+
+def stretches_behind(instances: Iterable[ProblemInstance], data_root: str | None) -> list[ProblemInstance]:
+    """The parts of recordings moved behind the last frame that is named of each, as far as the recording goes."""
+    parts: dict[str, list[tuple[ProblemInstance, int, int]]] = {}
+    for instance in instances:
+        first, last = instance.frames or (0, None)
+        if last is not None and not instance.sequence.startswith("synthetic/"):
+            parts.setdefault(instance.sequence, []).append((instance, first, last))
+    moved = []
+    for sequence, group in parts.items():
+        shift = max(last for _, _, last in group) - min(first for _, first, _ in group)
+        length = len(open_sequence(sequence, data_root=data_root))
+        moved += [
+            replace(instance, frames=(first + shift, last + shift))
+            for instance, first, last in group
+            if last + shift <= length
+        ]
+    return moved
+
+
 def _options(query: str, text: str) -> dict[str, str]:
     options: dict[str, str] = {}
     for option in query.split("&") if query else ():

@@ -1,16 +1,18 @@
-"""Objectives and constraints: each objective is a cost of a run, compared with the default's in each scene.
+"""Objectives and constraints: each objective is a cost of a run, compared with the baseline's in each scene.
 
-All objectives are natural logarithms of ratios to the default settings: less is better, 0 is the default's own.
+All objectives are natural logarithms of ratios to the baseline: less is better, 0 is the baseline's own. Below them the
+statistics of such ratios: interval, bound, power, and the test of whether settings matter at all.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy import stats
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.tuning.evaluate import Outcome
@@ -23,7 +25,7 @@ WORST_SHARE = 0.25
 """Share of the scenes, the worst ones, that the worst case is the mean of; always one at least."""
 _MANY = 1e9
 _LOST_FLOOR = 0.01
-"""So many lost frames are added on both sides, as a share, so that a default without any can be compared with."""
+"""So many lost frames are added on both sides, as a share, so that a baseline without any can be compared with."""
 
 
 @dataclass(frozen=True)
@@ -44,36 +46,29 @@ class Objective:
     worst: bool = False
     degraded: bool = False
 
-    def log_ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[ProblemInstance, float]:
-        """Natural logarithm of the ratio on each instance, whether it counts or not."""
-        return {
-            instance: math.log(self.cost(outcome) / self.cost(default[instance]))
-            for instance, outcome in outcomes.items()
-        }
-
-    def by_start(self, outcomes: Outcomes, default: Outcomes) -> list[float]:
+    def by_start(self, outcomes: Outcomes, baseline: Outcomes) -> list[float]:
         """Natural logarithm of the ratio on each instance that counts and that both ran."""
-        reference = self._costs(default)
+        reference = self._costs(baseline)
         return [
             math.log(max(cost, FLOOR_M) / max(reference[instance], FLOOR_M))
             for instance, cost in self._costs(outcomes).items()
             if instance in reference
         ]
 
-    def ratios(self, outcomes: Outcomes, default: Outcomes) -> dict[str, float]:
-        """Natural logarithm of the ratio to the default by scene; empty without any instance that counts."""
-        return by_scene(self._costs(outcomes), self._costs(default))
+    def ratios(self, outcomes: Outcomes, baseline: Outcomes) -> dict[str, float]:
+        """Natural logarithm of the ratio to the baseline by scene; empty without any instance that counts."""
+        return by_scene(self._costs(outcomes), self._costs(baseline))
 
     def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
         return {instance: self.cost(outcome) for instance, outcome in outcomes.items() if self.counts(instance)}
 
-    def value(self, outcomes: Outcomes, default: Outcomes) -> float:
-        """Natural logarithm of the ratio to the default over the scenes; below 0 is better.
+    def value(self, outcomes: Outcomes, baseline: Outcomes) -> float:
+        """Natural logarithm of the ratio to the baseline over the scenes; below 0 is better.
 
         Raises:
             StudyError: None of the instances counts.
         """
-        counted = self.counted(self.ratios(outcomes, default).values())
+        counted = self.counted(self.ratios(outcomes, baseline).values())
         if not counted:
             raise StudyError(
                 f"objective '{self.name}' counts degraded instances alone, but none of the study's is",
@@ -157,26 +152,26 @@ def fps(outcomes: Outcomes) -> float:
     return 1.0 / float(np.mean([outcome.frame_s for outcome in outcomes.values()]))
 
 
-def violations(spec: StudySpec, outcomes: Outcomes, default: Outcomes | None = None) -> dict[str, float]:
+def violations(spec: StudySpec, outcomes: Outcomes, baseline: Outcomes | None = None) -> dict[str, float]:
     """How far each constraint is violated, relatively; <= 0 is fulfilled.
 
     Args:
         spec: The study. One of anything but error alone must not pay for its gain with accuracy: the ATE ratio has to
             stay below 1 + `StudySpec.ate_margin`; a front of several objectives holds the error itself.
         outcomes: Of a configuration.
-        default: Of the default settings at the same places, for that ratio; None to leave it out.
+        baseline: Outcomes of the baseline at the same places, for that ratio; None to leave it out.
     """
     values = {}
     if spec.min_coverage is not None:
         values["coverage"] = spec.min_coverage - coverage(outcomes)
     if spec.min_fps is not None:
         values["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
-    if default is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
-        values["ate"] = ACCURACY.value(outcomes, default) - math.log1p(spec.ate_margin)
+    if baseline is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
+        values["ate"] = ACCURACY.value(outcomes, baseline) - math.log1p(spec.ate_margin)
     return values
 
 
-# Comparing a configuration with the default: paired by place, robust to single runs, with intervals that cover.
+# Comparing a configuration with the baseline: paired by place, robust to single runs, with intervals that cover.
 
 FLOOR_M = 1e-4
 """Errors below a tenth of a millimetre count as that: a ratio of two perfect runs tells nothing."""
@@ -194,20 +189,20 @@ def place_of(instance: ProblemInstance) -> ProblemInstance:
     return replace(instance, offset=0, seed=0)
 
 
-def by_scene(errors: Errors, default: Errors) -> dict[str, float]:
-    """Log ATE ratio of a configuration to the default in each scene.
+def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
+    """Log ATE ratio of a configuration to the baseline in each scene.
 
-    At each place the median over the configuration's starts is compared with the median over all of the default's, so
+    At each place the median over the configuration's starts is compared with the median over all of the baseline's, so
     that no single start decides; a scene is the mean of its places.
 
     Args:
         errors: Of the configuration.
-        default: Of the default settings, at every place of `errors`; more starts make it steadier.
+        baseline: At every place of `errors`; more starts make it steadier.
 
     Returns:
-        Natural logarithm by scene, below 0 is better than the default.
+        Natural logarithm by scene, below 0 is better than the baseline.
     """
-    reference = _log_errors(default)
+    reference = _log_errors(baseline)
     ratios: dict[str, list[float]] = {}
     for place, values in _log_errors(errors).items():
         ratios.setdefault(place.scene, []).append(float(np.median(values) - np.median(reference[place])))
@@ -247,7 +242,7 @@ def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, fl
     kept = count - 2 * cut
     winsorised = np.clip(sample, sample[cut], sample[count - 1 - cut])
     error = float(winsorised.std(ddof=1)) * math.sqrt(count) / kept
-    half = float(stdtrit(kept - 1, 0.5 + confidence / 2)) * error
+    half = float(stats.t.ppf(0.5 + confidence / 2, kept - 1)) * error
     middle = centre(sample)
     return middle - half, middle + half
 
@@ -256,3 +251,66 @@ def upper(values: Iterable[float], confidence: float) -> float:
     """One-sided upper confidence bound of the centre; infinite for fewer than two values."""
     interval = bounds(values, 2 * confidence - 1)
     return math.inf if interval is None else interval[1]
+
+
+# What scenes can show.
+
+_POWER = 0.8
+_MOST_SCENES = 100_000
+
+
+def detectable(spread: float, count: int) -> float:
+    """Smallest gain, as a share, that so many scenes tell from nothing in four of five studies; 1 for fewer than two.
+
+    Args:
+        spread: Standard deviation over scenes of the log ratio.
+        count: Scenes.
+    """
+    if count < 2:
+        return 1.0
+    factor = stats.t.ppf(0.975, count - 1) + stats.t.ppf(_POWER, count - 1)
+    return float(1 - math.exp(-factor * spread / math.sqrt(count)))
+
+
+def scenes_needed(gain: float, spread: float) -> int:
+    """The fewest scenes that tell a gain from nothing, at most `_MOST_SCENES`; see `detectable`."""
+    return 2 + bisect_left(range(2, _MOST_SCENES), True, key=lambda count: detectable(spread, count) <= gain)
+
+
+MATTER_LEVEL = 0.02
+"""Level of `spread_test`; pruning, which depends on the values, makes it find a difference where there is none in 3 to
+8 % of the studies (`tests/benchmarks/study_null.py`)."""
+
+
+def spread_test(trials: Sequence[Mapping[str, float]]) -> float | None:
+    """Whether trials differ by more than chance: the p-value of an F-test for trials x scenes (additive model).
+
+    Chance is what is left of the log ratios once each trial and each scene has its mean: the scatter between starts,
+    and what any change does to one scene but not to another. Pruned trials count with the scenes that they ran on.
+
+    Args:
+        trials: Log ratio by scene of each trial.
+
+    Returns:
+        Above `MATTER_LEVEL` the settings do not matter on these scenes; None with too few trials or scenes for a test.
+    """
+    names = sorted({scene for trial in trials for scene in trial})
+    cells = [(row, names.index(scene), value) for row, trial in enumerate(trials) for scene, value in trial.items()]
+    free = len(cells) - len(names) - len(trials) + 1
+    if len(trials) < 2 or free < 1:
+        return None
+    rows, columns, values = (np.array(column) for column in zip(*cells, strict=True))
+    by_scene, by_trial = np.eye(len(names))[columns], np.eye(len(trials))[rows]
+    left = [
+        float(np.square(values - model @ np.linalg.lstsq(model, values)[0]).sum())
+        for model in (by_scene, np.hstack([by_scene, by_trial]))
+    ]
+    explained = max(0.0, left[0] - left[1]) / (len(trials) - 1)
+    chance = left[1] / free
+    if explained < _SAME:
+        return 1.0
+    return float(stats.f.sf(explained / max(chance, _SAME), len(trials) - 1, free))
+
+
+_SAME = 1e-18
+"""Variances below this are rounding."""

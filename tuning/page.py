@@ -24,11 +24,16 @@ from dynslam_bench.tuning.final_runs import preset_text
 from dynslam_bench.tuning.instances import ProblemInstance, scenes
 from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
-from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, worth
-from dynslam_bench.tuning.trials import FEWEST_TRIALS, errors_of, importances
+from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, Verdict, worth
+from dynslam_bench.tuning.trials import EARLIER, FEWEST_TRIALS, errors_of
 from dynslam_bench.tuning.tuner import Tuner
 
 PLOTS_FILE = "plots.html"
+_PLOTS = Markup(
+    '<a href="{}">Optuna\'s plots</a><iframe src="{}" title="Optuna\'s plots" width="100%" height="900"></iframe>'
+)
+_CONTOURS = 4
+"""Contours of so many parameters are drawn, the most important ones."""
 
 
 def write_page(tuner: Tuner, summary: StudySummary) -> Path:
@@ -43,29 +48,28 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     """
     spec = tuner.spec
     candidates, trials = _candidates(summary), _trials(tuner, summary)
-    best = summary.candidates[0].params if summary.candidates else {}
-    settings = settings_table(tuner.space, tuner.base, best, summary.improves)
+    proven = summary.verdict == Verdict.PROVEN
+    settings = settings_table(tuner.space, tuner.base, summary.best.params if summary.best else {}, proven)
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
-    write_atomic(tuner.folder / PLOTS_FILE, _plots(tuner))
+    write_atomic(tuner.folder / PLOTS_FILE, _plots(tuner, list(summary.importances)))
     result = [Block("table", table=candidates)]
     if figure := _ratio_figure(summary):
         caption = (
-            "Ratio to the default settings and its 95 % interval: on the instances of the choice (confirm), which no "
-            "trial had seen, and, for the choice alone, on the held-out instances and on recordings."
+            "Ratio to the baseline and its 95 % interval: on the instances of the choice (confirm), which no trial had "
+            "seen, and, for the best trial, on the held-out instances and on recordings."
         )
         result.append(Block("figure", figure="ratios", chart=figure, caption=caption))
-    plots = Markup('<a href="{}">Optuna\'s plots</a>: history, slices, importances, intermediate values, Pareto front')
-    conclusion = [summary.conclusion, *filter(None, [seen_note(summary.seen)])]
+    conclusion = [summary.conclusion, *filter(None, [_shipped(summary), seen_note(summary.seen)])]
     sections = [
         Section("result", "What the study found", "Result", conclusion, result),
         Section(
-            "preset", "Settings: default, best trial, range", "Settings", _picks(summary),
+            "preset", "Settings: baseline, best trial, range", "Settings", _picks(summary),
             _preset(tuner, summary, settings),
         ),
         Section(
             "course", "How it went", "Course", [*warnings_of(tuner), _importance_note(summary)],
-            [Block("list", entries=[plots.format(PLOTS_FILE)])],
+            [Block("list", entries=[_PLOTS.format(PLOTS_FILE, PLOTS_FILE)])],
         ),
         Section("trials", "All trials", "Trials", [], [Block("table", table=trials)]),
     ]  # fmt: skip
@@ -93,21 +97,24 @@ def _size(instances: Sequence[ProblemInstance]) -> str:
     return f"{len(instances)} runs, {len(scenes(instances))} scenes" if instances else "none"
 
 
-def _plots(tuner: Tuner) -> str:
+def _plots(tuner: Tuner, important: list[str]) -> str:
     """Optuna's own plots of the study, in one HTML text that works offline; ratios in place of logarithms."""
     from optuna import visualization
 
-    names = [f"ratio of {objective.what} to the default" for objective in tuner.objectives]
+    names = [f"ratio of {objective.what} to the baseline" for objective in tuner.objectives]
     target: dict[str, Any] = {"target": lambda trial: math.exp(trial.values[0]), "target_name": names[0]}
-    evaluator = optuna.importance.PedAnovaImportanceEvaluator
+    params = important or [parameter.name for parameter in tuner.space]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        warnings.simplefilter("ignore")  # experimental; of trials that pruning never saw
         figures = [
             visualization.plot_optimization_history(tuner.study, **target),
+            visualization.plot_parallel_coordinate(tuner.study, **target),
             visualization.plot_slice(tuner.study, **target),
+            visualization.plot_contour(tuner.study, params=params[:_CONTOURS], **target),
         ]
-        if importances(tuner.study):
-            figures.append(visualization.plot_param_importances(tuner.study, evaluator=evaluator(), **target))
+        if important:
+            evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+            figures.append(visualization.plot_param_importances(tuner.study, evaluator=evaluator, **target))
         if len(names) == 1:
             figures.append(visualization.plot_intermediate_values(tuner.study))
         elif len(names) < 4:
@@ -120,16 +127,21 @@ def _plots(tuner: Tuner) -> str:
 
 
 def _preset(tuner: Tuner, summary: StudySummary, settings: Table) -> list[Block]:
-    """The chosen settings, and how to use them only if they are confirmed on the held-out split."""
-    spec, shown = tuner.spec, Block("table", table=settings)
-    if summary.chosen is None:
+    """The best settings with their status, and how to use them only if they are proven."""
+    shown, best = Block("table", table=settings), summary.best
+    if best is None:
         return [shown]
-    chosen = summary.candidates[0]
-    text = preset_text({**spec.space.fixed, **chosen.params}, spec.tracker, summary.conclusion)
-    if not summary.improves:
-        return [shown, Block("code", title="Not recommended: they are not confirmed; shown as a record", text=text)]
-    command = f"dynslam-bench run {spec.tracker} SEQUENCE --settings best.toml"
+    text = preset_text(tuner, best.params, summary.conclusion, status=summary.verdict.value)
+    if summary.verdict != Verdict.PROVEN:
+        return [shown, Block("code", title=f"best.toml, not recommended: {summary.verdict.value}", text=text)]
+    command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
     return [shown, Block("code", text=text), Block("code", title="Use them", text=command)]
+
+
+def _shipped(summary: StudySummary) -> str:
+    """The default settings beside a baseline that is something else; empty if it is not."""
+    ratios = "; ".join(f"{split.replace('_', '-')}: {ratio}" for split, ratio in summary.shipped.items())
+    return f"Ratios are to {summary.baseline}. The default settings of {summary.tracker}: {ratios}." if ratios else ""
 
 
 def _picks(summary: StudySummary) -> list[str]:
@@ -144,13 +156,9 @@ def _picks(summary: StudySummary) -> list[str]:
 
 def _importance_note(summary: StudySummary) -> str:
     if not summary.importances:
-        complete = summary.trials.get("complete", 0)
-        return f"No importances: they need {FEWEST_TRIALS} complete trials that differ, there are {complete}."
-    shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in summary.importances.items())
-    return (
-        f"Importances (PED-ANOVA): {shares}. The shares add up to 100 % even where no setting matters; `tune screen` "
-        "tells effects from chance."
-    )
+        return f"No importances: they need {FEWEST_TRIALS} complete or pruned trials that differ."
+    shares = ", ".join(f"{name} {importance}" for name, importance in summary.importances.items())
+    return f"Importances (PED-ANOVA) and their 95 % intervals: {shares}. They add up to 100 % even where none matters."
 
 
 def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
@@ -188,19 +196,19 @@ def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
         height=160 + 50 * len(summary.candidates),
         shapes=[guide(x=1.0)],
         margin={"l": 90, "r": 20, "t": 30, "b": 60},
-        xaxis=axis("ratio to the default settings (left is better)"),
+        xaxis=axis("ratio to the baseline (left is better)"),
         yaxis={"autorange": "reversed", "gridcolor": GRID},
     )
     return {"data": traces, "layout": layout}
 
 
 def fewer_starts(design: Design) -> str:
-    """Why the default itself may have another ratio than 1; empty where trials ran from as many starts as it."""
+    """Why the baseline itself may have another ratio than 1; empty where trials ran from as many starts as it."""
     if len(design.reference) == len(design.tune):
         return ""
     return (
-        f" Ratios are to the median of the default over {FEWEST_STARTS} or more starts in each scene, but every trial, "
-        "the default as trial 0 too, ran from fewer: so the ratio of trial 0, and with it the best so far, may differ "
+        f" Ratios are to the median of the baseline over {FEWEST_STARTS} or more starts in each scene, but every "
+        "trial, the baseline as trial 0 too, ran from fewer: so the ratio of trial 0, and with it the best so far, may differ "
         "from 1 though no setting was changed."
     )
 
@@ -224,7 +232,7 @@ def warnings_of(tuner: Tuner) -> list[str]:
     if "speed" in tuner.spec.objectives:
         notes.append(
             "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On "
-            "the instances of the choice and the held-out ones default and candidates ran in turn: those count."
+            "the instances of the choice and the held-out ones baseline and candidates ran in turn: those count."
         )
     return notes
 
@@ -248,16 +256,16 @@ def _candidates(summary: StudySummary) -> Table:
     def time(candidate: Candidate) -> TableCell:
         if candidate.frame_ms is None:
             return TableCell("-")
-        return TableCell(f"{candidate.frame_ms:.1f}", f"default {candidate.default_frame_ms:.1f}", candidate.frame_ms)
+        return TableCell(f"{candidate.frame_ms:.1f}", f"baseline {candidate.baseline_frame_ms:.1f}", candidate.frame_ms)
 
     rows = [
         [
             TableCell(
                 str(candidate.trial),
                 value=float(candidate.trial),
-                emphasis="best" if candidate.trial == summary.chosen else "",
+                emphasis="best" if candidate is summary.best else "",
             ),
-            number(math.exp(candidate.values[0]), ".3f"),
+            number(math.exp(candidate.values[0]) if candidate.values else None, ".3f"),
             ratio(candidate.confirm),
             number(candidate.bound if math.isfinite(candidate.bound) else None, ".3f"),
             ratio(candidate.held_out),
@@ -268,10 +276,10 @@ def _candidates(summary: StudySummary) -> Table:
         for candidate in summary.candidates
     ]
     caption = (
-        "Ratios to the default settings on the same instances: the median of a scene's starts, the mean over scenes "
-        "(trimmed from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on "
-        "instances that no trial had seen is chosen where that bound lies below 1, and else the default; held-out "
-        f"instances and recordings only judge the choice. Frame times without the stage cache.{_cautions(summary)}"
+        "Ratios to the baseline on the same instances: the median of a scene's starts, the mean over scenes (trimmed "
+        "from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on instances that no "
+        "trial had seen is the best, and chosen where that bound lies below 1; held-out instances and recordings judge "
+        f"it. Frame times without the stage cache.{_cautions(summary)}"
     )
     optimistic = "the trial's own value, optimistic: the trial was selected for it"
     one_sided = "one-sided upper bound for the choice; allows for the number of candidates"
@@ -300,7 +308,9 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
     rows = [
         [
             number(float(trial.number), ".0f"),
-            TableCell(trial.state.name.lower(), tip=trial.user_attrs.get("reason", "")),
+            TableCell(
+                trial.state.name.lower(), tip=trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, "")
+            ),
             *(number(math.exp(value), ".3f") for value in trial.values or ()),
             *(TableCell("-") for _ in tuner.objectives if not trial.values),
             number(trial.user_attrs.get("coverage"), ".3f"),
@@ -311,28 +321,28 @@ def _trials(tuner: Tuner, summary: StudySummary) -> Table:
     ]
     headings = _marked(summary, *((f"ratio of {objective.what}", "tune") for objective in tuner.objectives))
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings, "coverage", "fps", *names)]
-    caption = "Reasons of pruned and failed trials stand behind their state."
+    caption = (
+        "Behind the state stand the reasons of pruned and failed trials, and the study that an earlier trial is of."
+    )
     return Table("trials", "All trials", caption + fewer_starts(tuner.design) + _cautions(summary), columns, rows)
 
 
-def settings_table(
-    space: Sequence[Parameter], default: dict[str, Any], chosen: dict[str, Any], confirmed: bool
-) -> Table:
-    """Every tuned setting: default, chosen value, and the range that was searched."""
+def settings_table(space: Sequence[Parameter], baseline: dict[str, Any], best: dict[str, Any], proven: bool) -> Table:
+    """Every tuned setting: the baseline's value, the best trial's, and the range that was searched."""
     rows = [
         [
             TableCell(parameter.name),
-            _value(default.get(parameter.name)),
-            _value(chosen.get(parameter.name)),
+            _value(baseline.get(parameter.name)),
+            _value(best.get(parameter.name)),
             TableCell(_range(parameter)),
             TableCell(parameter.unit),
         ]
         for parameter in space
     ]
     setting, searched, unit = (Column(name, numeric=False) for name in ("setting", "range", "unit"))
-    columns = [setting, Column("default"), Column("chosen" if confirmed else "best trial"), searched, unit]
-    caption = "What was searched." + ("" if confirmed else " The best trial is not confirmed: keep the default.")
-    return Table("settings", "Default, chosen and range", caption, columns, rows)
+    columns = [setting, Column("baseline"), Column("best trial"), searched, unit]
+    caption = "What was searched." + ("" if proven else " The best trial is not proven: keep the baseline.")
+    return Table("settings", "Baseline, best trial and range", caption, columns, rows)
 
 
 def _value(value: Scalar | None) -> TableCell:

@@ -22,24 +22,22 @@ from dynslam_bench.tuning.splits import source_of_masks
 from dynslam_bench.tuning.study_file import SpaceSpec
 
 
-def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
-    """The parameters of a study; what has no effect as the fixed settings stand is no part of it.
+def search_space(settings: Settings, spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
+    """The parameters of a study; what has no effect with the baseline's settings is no part of it.
 
     Args:
-        settings: The tracker's settings class.
+        settings: The tracker's, the baseline's and the fixed ones among them.
         spec: Which of them are tuned.
         sequences: What the study runs on, which decides what the source of masks ``auto`` is.
 
     Raises:
         StudyError: A pattern matches nothing, names a setting that has no effect, or nothing is left to tune.
-        SettingsError: A fixed value is unknown or unfit.
     """
-    apply_overrides(settings(), spec.fixed)
-    every = parameters(settings)
+    every = parameters(type(settings))
     for pattern in (*spec.include, *spec.exclude):
         if not any(fnmatchcase(parameter.name, pattern) for parameter in every):
             similar = did_you_mean(pattern, [parameter.name for parameter in every])
-            hint = "it exists, but is not tunable" if pattern in field_names(settings) else similar
+            hint = "it exists, but is not tunable" if pattern in field_names(type(settings)) else similar
             raise StudyError(f"'{pattern}' matches no tunable setting", hint)
     chosen = [
         parameter
@@ -48,8 +46,9 @@ def search_space(settings: type[Settings], spec: SpaceSpec, sequences: Iterable[
         and not any(fnmatchcase(parameter.name, pattern) for pattern in spec.exclude)
         and parameter.name not in spec.fixed
     ]
-    fixed = _as_run(apply_overrides(settings(), spec.fixed), list(sequences))
-    unused = {parameter.name: why for parameter in chosen if (why := why_unused(fixed, parameter.name))}
+    if hasattr(settings, "segmentation"):  # "auto" stands for a source
+        settings = apply_overrides(settings, {"segmentation.source": source_of_masks(settings, list(sequences))})
+    unused = {parameter.name: why for parameter in chosen if (why := why_unused(settings, parameter.name))}
     chosen = [parameter for parameter in chosen if parameter.name not in unused]
     if not chosen:
         raise StudyError("the space is empty: all that matches is excluded, fixed, or switched off by a fixed value")
@@ -77,18 +76,8 @@ def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
     return optuna.distributions.FloatDistribution(parameter.low, parameter.high, log=log)
 
 
-def _as_run(settings: Settings, sequences: Sequence[str]) -> Settings:
-    """The settings with the source of masks that ``auto`` stands for on rendered sequences."""
-    if hasattr(settings, "segmentation"):
-        return apply_overrides(settings, {"segmentation.source": source_of_masks(settings, sequences)})
-    return settings
-
-
-# Starting points.
-
-
 def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
-    """A preset as a configuration of a study; what it does not say is as the default has it.
+    """A preset as a configuration of a study; what it does not say is as the baseline has it.
 
     Args:
         preset: Settings by dotted name.
@@ -107,9 +96,11 @@ def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: 
                 f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
                 f'tune it, or say "{name}" = ... under [space.fixed]',
             )
-        if name in tuned and not _fits(tuned[name], value):
+    point = {name: preset.get(name, base[name]) for name in tuned}
+    for name, value in point.items():
+        if not _fits(tuned[name], value):
             raise StudyError(f"the preset to start from sets {name} = {value!r}, out of the range that the study tunes")
-    return {name: preset.get(name, base[name]) for name in tuned}
+    return point
 
 
 def _fits(parameter: Parameter, value: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, product, zip_longest
@@ -25,16 +25,14 @@ from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
 from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
 from dynslam_bench.sequences.view import Part, part_of
-from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.instances import ProblemInstance, further_scenes, scenes, stretches_behind
 from dynslam_bench.tuning.objectives import place_of
 from dynslam_bench.tuning.study_file import StudySpec
 
 FEWEST_STARTS = 3
-"""The default settings run from so many starts at every place: all trials would share the luck of a single one."""
-ENOUGH_SCENES = 12
-"""With so many tune scenes a third of them is kept for the choice; else other starts in all of them are."""
-FRESH_SEED = 1000
-"""Seeds of fresh starts: none that a trial has used."""
+"""The baseline runs from so many starts at every place: all trials would share the luck of a single one."""
+CONFIRM_SCENES = 12
+"""Scenes at least that are made for the choice; half as many as to tune on where that is more."""
 RECORDED_FRAMES, RECORDED_STARTS = 120, 4
 
 
@@ -44,8 +42,9 @@ class Design:
 
     Attributes:
         tune: What trials run on, in the order of all trials.
-        reference: What the default settings run on beforehand: `tune`, and more starts where those are few.
-        confirm: What the best trials and the default run on for the choice; no trial has seen them.
+        reference: What the baseline runs on beforehand: `tune`, and more starts where those are few.
+        confirm: What the best trials and the baseline run on for the choice; shares no frame with `tune`. Empty where
+            recordings have no further frames: then nothing can be claimed.
         held_out: What judges the choice.
         recorded: Recordings on which the choice must not be worse.
         notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
@@ -59,28 +58,31 @@ class Design:
     notes: tuple[str, ...] = ()
 
 
-def design_of(spec: StudySpec, *, accept: bool = False) -> Design:
+def design_of(spec: StudySpec, *, accept: bool = False, further: int = 0) -> Design:
     """Lay out the instances of a study and check them.
 
     Args:
         spec: The study.
         accept: Whether splits that are not apart are only noted, as for a study that is only looked at.
+        further: Rendered scenes that are added to the choice and to the judgement.
 
     Raises:
-        DynslamError: See `splits.check_splits`.
+        DynslamError: See `splits.check_splits`; or further scenes cannot be made.
     """
     accept = accept or spec.allow_overlap
-    tune, confirm = spec.instances(*spec.tune), spec.instances(*spec.confirm)
-    groups = list(scenes(tune).values())
-    if not confirm and len(groups) < ENOUGH_SCENES:
-        confirm = fresh_starts(tune)
-    elif not confirm:
-        confirm = [instance for group in groups[2::3] for instance in group]
-        tune = [instance for instance in tune if instance not in confirm]
-    held_out = spec.instances(*spec.held_out)
+    tune, confirm, held_out = (spec.instances(*texts) for texts in (spec.tune, spec.confirm, spec.held_out))
+    taken = {instance.scene for instance in (*tune, *confirm, *held_out)}
+    if not confirm:
+        rendered = {instance.scene for instance in tune if instance.sequence.startswith("synthetic/")}
+        if rendered:
+            confirm = further_scenes(tune, max(CONFIRM_SCENES, (len(rendered) + 1) // 2), taken, TUNE_SCENES)
+        confirm += stretches_behind(tune, spec.data_root)
+    if further:
+        taken |= {instance.scene for instance in confirm}
+        confirm += further_scenes(confirm, further, taken, TUNE_SCENES)
+        held_out += further_scenes(held_out, further, taken, HELD_OUT_SCENES) if held_out else []
     splits: dict[Split, list[ProblemInstance]] = {"tune": tune, "confirm": confirm, "held_out": held_out}
     notes = check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
-    taken = {instance.scene for instance in (*tune, *confirm, *held_out)}
     recorded = _recordings(spec, taken) if spec.recorded is None else spec.instances(*spec.recorded)
     if spec.recorded:
         splits = {"tune": [*tune, *confirm], "held_out": recorded}
@@ -99,32 +101,15 @@ def running_order(instances: PySequence[ProblemInstance], seed: int) -> list[Pro
 
 def with_more_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
     """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
-    more = []
-    for own in _places(instances).values():
-        offsets = {instance.offset for instance in own}
-        more += [replace(own[0], offset=offset) for offset in _unused(offsets, FEWEST_STARTS - len(offsets))]
-    return [*instances, *more]
-
-
-def fresh_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
-    """As many instances at each place from starts, and with seeds, that none of the instances has."""
-    fresh = []
-    for place, own in _places(instances).items():
-        offsets = _unused({instance.offset for instance in own}, len(own))
-        fresh += [replace(place, offset=offset, seed=FRESH_SEED + index) for index, offset in enumerate(offsets)]
-    return fresh
-
-
-def _places(instances: Iterable[ProblemInstance]) -> dict[ProblemInstance, list[ProblemInstance]]:
     places: dict[ProblemInstance, list[ProblemInstance]] = {}
     for instance in instances:
         places.setdefault(place_of(instance), []).append(instance)
-    return places
-
-
-def _unused(used: set[int], count: int) -> list[int]:
-    """The first `count` offsets that are not used."""
-    return list(islice((offset for offset in itertools.count() if offset not in used), max(count, 0)))
+    more = []
+    for repeats in places.values():
+        used = {instance.offset for instance in repeats}
+        unused = (offset for offset in itertools.count() if offset not in used)
+        more += [replace(repeats[0], offset=offset) for offset in islice(unused, max(FEWEST_STARTS - len(used), 0))]
+    return [*instances, *more]
 
 
 def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
@@ -155,8 +140,8 @@ def check_splits(
 
     Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
     a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other file
-    names, other stamps or other image files (`same_recording`). `tune` and `confirm` may share a scene, but no frames
-    from the same start. A sequence that the catalogue, or its scene, gives to one split must not stand in the other.
+    names, other stamps or other image files (`same_recording`). `tune` and `confirm` may share a recording, but no
+    frame. A sequence that the catalogue, or its scene, gives to one split must not stand in the other.
 
     Args:
         name: Of the study.
@@ -177,7 +162,7 @@ def check_splits(
     judged = dict.fromkeys(instance.sequence for instance in held_out)
     opened: dict[str, Any] = {name: open_sequence(name, data_root=data_root) for name in (*tuned, *judged)}
     for instances in (tune, held_out):
-        _check_repeats(instances, opened)
+        _check_repeats(instances, opened, apart=set(splits.get("confirm", ())))
     scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
@@ -192,8 +177,10 @@ def check_splits(
     return faults
 
 
-def _check_repeats(instances: PySequence[ProblemInstance], opened: Mapping[str, Any]) -> None:
-    """Within a split, instances of one scene are repeats of the same frames or share no frame."""
+def _check_repeats(
+    instances: PySequence[ProblemInstance], opened: Mapping[str, Any], apart: set[ProblemInstance]
+) -> None:
+    """Instances of one scene are repeats of the same frames or share none; those in `apart` share none with others."""
     parts: dict[ProblemInstance, Part] = {}
     for instance in instances:
         if instance in parts:
@@ -205,7 +192,8 @@ def _check_repeats(instances: PySequence[ProblemInstance], opened: Mapping[str, 
         if (here.block, here.noise, _drawn(one)) == (there.block, there.noise, _drawn(other)):
             raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
         shared = min(here.stop, there.stop) - max(here.start, there.start)
-        if (here.start, here.stop) != (there.start, there.stop) and shared > 0:
+        repeats = (here.start, here.stop) == (there.start, there.stop) and (one in apart) == (other in apart)
+        if shared > 0 and not repeats:
             raise StudyError(f"'{one}' and '{other}' share {shared} frames", "write instances of a sequence apart")
 
 

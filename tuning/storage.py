@@ -21,8 +21,9 @@ from optuna.storages.journal import JournalFileBackend
 from sqlalchemy.exc import DBAPIError
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.reading import read_json
 from dynslam_bench.core.sanitise import HIDDEN, without_passwords
-from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.study_file import StudySpec, make_spec
 
 SCHEMES = ("sqlite", "postgresql", "mysql", "mariadb", "oracle", "mssql", "grpc")
 """SQL databases (also with a driver: ``postgresql+psycopg``) and Optuna's gRPC proxy. They hold data, never code;
@@ -64,6 +65,21 @@ def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
         line = (str(error).strip() or type(error).__name__).splitlines()[0]
         text = without_password(f"cannot open the storage {spec.storage or folder}: {line}", spec.storage)
         raise StudyError(text, "check the address and the permissions") from None
+
+
+SPEC_FILE = "study.json"
+
+
+def read_stored(folder: Path) -> tuple[StudySpec, Path]:
+    """The study that lies in a folder, and the results folder that it lies in.
+
+    Raises:
+        StudyError: There is none.
+    """
+    stored = folder / SPEC_FILE
+    if not stored.is_file():
+        raise StudyError(f"{folder} holds no study: it has no {SPEC_FILE}", "name results/studies/NAME")
+    return make_spec(read_json(stored, kind=StudyError), str(stored)), folder.absolute().parents[1]
 
 
 def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:

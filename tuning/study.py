@@ -1,4 +1,4 @@
-"""Studies: run one from Python with custom objectives, samplers and callbacks, open a stored one, run its stages."""
+"""Studies from Python: run one with custom objectives, samplers and callbacks, trial by trial, or open a stored one."""
 
 from __future__ import annotations
 
@@ -10,26 +10,22 @@ import optuna
 from optuna.trial import FrozenTrial
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.reading import read_json
 from dynslam_bench.core.settings import Scalar
-from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning.final_runs import finish
 from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.objectives import Cost, Objective, find_objective, own_objective
 from dynslam_bench.tuning.page import write_page
-from dynslam_bench.tuning.preliminary import SCREENED_INSTANCES, Pilot, Screening, begin, pilot_of, screen_study
-from dynslam_bench.tuning.space import starting_point
-from dynslam_bench.tuning.storage import load_study
+from dynslam_bench.tuning.plan import Preview
+from dynslam_bench.tuning.storage import load_study, read_stored
 from dynslam_bench.tuning.study_file import StudySpec, make_spec, read_study
 from dynslam_bench.tuning.summary import StudySummary
 from dynslam_bench.tuning.trials import trials_frame
-from dynslam_bench.tuning.tuner import OnEvent, OnRun, StudyEvent, Tuner
+from dynslam_bench.tuning.tuner import Evaluation, OnEvent, OnRun, StudyEvent, Tuner
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-_SPEC_FILE = "study.json"
 Callback = Callable[[optuna.Study, FrozenTrial], object]
 """Called after each trial, as Optuna's own."""
 
@@ -47,7 +43,6 @@ class Study:
             `evaluate.Outcome` to a cost above 0, one or several.
         sampler: Any of Optuna's, in place of the spec's.
         callbacks: Called with Optuna's study and the trial after each trial.
-        start: Presets (TOML files, or settings by dotted name) that are tried right after the default.
         **fields: Fields of `StudySpec`, in place of the spec's; `tune`, `confirm` and `held_out` take instances, too.
 
     Attributes:
@@ -55,7 +50,7 @@ class Study:
         study: Optuna's study.
 
     Raises:
-        DynslamError: See `Tuner`; or a preset holds settings that the study neither tunes nor has.
+        DynslamError: See `Tuner`.
     """
 
     spec: StudySpec
@@ -70,7 +65,6 @@ class Study:
         objective: str | Cost | Sequence[str | Cost] | None = None,
         sampler: optuna.samplers.BaseSampler | None = None,
         callbacks: Iterable[Callback] = (),
-        start: Iterable[Path | str | Mapping[str, Scalar]] = (),
         **fields: Any,
     ) -> None:
         base = read_study(spec) if isinstance(spec, Path | str) else spec
@@ -83,9 +77,6 @@ class Study:
         self._tuner = tuner = Tuner(self.spec, results, objectives=objectives, sampler=sampler)
         self.study = tuner.study
         self._callbacks = tuple(callbacks)
-        for preset in start:
-            settings = preset if isinstance(preset, Mapping) else read_settings(Path(preset))
-            tuner.study.enqueue_trial(starting_point(settings, tuner.space, tuner.base), skip_if_exists=True)
 
     @classmethod
     def open(cls, study: StudySpec | Path | str, results: Path | str = "results") -> Study:
@@ -98,22 +89,44 @@ class Study:
         Raises:
             StudyError: There is no such study.
         """
-        spec, root = _spec_of(study, Path(results))
-        opened = cls.__new__(cls)
-        opened.study = load_study(root, spec)
-        opened.spec, opened._tuner = spec, None
+        opened, root = cls.__new__(cls), Path(results)
+        if isinstance(study, StudySpec):
+            opened.spec = study
+        elif (path := Path(study).expanduser()).is_dir():
+            opened.spec, root = read_stored(path)
+        else:
+            opened.spec = read_study(path)
+        opened.study, opened._tuner = load_study(root, opened.spec), None
         return opened
 
+    def preview(self, *, jobs: int = 1) -> Preview:
+        """What the study could show and how long it takes; see `plan.Plan.preview`."""
+        return self._running().preview(jobs)
+
     def run(self, *, jobs: int = 1) -> Study:
-        """Run the trials that are missing; a pilot first, if the study is new and asks for one.
+        """Run the trials that are missing.
 
         Raises:
-            StudyError: The default settings fail, the pilot shows that the study could find nothing, or it was opened
-                to be looked at.
+            StudyError: The baseline fails, or the study was opened to be looked at.
         """
-        tuner = self._running()
-        begin(tuner, jobs=jobs)
-        tuner.run(jobs=jobs, on_event=self._call_back)
+        self._running().run(jobs=jobs, on_event=self._call_back)
+        return self
+
+    def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
+        """The next trial, as the sampler proposes it; see `Tuner.ask`."""
+        return self._running().ask(settings)
+
+    def evaluate(self, trial: optuna.Trial) -> Evaluation:
+        """Run a trial; see `Tuner.run_trial`."""
+        return self._running().run_trial(trial)
+
+    def tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
+        """Store what a trial came to."""
+        self._running().tell(trial, evaluation)
+
+    def extend(self, *, scenes: int = 0, trials: int = 0) -> Study:
+        """Ask for more rendered scenes to judge on and for more trials; `run` and `finish` then go on."""
+        self._running().extend(scenes=scenes, trials=trials)
         return self
 
     def finish(self, *, jobs: int = 1) -> StudySummary:
@@ -122,14 +135,6 @@ class Study:
         summary = finish(tuner, jobs=jobs)
         write_page(tuner, summary)
         return summary
-
-    def pilot(self, *, jobs: int = 1) -> Pilot:
-        """What the study's instances could show; see `pilot_of`."""
-        return pilot_of(self._running(), jobs=jobs)
-
-    def screen(self, *, points: int = 2, instances: int = SCREENED_INSTANCES, jobs: int = 1) -> Screening:
-        """Which settings matter; see `screen_study`."""
-        return screen_study(self._running(), points=points, instances=instances, jobs=jobs)
 
     def frame(self) -> pd.DataFrame:
         """All trials; see `trials.trials_frame`.
@@ -162,22 +167,10 @@ def _objectives(given: str | Cost | Sequence[str | Cost] | None) -> list[Objecti
 
 
 def _texts(value: Any) -> Any:
-    """Instances as the texts that name them; any other value as it is."""
-    values = value if isinstance(value, list | tuple) else [value]
-    return tuple(map(str, values)) if any(isinstance(item, ProblemInstance) for item in values) else value
-
-
-def _spec_of(study: StudySpec | Path | str, results: Path) -> tuple[StudySpec, Path]:
-    """The study and the results folder that it lies in."""
-    if isinstance(study, StudySpec):
-        return study, results
-    path = Path(study).expanduser()
-    stored = path / _SPEC_FILE
-    if stored.is_file():
-        return make_spec(read_json(stored, kind=StudyError), str(stored)), path.absolute().parents[1]
-    if path.is_dir():
-        raise StudyError(f"{path} holds no study: it has no {_SPEC_FILE}", "name results/studies/NAME")
-    return read_study(path), results
+    """Instances and paths as the texts that name them; any other value as it is."""
+    if isinstance(value, list | tuple):
+        return tuple(map(_texts, value))
+    return str(value) if isinstance(value, ProblemInstance | Path) else value
 
 
 def run_study(
@@ -185,15 +178,19 @@ def run_study(
     *,
     results: str | Path = "results",
     jobs: int = 1,
+    scenes: int = 0,
+    trials: int = 0,
     on_event: OnEvent | None = None,
     on_run: OnRun | None = None,
 ) -> Tuner:
-    """Run a study to its end, or go on with it; a pilot runs first where the study asks for one.
+    """Run a study to its end, or go on with it.
 
     Args:
         spec: The study.
         results: The results folder; the study's own files lie in ``studies/<name>``.
         jobs: Trials at a time.
+        scenes: Rendered scenes to add to those that choose and judge.
+        trials: Trials to add.
         on_event: Called with every event.
         on_run: Called with every event of every run, those of `finish` included.
 
@@ -201,10 +198,14 @@ def run_study(
         The study, for `finish`.
 
     Raises:
-        DynslamError: See `Tuner`; or the pilot shows that the study could find nothing.
+        DynslamError: See `Tuner`.
     """
     tuner = Tuner(spec, results)
+    if scenes or trials:
+        tuner.extend(scenes=scenes, trials=trials)
     tuner.on_run = on_run
-    begin(tuner, jobs=jobs, on_event=on_event)
+    if on_event is not None and not tuner.study.get_trials(deepcopy=False)[1:]:
+        for line in tuner.preview(jobs).lines:
+            on_event(StudyEvent("preview", 0, tuner.trials, line))
     tuner.run(jobs=jobs, on_event=on_event)
     return tuner

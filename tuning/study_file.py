@@ -40,28 +40,31 @@ class StudySpec(Record, frozen=True):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
+        baseline: What ratios are to: empty for the tracker's default settings, a preset (a TOML file), on which trials
+            then build, or another tracker with its default settings.
+        start: What a new study tries right after its baseline: presets (TOML files, or settings by dotted name), and
+            the best trials of earlier studies (``results/studies/NAME``), whose trials the sampler learns from.
         tune: Instances that trials run on, written as `instances.parse_instances` reads them:
             ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
-        confirm: Instances that no trial runs on. The best trials are judged again on them, and one is chosen. Empty for
-            a third of the scenes of `tune`, or for other starts in them where they are fewer than twelve.
+        confirm: Instances without a frame of `tune`. The best trials are judged again on them, and one is chosen. Empty
+            for further scenes of rendered sequences, and for the frames behind the named part of a recording.
         held_out: Instances that decide at the end whether tuning helped; neither trials nor the choice see them.
         recorded: Instances of recordings that the choice must not be worse on; None for the first frames of a held-out
             recording where one is present.
         space: Which settings are tuned.
         allow_overlap: Accept splits that share content, or sequences that the catalogue or their scene gives to the
             other split; every table of the study then says so.
-        objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the default settings (its logarithm is
+        objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the baseline (its logarithm is
             minimised, see `objectives.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
             the worst quarter of the scenes; ``robustness``: ATE on the degraded instances; ``coverage``: share of lost
             frames.
         ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
             ATE ratio must lie below 1 + this.
-        pilot: Whether a pilot runs first and refuses a study that could show nothing.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
         seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that draws nothing from it.
         offsets: Start offsets of the instances that name none: so many leading frames are left out.
-        trials: Finished trials, trial 0 (the default settings) included.
+        trials: Finished trials, trial 0 (the baseline's settings) included.
         timeout_s: No trial begins after this many seconds; None for no limit.
         top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
@@ -79,6 +82,8 @@ class StudySpec(Record, frozen=True):
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)
     tracker: str = "emfoa-oft"
+    baseline: str = ""
+    start: tuple[str | dict[str, Any], ...] = ()
     tune: tuple[str, ...] = Field(min_length=1)
     confirm: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
@@ -87,14 +92,13 @@ class StudySpec(Record, frozen=True):
     space: SpaceSpec = SpaceSpec()
     objectives: tuple[str, ...] = Field(default=("accuracy",), min_length=1)
     ate_margin: float = Field(default=0.05, gt=0, le=1)
-    pilot: bool = True
     min_coverage: float | None = Field(default=0.95, ge=0, le=1)
     min_fps: float | None = Field(default=None, gt=0)
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     offsets: tuple[Offset, ...] = Field(default=(0, 3), min_length=1)
     trials: int = Field(default=40, ge=2)
     timeout_s: float | None = Field(default=None, gt=0)
-    top: int = Field(default=3, ge=1)
+    top: int = Field(default=2, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0
     pruner: PrunerName = "halving"

@@ -1,15 +1,28 @@
-"""The result of a study: ratios to the default with their intervals, the choice, the conclusion, the picks."""
+"""The result of a study: ratios to the baseline with their intervals, the choice, the verdict, the picks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import Any, Literal, get_args
 
+import numpy as np
 from pydantic import Field
 
 from dynslam_bench.core.records import Record
-from dynslam_bench.tuning.objectives import ACCURACY, FEWEST_SCENES, Objective, Outcomes, bounds, centre, upper
+from dynslam_bench.tuning.objectives import (
+    ACCURACY,
+    FEWEST_SCENES,
+    MATTER_LEVEL,
+    Objective,
+    Outcomes,
+    bounds,
+    centre,
+    scenes_needed,
+    upper,
+)
+from dynslam_bench.tuning.trials import Importance
 
 _LARGEST_LOG = 700.0
 """Larger logarithms overflow."""
@@ -18,16 +31,17 @@ FALSE_CHOICES = 0.05
 
 
 class Ratio(Record):
-    """A ratio to the default settings, of the ATE or whatever a study is after, with its 95 % interval.
+    """A ratio to the baseline, of the ATE or whatever a study is after, with its 95 % interval.
 
     Attributes:
-        ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the default.
+        ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the baseline.
         low: Lower end of the interval over scenes (`objectives.bounds`); below three scenes over starts, which tells
             nothing of other scenes. None for a single run.
         high: Upper end.
         n: Paired runs.
         sequences: How many scenes they come from.
         bound: One-sided upper bound, wide enough for the number of candidates compared; None for a single run.
+        spread: Standard deviation of the logarithm over what the interval is over; None for a single run.
         what: What the ratio is one of.
     """
 
@@ -37,6 +51,7 @@ class Ratio(Record):
     n: int
     sequences: int
     bound: float | None = None
+    spread: float | None = None
     what: str = "ATE"
 
     @property
@@ -50,6 +65,11 @@ class Ratio(Record):
         return self.low is not None and self.low > 1 and self.sequences >= FEWEST_SCENES
 
     @property
+    def missing(self) -> int:
+        """How many more scenes would show a gain as large as this one in four of five studies; at least one."""
+        return max(1, scenes_needed(1 - self.ratio, self.spread or 0.0) - self.sequences)
+
+    @property
     def interval(self) -> str:
         """The interval in brackets; empty without one."""
         return "" if self.low is None or self.high is None else f"[{self.low:.3f}, {self.high:.3f}]"
@@ -58,17 +78,17 @@ class Ratio(Record):
         return f"{self.what} x {self.ratio:.3f} {self.interval or 'without an interval'}"
 
 
-def compared(outcomes: Outcomes, default: Outcomes, *, objective: Objective = ACCURACY, candidates: int = 1) -> Ratio:
-    """A configuration beside the default on the same instances.
+def compared(outcomes: Outcomes, baseline: Outcomes, *, objective: Objective = ACCURACY, candidates: int = 1) -> Ratio:
+    """A configuration beside the baseline on the same instances.
 
     Args:
         outcomes: Of the configuration.
-        default: Of the default settings.
+        baseline: Of the baseline.
         objective: What is compared.
         candidates: How many configurations are compared for one choice; the bound allows for all of them (Bonferroni).
     """
-    scenes = objective.ratios(outcomes, default)
-    sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, default)
+    scenes = objective.ratios(outcomes, baseline)
+    sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, baseline)
     sample = objective.counted(sample)
     interval = bounds(sample)
     return Ratio(
@@ -76,6 +96,7 @@ def compared(outcomes: Outcomes, default: Outcomes, *, objective: Objective = AC
         low=None if interval is None else _ratio(interval[0]),
         high=None if interval is None else _ratio(interval[1]),
         bound=None if interval is None else _ratio(upper(sample, 1 - FALSE_CHOICES / candidates)),
+        spread=None if interval is None else float(np.std(sample, ddof=1)),
         n=len(outcomes),
         sequences=len(scenes),
         what=objective.what,
@@ -86,7 +107,17 @@ def _ratio(logarithm: float) -> float:
     return math.exp(min(logarithm, _LARGEST_LOG))
 
 
-# The summary of a study and its conclusion.
+# The summary of a study and its verdict.
+
+
+class Verdict(str, Enum):
+    """What a study says of its best candidate."""
+
+    PROVEN = "proven"
+    PROMISING = "promising"
+    NO_MATTER = "does not matter here"
+    WORSE = "worse"
+    NOT_JUDGED = "not judged"
 
 
 class Candidate(Record):
@@ -97,13 +128,13 @@ class Candidate(Record):
         params: The tuned settings.
         values: What its trial had been worth.
         confirm: On the instances for the choice, which no trial had seen.
-        held_out: On the held-out split; None without one, or if it was not chosen.
-        recorded: ATE on recordings; None without any, or if it was not chosen.
+        held_out: On the held-out split; None without one, or if it is neither the best nor a pick.
+        recorded: ATE on recordings; None without any, or if it is neither the best nor a pick.
         on_confirm: ATE and processor time on the instances for the choice, by objective.
         on_held_out: The same on the held-out split.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of errors.
         frame_ms: Mean milliseconds a frame, timed without the stage cache.
-        default_frame_ms: The same of the default settings.
+        baseline_frame_ms: The same of the baseline.
         feasible: Whether the constraints hold in the new runs.
         failed: Why it could not be run again; empty if it could.
     """
@@ -118,7 +149,7 @@ class Candidate(Record):
     on_held_out: dict[str, Ratio] = Field(default_factory=dict)
     ate_margin: float | None = None
     frame_ms: float | None = None
-    default_frame_ms: float | None = None
+    baseline_frame_ms: float | None = None
     feasible: bool = True
     failed: str = ""
 
@@ -127,20 +158,25 @@ class Candidate(Record):
         """Upper confidence bound of its ratio; infinite if it cannot be chosen."""
         return _bound(self.confirm) if self.feasible and self.nothing_lost(self.on_confirm) else math.inf
 
+    @property
+    def chosen(self) -> bool:
+        """Whether it is surely better than the baseline on the instances of the choice."""
+        return self.bound < 1
+
+    @property
+    def evidence(self) -> Ratio | None:
+        """Its ratio on scenes that neither trials nor choice saw, or else on those of the choice; None without any."""
+        held = self.held_out
+        return held if held is not None and held.sequences >= FEWEST_SCENES else self.confirm
+
     def nothing_lost(self, ratios: Mapping[str, Ratio]) -> bool:
-        """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the default, if that is asked."""
+        """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the baseline, if that is asked."""
         return self.ate_margin is None or _bound(ratios.get("accuracy")) < 1 + self.ate_margin
 
     @property
     def worse_on_recordings(self) -> bool:
         """Whether the whole interval on the recordings, over starts if need be, lies above 1."""
         return self.recorded is not None and self.recorded.low is not None and self.recorded.low > 1
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Whether it beats the default on the held-out split and is not worse on recordings."""
-        gain = self.held_out is not None and self.held_out.shows_gain
-        return self.feasible and gain and self.nothing_lost(self.on_held_out) and not self.worse_on_recordings
 
 
 class StudySummary(Record):
@@ -149,32 +185,35 @@ class StudySummary(Record):
     Attributes:
         name: The study.
         tracker: The tracker.
+        baseline: What ratios are to, in words.
         protocol: Description of the protocol.
         trials: Trials by state.
-        candidates: The best configurations, judged again; the chosen one first.
-        chosen: Number of the trial whose settings became the preset; None if the default was chosen.
-        improves: Whether the chosen settings beat the default on the held-out split (the whole interval below 1), are
-            not worse on recordings, and the splits are apart.
-        conclusion: One sentence, see `conclude`.
+        candidates: The best configurations, judged again; the best one, whose settings became the preset, first.
+        verdict: What the study says of the best candidate.
+        conclusion: One sentence, see `judge`.
+        p_value: Of the test whether the settings matter at all (`objectives.spread_test`); None without a test.
+        shipped: The default settings, where the baseline is something else, on ``confirm`` and ``held_out``.
         importances: Optuna's importances of the parameters, see `trials.importances`.
         tune: The instances that trials ran on.
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
-        picks: Presets of the study by name, and the trial of each; None where the default is the pick.
+        picks: Presets of the study by name, and the trial of each; None where the baseline is the pick.
         split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
         seen: Splits with scenes that the network behind the masks was trained on, see `splits.seen_note`.
     """
 
     name: str
     tracker: str
+    baseline: str
     protocol: str
     trials: dict[str, int]
     candidates: list[Candidate]
-    chosen: int | None
-    improves: bool
+    verdict: Verdict
     conclusion: str
-    importances: dict[str, float] = Field(default_factory=dict)
+    p_value: float | None = None
+    shipped: dict[str, Ratio] = Field(default_factory=dict)
+    importances: dict[str, Importance] = Field(default_factory=dict)
     tune: list[str] = Field(default_factory=list)
     confirm: list[str] = Field(default_factory=list)
     held_out: list[str] = Field(default_factory=list)
@@ -183,83 +222,80 @@ class StudySummary(Record):
     split_notes: list[str] = Field(default_factory=list)
     seen: list[str] = Field(default_factory=list)
 
-
-def choose(candidates: Sequence[Candidate]) -> Candidate | None:
-    """The candidate with the smallest upper bound of its ratio; None, the default, where no bound lies below 1."""
-    best = min(candidates, key=lambda candidate: candidate.bound, default=None)
-    return best if best is not None and best.bound < 1 else None
-
-
-def conclude(candidates: Sequence[Candidate], chosen: int | None, split_notes: Sequence[str]) -> str:
-    """One sentence: better or not on the held-out split, by how much, how sure, and whether to keep the default."""
-    candidate = next((candidate for candidate in candidates if candidate.trial == chosen), None)
-    text = _nothing_chosen(candidates) if candidate is None else _judged(candidate, bool(split_notes))
-    return text + _apart(split_notes)
+    @property
+    def best(self) -> Candidate | None:
+        """The best candidate; None if no trial with other settings came to its end."""
+        return self.candidates[0] if self.candidates else None
 
 
-def _nothing_chosen(candidates: Sequence[Candidate]) -> str:
-    """Why the default was chosen."""
+def judge(
+    candidates: Sequence[Candidate], p_value: float | None = None, split_notes: Sequence[str] = ()
+) -> tuple[Verdict, str]:
+    """The verdict on the first, best candidate, and one sentence with its numbers.
+
+    *Proven*: it was chosen, the whole interval on held-out scenes lies below 1, nothing is lost of accuracy where that
+    is asked, recordings are not worse and the splits are apart. *Worse*: an interval lies above 1, a constraint fails,
+    or the settings matter and the estimate is not below 1. *Does not matter here*: see `objectives.spread_test`.
+    *Promising* is what is left.
+
+    Args:
+        candidates: The best one first.
+        p_value: Of `objectives.spread_test`.
+        split_notes: How the splits are not apart, where the study accepts that.
+    """
+    verdict, text = _judged(candidates, p_value, split_notes)
+    return verdict, f"{verdict.value.capitalize()}: {text}.{_apart(split_notes)}"
+
+
+def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes: Sequence[str]) -> tuple[Verdict, str]:
     if not candidates:
-        return "Keep the default: no trial with other settings came to its end."
-    judged = [candidate for candidate in candidates if candidate.confirm is not None]
-    feasible = [candidate for candidate in judged if candidate.feasible]
-    if not judged:
-        return f"Keep the default: trial {candidates[0].trial} failed when run again: {candidates[0].failed}."
-    if not feasible:
-        return f"Keep the default: trial {judged[0].trial} violates a constraint when run again, as do all that were."
-    if not any(candidate.nothing_lost(candidate.on_confirm) for candidate in feasible):
-        best = min(feasible, key=lambda candidate: _bound(candidate.on_confirm["accuracy"]))
-        ate = best.on_confirm["accuracy"]
-        return (
-            f"Keep the default: no trial is shown to be as accurate on {ate.n} runs that none had seen (trial "
-            f"{best.trial}: {best.confirm}, but {ate}, upper bound {_bound(ate):.3f}, which has to lie below "
-            f"{1 + (best.ate_margin or 0.0):.2f})."
+        return Verdict.NOT_JUDGED, "no trial with other settings came to its end"
+    best = candidates[0]
+    name, ratio = f"trial {best.trial}", best.evidence
+    if best.failed:
+        return Verdict.NOT_JUDGED, f"{name} failed when it was run again: {best.failed}"
+    if ratio is None or best.confirm is None:
+        return Verdict.NOT_JUDGED, f"no frames are left to confirm {name} on; name some as confirm"
+    if ratio.sequences < FEWEST_SCENES:
+        return Verdict.NOT_JUDGED, f"{name} has {ratio} on {_scenes(ratio)} only, and {FEWEST_SCENES} are the fewest"
+    numbers = f"{ratio} on {_scenes(ratio)} that no trial saw"
+    numbers += f" (where it was chosen {', '.join(map(str, best.on_confirm.values()))})" if best.ate_margin else ""
+    if not best.feasible:
+        return Verdict.WORSE, f"{name} violates a constraint when it is run again ({numbers})"
+    if best.worse_on_recordings:
+        return Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"
+    if ratio.shows_loss:
+        return Verdict.WORSE, f"{name} has {100 * (ratio.ratio - 1):.1f} % more {ratio.what}: {numbers}"
+    gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}"
+    unsettled = _unsettled(best, split_notes)
+    if not unsettled:
+        return Verdict.PROVEN, f"{name} has {gain}: {numbers}"
+    if p_value is not None and p_value > MATTER_LEVEL and not best.chosen and not ratio.shows_gain:
+        return Verdict.NO_MATTER, (
+            f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}); the best, "
+            f"{name}, has {numbers}"
         )
-    best = min(feasible, key=lambda candidate: candidate.bound)
-    assert best.confirm is not None
-    many = f"none of the {len(judged)} best trials is" if len(judged) > 1 else "the best trial is not"
-    return (
-        f"Keep the default: {many} confirmed on {best.confirm.n} runs that no trial had seen (trial {best.trial}: "
-        f"{best.confirm}, upper bound {_bound(best.confirm):.3f})."
-    )
+    if ratio.ratio >= 1:
+        return Verdict.WORSE, f"the settings matter, but the best, {name}, is not better than the baseline: {numbers}"
+    more = f"about {ratio.missing} more scene{'s' * (ratio.missing != 1)} would settle it"
+    return Verdict.PROMISING, f"{name} has perhaps {gain}: {numbers}; {unsettled}, {more}"
 
 
-def _judged(chosen: Candidate, overlapping: bool) -> str:
-    """What the held-out split and the recordings say of the choice."""
-    if chosen.failed:
-        return f"Keep the default: trial {chosen.trial} was chosen, but failed when it was judged: {chosen.failed}."
-    held, confirm = chosen.held_out, chosen.confirm
-    if held is None:
-        return (
-            f"Not judged, keep the default: no held-out split was given, and what trial {chosen.trial} reaches on the "
-            f"instances that it was chosen on ({confirm}) says nothing about others."
-        )
-    on = f"on {held.sequences} held-out scene{'s' * (held.sequences != 1)}"
-    details = f"where it was chosen: {confirm}"
-    if held.sequences < FEWEST_SCENES:
-        return f"Not judged, keep the default: {held} {on} only, from which nothing follows for others ({details})."
-    sure = "95 % interval over scenes" + (", rough below five" if held.sequences < 5 else "")
-    if chosen.worse_on_recordings:
-        return f"Worse on recordings, keep the default: {chosen.recorded} there ({on}: {held}, {sure})."
-    if held.shows_loss and chosen.nothing_lost(chosen.on_held_out):
-        more = f"{100 * (held.ratio - 1):.1f} % more {held.what}"
-        return f"Worse, keep the default: {more} {on} ({held}, {sure}; {details})."
-    if chosen.ate_margin is not None and "accuracy" in chosen.on_held_out:
-        details += f"; {chosen.on_held_out['accuracy']}"
-    if chosen.recorded is not None:
-        details += f"; recorded: {chosen.recorded}"
-    if not chosen.nothing_lost(chosen.on_held_out):
-        limit = 1 + (chosen.ate_margin or 0)
-        return (
-            f"Not better, keep the default: {held} {on}, but not shown to be as accurate: the upper bound has to lie "
-            f"below {limit:.2f} ({details})."
-        )
-    if held.shows_gain and not overlapping:
-        return (
-            f"Better: trial {chosen.trial} has {100 * (1 - held.ratio):.1f} % less {held.what} {on} ({held}, {sure}; "
-            f"{details}), so its settings may replace the default there."
-        )
-    return f"Not better, keep the default: {held} {on} shows no gain ({sure}; {details})."
+def _unsettled(best: Candidate, split_notes: Sequence[str]) -> str:
+    """Why the best candidate is not proven; empty if it is."""
+    if split_notes:
+        return "the splits are not apart"
+    if not best.nothing_lost(best.on_confirm) or not best.nothing_lost(best.on_held_out or best.on_confirm):
+        return f"it is not shown to be as accurate (the bound has to lie below {1 + (best.ate_margin or 0.0):.2f})"
+    if not best.chosen:
+        return f"its upper bound {_bound(best.confirm):.3f} where it was chosen is not below 1"
+    if best.held_out is None or best.held_out.sequences < FEWEST_SCENES:
+        return f"fewer than {FEWEST_SCENES} held-out scenes were given to prove it on"
+    return "" if best.held_out.shows_gain else "the interval is not below 1"
+
+
+def _scenes(ratio: Ratio) -> str:
+    return f"{ratio.sequences} scene{'s' * (ratio.sequences != 1)}"
 
 
 def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) -> str:
@@ -267,11 +303,11 @@ def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) ->
 
     Args:
         name: Of the preset.
-        candidate: Whose settings it holds, judged; None for the default's.
+        candidate: Whose settings it holds, judged; None for the baseline's.
         split_notes: How the splits are not apart, where the study accepts that.
     """
     if candidate is None:
-        return f"The '{name}' pick is the default: no trial was surely better than it."
+        return f"The '{name}' pick is the baseline: no trial was surely better than it."
     parts = [
         f"{split}: {ratios['accuracy']}, {ratios['speed']}"
         for split, ratios in (("where it was chosen", candidate.on_confirm), ("held out", candidate.on_held_out))
@@ -295,11 +331,11 @@ PICKS: tuple[PickName, ...] = get_args(PickName)
 
 
 def pick(name: PickName, candidates: Sequence[Candidate], margin: float) -> Candidate | None:
-    """A study's pick; None stands for the default.
+    """A study's pick; None stands for the baseline.
 
     Args:
-        name: ``fast``: the least processor time at (nearly) the default's accuracy; ``accurate``: the least ATE;
-            ``balanced``: the least of the study's objectives together, at (nearly) the default's accuracy.
+        name: ``fast``: the least processor time at (nearly) the baseline's accuracy; ``accurate``: the least ATE;
+            ``balanced``: the least of the study's objectives together, at (nearly) the baseline's accuracy.
         candidates: The trials to choose from, feasible ones.
         margin: What may be lost of accuracy, as a share.
     """

@@ -1,4 +1,4 @@
-"""Running a study: trial 0 is the default, trials run on growing sets of instances, everything resumes."""
+"""Running a study: trial 0 is the baseline, trials run on growing sets of instances, everything resumes."""
 
 from __future__ import annotations
 
@@ -17,31 +17,35 @@ from pathlib import Path
 from typing import Any, Literal
 
 import optuna
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.records import digest, write_atomic
 from dynslam_bench.core.sanitise import storable, words_without_passwords
-from dynslam_bench.core.settings import apply_overrides, flatten
-from dynslam_bench.runs import RunEvent, RunStore
+from dynslam_bench.core.settings import Scalar
+from dynslam_bench.core.toml import read_settings
+from dynslam_bench.runs import RunEvent
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.record import program_of
-from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning.evaluate import CancelledError, InstanceFailedError, Outcome, evaluate
+from dynslam_bench.tuning.evaluate import CancelledError, Configuration, InstanceFailedError, Outcome, evaluate
 from dynslam_bench.tuning.instances import ProblemInstance
-from dynslam_bench.tuning.objectives import Objective, Outcomes, coverage, find_objective, fps, violations
+from dynslam_bench.tuning.objectives import Objective, Outcomes, coverage, fps, together, violations
+from dynslam_bench.tuning.plan import Plan
 from dynslam_bench.tuning.samplers import build_pruner, build_sampler, is_dominated, step_name, steps
-from dynslam_bench.tuning.space import distributions, search_space
+from dynslam_bench.tuning.space import distributions, starting_point
 from dynslam_bench.tuning.splits import design_of
 from dynslam_bench.tuning.storage import (
+    SPEC_FILE,
     load_study,
     open_storage,
+    read_stored,
     study_folder,
     without_password,
     worker_is_dead,
     worker_name,
 )
 from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.trials import EARLIER, best_trials
 
 CRASHED_WORKER = "worker ended in the middle of the trial"
 
@@ -51,14 +55,14 @@ class StudyEvent:
     """Something happened in a study.
 
     Attributes:
-        kind: ``pilot`` (what it found), ``reference`` (runs with the default settings), ``started`` or ``finished`` (a
+        kind: ``preview`` (what it could show), ``reference`` (runs of the baseline), ``started`` or ``finished`` (a
             trial).
         number: Of the trial.
         total: How many there are to be.
         text: One line.
     """
 
-    kind: Literal["pilot", "reference", "started", "finished"]
+    kind: Literal["preview", "reference", "started", "finished"]
     number: int
     total: int
     text: str
@@ -69,7 +73,22 @@ OnRun = Callable[[RunEvent], None]
 """Called with every event of every run of a study, possibly by several threads at a time."""
 
 
-class Tuner:
+@dataclass(frozen=True)
+class Evaluation:
+    """What a trial came to.
+
+    Attributes:
+        state: Complete, pruned or failed.
+        text: In words.
+        values: The objectives' (natural logarithms of ratios to the baseline, less is better); None if it failed.
+    """
+
+    state: TrialState
+    text: str
+    values: list[float] | None = None
+
+
+class Tuner(Plan):
     """A study that is ready to run.
 
     Args:
@@ -96,31 +115,45 @@ class Tuner:
         objectives: Sequence[Objective] | None = None,
         sampler: optuna.samplers.BaseSampler | None = None,
     ) -> None:
-        self.spec = spec
-        self.results = Path(results)
+        super().__init__(spec, results, objectives=objectives, accept=reading)
         self.reading = reading
-        self.tracker = TRACKERS.get(spec.tracker)
-        defaults = apply_overrides(self.tracker.settings(), spec.space.fixed)
-        self.space = search_space(
-            self.tracker.settings, spec.space, {instance.sequence for instance in spec.instances(*spec.tune)}
-        )
-        self.defaults, self.base = defaults, flatten(defaults)
         if spec.pruner == "wilcoxon" and len(spec.objectives) > 1:
             raise StudyError(
                 f"pruner 'wilcoxon' takes one objective, the study has {len(spec.objectives)}", "use halving or none"
             )
-        self.objectives = [find_objective(name) for name in spec.objectives] if objectives is None else list(objectives)
         sampler = build_sampler(spec) if sampler is None else sampler
-        self.design = design_of(spec, accept=reading)
         self.steps = self._comparable_steps()
-        self.store = RunStore(self.results)
         self.store.prepare()
         self.folder = study_folder(self.results, spec)
-        self.study = self._open(sampler)
+        self._identity = self._identify()
         self._lock = threading.Lock()
         self._interrupted = threading.Event()
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
+        self.study = self._open(sampler, [] if reading else list(self._beginnings()))
+        if self.extension["scenes"]:
+            self.design = design_of(spec, accept=reading, further=self.extension["scenes"])
+
+    @property
+    def extension(self) -> dict[str, int]:
+        """Scenes and trials that `extend` has added."""
+        stored: dict[str, int] = self.study.user_attrs.get("extension", {})
+        return {"scenes": 0, "trials": 0} | stored
+
+    @property
+    def trials(self) -> int:
+        """How many finished trials the study asks for."""
+        return self.spec.trials + self.extension["trials"]
+
+    def extend(self, *, scenes: int = 0, trials: int = 0) -> None:
+        """Ask for more trials, and for more rendered scenes to choose and to judge on.
+
+        Raises:
+            StudyError: So many scenes cannot be made.
+        """
+        total = {"scenes": self.extension["scenes"] + scenes, "trials": self.extension["trials"] + trials}
+        self.design = design_of(self.spec, further=total["scenes"])
+        self.study.set_user_attr("extension", total)
 
     def run(self, *, jobs: int = 1, on_event: OnEvent | None = None) -> optuna.Study:
         """Run trials until the study has as many finished ones as it asks for.
@@ -132,8 +165,7 @@ class Tuner:
             on_event: Called with every event.
 
         Raises:
-            StudyError: The default settings themselves fail on a sequence; says where and why. Or the study was opened
-                for reading.
+            StudyError: The baseline fails on a sequence; says where and why. Or the study was opened for reading.
         """
         if self.reading:
             raise StudyError(f"study '{self.spec.name}' was opened for reading")
@@ -142,7 +174,7 @@ class Tuner:
 
         def work() -> None:
             while (deadline is None or time.monotonic() < deadline) and not self._interrupted.is_set() and self._more():
-                self._one(on_event)
+                self._one(on_event or (lambda _: None))
 
         with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool, self._ending_all():
             for future in [pool.submit(work) for _ in range(jobs)]:
@@ -159,48 +191,51 @@ class Tuner:
             raise
 
     def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[ProblemInstance, Outcome]:
-        """The default settings' outcomes on the tune split, to which every trial is compared."""
-        if on_event is not None:
-            missing = len(self.design.reference) - len(self._reference)
-            on_event(StudyEvent("reference", 0, missing, "the default settings"))
-        return self.default_outcomes(self.design.reference, jobs=jobs)
-
-    def default_outcomes(
-        self, instances: Sequence[ProblemInstance], *, jobs: int = 1
-    ) -> dict[ProblemInstance, Outcome]:
-        """The default settings' outcomes on instances.
+        """The baseline's outcomes on the tune split, to which every trial is compared.
 
         Raises:
-            StudyError: The default settings fail; says where and why.
+            StudyError: The baseline fails; says where and why.
         """
-        missing = [instance for instance in instances if instance not in self._reference]
+        missing = [instance for instance in self.design.reference if instance not in self._reference]
+        if on_event is not None:
+            on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
         with self._ending_all():
             try:
-                self._reference |= self.evaluate(self.spec.space.fixed, missing, jobs=jobs)
+                self._reference |= self.evaluate(
+                    self.baseline.settings, missing, tracker=self.baseline.tracker, jobs=jobs
+                )
             except InstanceFailedError as error:
-                text = f"the default settings fail: {error.args[0]}"
-                raise StudyError(text, "a study needs a default that runs") from error
+                raise StudyError(f"the baseline fails: {error.args[0]}", "a study needs one that runs") from error
             except CancelledError as error:
                 raise StudyError("interrupted") from error
-        return {instance: self._reference[instance] for instance in instances}
+        return self._reference
 
     def evaluate(
         self,
         settings: Mapping[str, Any],
         instances: Sequence[ProblemInstance],
         *,
+        tracker: str = "",
         jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
-        """Run settings on instances as this study does; see `evaluate.evaluate`. `cache` None is the study's own."""
+        """Run settings on instances as this study does; see `evaluate.evaluate`.
+
+        Args:
+            settings: Overrides, dotted name to value.
+            instances: Where.
+            tracker: Whose; the study's if empty.
+            jobs: Runs at a time.
+            cache: Whether to use the stage cache; None for what the study says.
+        """
         return evaluate(
-            self.spec.tracker, settings, instances, results=self.store, jobs=jobs, protocol=self.spec.protocol,
-            threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
+            tracker or self.spec.tracker, settings, instances, results=self.store, jobs=jobs,
+            protocol=self.spec.protocol, threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
             data_root=self.spec.data_root, study=self.spec.name, cancelled=self._interrupted.is_set, on_run=self.on_run,
         )  # fmt: skip
 
     def evaluate_beside(
-        self, configurations: Sequence[Mapping[str, Any]], instances: Sequence[ProblemInstance], *, jobs: int = 1
+        self, configurations: Sequence[Configuration], instances: Sequence[ProblemInstance], *, jobs: int = 1
     ) -> list[dict[ProblemInstance, Outcome] | InstanceFailedError]:
         """Run configurations instance by instance, without the stage cache, so that their times can be compared.
 
@@ -215,7 +250,8 @@ class Tuner:
             result = results[number]
             if isinstance(result, dict):
                 try:
-                    result |= self.evaluate(configurations[number], [instance], cache=False)
+                    tracker, settings = configurations[number]
+                    result |= self.evaluate(settings, [instance], tracker=tracker, cache=False)
                 except InstanceFailedError as error:
                     results[number] = error
 
@@ -224,9 +260,9 @@ class Tuner:
                 future.result()
         return results
 
-    def settings_of(self, trial: FrozenTrial) -> dict[str, Any]:
-        """The overrides that a trial ran with."""
-        return {**self.spec.space.fixed, **trial.params}
+    def configuration_of(self, trial: FrozenTrial | optuna.Trial) -> Configuration:
+        """What a trial runs with."""
+        return Configuration(self.spec.tracker, {**self.held, **trial.params})
 
     def _comparable_steps(self) -> list[int]:
         """The steps at which every objective has an instance that counts."""
@@ -234,54 +270,62 @@ class Tuner:
         counted = [[objective.counts(instance) for instance in self.design.tune] for objective in self.objectives]
         return [*(step for step in early if all(any(flags[:step]) for flags in counted)), last]
 
-    def _one(self, on_event: OnEvent | None) -> None:
-        with self._lock:
-            trial = self.study.ask(distributions(self.space))
-        trial.set_user_attr("worker", worker_name())
-        if on_event is not None:
-            on_event(StudyEvent("started", trial.number, self.spec.trials, f"trial {trial.number}"))
-        values, state = None, TrialState.COMPLETE
-        try:
-            values, text = self._evaluate(trial)
-        except (optuna.TrialPruned, CancelledError, InstanceFailedError) as error:
-            state = TrialState.PRUNED if isinstance(error, optuna.TrialPruned) else TrialState.FAIL
-            text = CRASHED_WORKER if isinstance(error, CancelledError) else str(error)
-            trial.set_user_attr("reason", text)
-        with self._lock:
-            self.study.tell(trial, values, state=state)
-        if on_event is not None:
-            on_event(StudyEvent("finished", trial.number, self.spec.trials, f"trial {trial.number}: {text}"))
+    def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
+        """The next trial: the first is the baseline's, then come those that wait, then the sampler's.
 
-    def _evaluate(self, trial: optuna.Trial) -> tuple[list[float], str]:
-        """Run a trial on growing sets of instances.
-
-        Returns:
-            The objectives' values (natural logarithms of ratios to the default settings, less is better), in words too.
+        Args:
+            settings: A configuration to wait in line; what it does not say is as the baseline has it.
 
         Raises:
-            TrialPruned: It is worse than others on the instances so far.
-            InstanceFailedError: A run failed.
-            CancelledError: The study was interrupted.
+            StudyError: It sets what the study does not tune, or is out of range.
         """
+        with self._lock:
+            if settings is not None:
+                self.study.enqueue_trial(starting_point(settings, self.space, self.base))
+            trial = self.study.ask(distributions(self.space))
+        trial.set_user_attr("worker", worker_name())
+        return trial
+
+    def run_trial(self, trial: optuna.Trial) -> Evaluation:
+        """Run a trial on growing sets of instances until it ends or is pruned."""
         outcomes: dict[ProblemInstance, Outcome] = {}
-        values: list[float] = []
+        reference, values = self._reference or self.reference(), list[float]()
         for step in self.steps:
             first = len(outcomes)
-            outcomes |= self.evaluate({**self.spec.space.fixed, **trial.params}, self.design.tune[first:step])
-            values = [objective.value(outcomes, self._reference) for objective in self.objectives]
+            try:
+                outcomes |= self.evaluate(self.configuration_of(trial).settings, self.design.tune[first:step])
+            except (CancelledError, InstanceFailedError) as error:
+                text = CRASHED_WORKER if isinstance(error, CancelledError) else str(error)
+                return Evaluation(TrialState.FAIL, text)
+            values = [objective.value(outcomes, reference) for objective in self.objectives]
             trial.set_user_attr("coverage", coverage(outcomes))
             trial.set_user_attr("fps", fps(outcomes))
+            trial.set_user_attr("scenes", together(self.objectives).ratios(outcomes, reference))
             rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
             trial.set_user_attr("instances", rows)
             if self._pruned(trial, outcomes, values, first) and trial.number > 0:
-                raise optuna.TrialPruned(f"pruned after {step} of {self.steps[-1]} instances")
-        violated = violations(self.spec, outcomes, self._reference)
+                return Evaluation(TrialState.PRUNED, f"pruned after {step} of {self.steps[-1]} instances")
+        violated = violations(self.spec, outcomes, reference)
         for name, value in violated.items():
             trial.set_constraint(name, value)
         ratios = zip(self.objectives, values, strict=True)
         text = ", ".join(f"{objective.what} x {math.exp(value):.3f}" for objective, value in ratios)
         broken = [name for name, value in violated.items() if value > 0]
-        return values, text + (f", violates {' and '.join(broken)}" if broken else "")
+        return Evaluation(TrialState.COMPLETE, text + (f", violates {' and '.join(broken)}" if broken else ""), values)
+
+    def tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
+        """Store what a trial came to."""
+        if evaluation.state != TrialState.COMPLETE:
+            trial.set_user_attr("reason", evaluation.text)
+        with self._lock:
+            self.study.tell(trial, evaluation.values, state=evaluation.state)
+
+    def _one(self, on_event: OnEvent) -> None:
+        trial = self.ask()
+        on_event(StudyEvent("started", trial.number, self.trials, f"trial {trial.number}"))
+        evaluation = self.run_trial(trial)
+        self.tell(trial, evaluation)
+        on_event(StudyEvent("finished", trial.number, self.trials, f"trial {trial.number}: {evaluation.text}"))
 
     def _pruned(self, trial: optuna.Trial, outcomes: Outcomes, values: list[float], first: int) -> bool:
         """Report a trial's values and ask the pruner; `first` instances were reported before.
@@ -313,12 +357,41 @@ class Tuner:
                     with suppress(RuntimeError):  # another worker has done so meanwhile
                         self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
                         self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
-                if trial.state == TrialState.WAITING or trial.user_attrs.get("reason") == CRASHED_WORKER:
+                crashed = trial.user_attrs.get("reason") == CRASHED_WORKER
+                if trial.state == TrialState.WAITING or crashed or EARLIER in trial.user_attrs:
                     lost.add(trial.number)
-            return len(trials) - len(lost) < self.spec.trials
+            return len(trials) - len(lost) < self.trials
 
-    def _open(self, sampler: optuna.samplers.BaseSampler) -> optuna.Study:
-        """The stored study, or a new one whose first trial is the default, whatever is enqueued later."""
+    def _beginnings(self) -> Iterator[FrozenTrial | dict[str, Scalar]]:
+        """What a new study knows of earlier ones (trials), and what it tries after its baseline (settings)."""
+        for entry in self.spec.start:
+            if isinstance(entry, str) and Path(entry).expanduser().is_dir():
+                yield from self._earlier(Path(entry).expanduser())
+            else:
+                preset = read_settings(Path(entry)) if isinstance(entry, str) else entry
+                yield starting_point(preset, self.space, self.base)
+
+    def _earlier(self, folder: Path) -> Iterator[FrozenTrial | dict[str, Scalar]]:
+        """Complete trials of an earlier study, marked as such; its best ones are to be tried again."""
+        spec, results = read_stored(folder)
+        study = load_study(results, spec)
+        if spec.objectives != self.spec.objectives:
+            raise StudyError(f"the earlier study '{spec.name}' has other objectives: {', '.join(spec.objectives)}")
+        other = study.user_attrs.get("identity", {}).get("code") != self._identity["code"]
+        marks = {EARLIER: f"study {spec.name}{', other code' * other}"}
+        spans, again = distributions(self.space), {trial.number for trial in best_trials(study, self.spec.top)}
+        for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            params = {name: value for name, value in trial.params.items() if name in spans}
+            with suppress(StudyError):  # out of this study's range
+                params = starting_point(params, self.space, self.base)
+                if trial.number in again:
+                    yield params
+                yield create_trial(params=params, distributions=spans, values=trial.values, user_attrs=marks)
+
+    def _open(
+        self, sampler: optuna.samplers.BaseSampler, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]
+    ) -> optuna.Study:
+        """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.spec.pruner)}
         if self.reading:
@@ -327,7 +400,7 @@ class Tuner:
             how |= {"storage": open_storage(self.results, self.spec), "study_name": self.spec.name}
             try:
                 study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
-                self._begin(study)
+                self._begin(study, beginnings)
             except optuna.exceptions.DuplicatedStudyError:
                 study = optuna.load_study(**how)
             except Exception as error:  # storages raise their drivers' errors
@@ -335,10 +408,10 @@ class Tuner:
                 raise StudyError(without_password(text, self.spec.storage)) from None
         self._check_identity(study)
         if not self.spec.storage:
-            write_atomic(self.folder / "study.json", json.dumps(self.spec.for_others(), indent=2) + "\n")
+            write_atomic(self.folder / SPEC_FILE, json.dumps(self.spec.for_others(), indent=2) + "\n")
         return study
 
-    def _begin(self, study: optuna.Study) -> None:
+    def _begin(self, study: optuna.Study, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]) -> None:
         """What a new study begins with; the identity comes last, other workers wait for it."""
         study.set_user_attr("spec", self.spec.for_others())
         study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
@@ -346,7 +419,12 @@ class Tuner:
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             study.set_metric_names(list(self.spec.objectives))
         study.enqueue_trial({parameter.name: self.base[parameter.name] for parameter in self.space})
-        study.set_user_attr("identity", self._identity())
+        for beginning in beginnings:
+            if isinstance(beginning, FrozenTrial):
+                study.add_trial(beginning)
+            else:
+                study.enqueue_trial(beginning, skip_if_exists=True)
+        study.set_user_attr("identity", self._identity)
 
     def _check_identity(self, study: optuna.Study) -> None:
         """Refuse a stored study that was made with something else; data and program count only to go on with it."""
@@ -357,7 +435,7 @@ class Tuner:
             raise StudyError(
                 f"the storage holds a study '{self.spec.name}' that is none of this toolkit", "give yours another name"
             )
-        identity = self._identity()
+        identity = self._identity
         changed = [key for key in identity if stored.get(key) != identity[key]]
         if changed:
             there, here = (json.dumps(values.get(changed[0]))[:80] for values in (stored, identity))
@@ -367,20 +445,21 @@ class Tuner:
                 f"give the study another name, or delete {self.folder}",
             )
 
-    def _identity(self) -> dict[str, Any]:
+    def _identify(self) -> dict[str, Any]:
         """What must be the same when a study is resumed, by name; to read one, its own fields alone.
 
-        Beside the fields these are the content of its sequences, and the program that runs on them: code, weights,
-        libraries, device.
+        Beside the fields these are the baseline's settings, the content of its sequences, and the program that runs on
+        them: code, weights, libraries, device.
         """
         spec = self.spec
-        identity = spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "pilot"})
+        identity = spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "start", "baseline"})
         if self.reading:
             return identity
-        how: dict[str, Any] = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(spec.space.fixed)}
         instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
         for sequence, instance in {instance.sequence: instance for instance in reversed(instances)}.items():
+            how = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(self.held)}
             run = resolve(instance.run_spec(spec.tracker, **how)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
             identity |= program_of(run) | {"device": run["device"]}
+        identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
         return identity | {"parameters": digest([repr(parameter) for parameter in self.space])}

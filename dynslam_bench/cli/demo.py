@@ -66,7 +66,7 @@ def demo(
     note("making the report")
     paths = report(store.root, title="Demo: walking and sitting people, rendered")
     silence_optuna()
-    render({instance.sequence for instance in study.instances(*study.tune, *study.held_out)})
+    render({instance.sequence for instance in study.instances(*study.tune, *study.confirm, *study.held_out)})
     with progress(f"study {study.name}") as advance:
         bar = StudyBar(advance)
         tuned = tune(study, results=store.root / "study", jobs=jobs, on_event=bar.event, on_run=bar.run, on_note=note)
@@ -82,7 +82,7 @@ def demo(
 
 
 def study_spec(frames: int, trials: int) -> StudySpec:
-    """A study of the error, which does not depend on the machine's load, on three scenes, checked on three others."""
+    """A study of the error, which does not depend on the machine's load, on three scenes, judged on six others."""
     from dynslam_bench.core.records import digest
     from dynslam_bench.runs.identity import source_fingerprint
     from dynslam_bench.trackers import TRACKERS
@@ -93,6 +93,7 @@ def study_spec(frames: int, trials: int) -> StudySpec:
         name=f"demo-{code}",
         tracker=STUDIED,
         tune=(f"synthetic/walking_xyz?scene=1-3&frames={frames}",),
+        confirm=(f"synthetic/walking_xyz?scene=4-6&frames={frames}",),
         held_out=(f"synthetic/walking_xyz?scene=101-103&frames={frames}",),
         recorded=(),
         objectives=("accuracy",),
@@ -101,7 +102,6 @@ def study_spec(frames: int, trials: int) -> StudySpec:
         trials=trials,
         top=1,
         min_coverage=0.9,
-        pilot=False,
     )
 
 

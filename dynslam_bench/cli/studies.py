@@ -1,8 +1,7 @@
-"""``tune space|pilot|screen|run|worker|status|best|report``."""
+"""``tune space|run|worker|extend|status|best|report``."""
 
 from __future__ import annotations
 
-import json
 import logging
 import warnings
 from pathlib import Path
@@ -34,58 +33,14 @@ def silence_optuna() -> None:
 
 
 @app.command()
-def space(study: Study, as_json: AsJson = False) -> None:
-    """Show which settings a study tunes, and within which limits."""
-    from dynslam_bench.trackers import TRACKERS
+def space(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False) -> None:
+    """Show which settings a study tunes, what its scenes could show, and how long it takes."""
+    plan = tuning.Plan(tuning.read_study(study), results)
+    preview = plan.preview(jobs)
 
-    spec = tuning.read_study(study)
-    sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
-    parameters = tuning.search_space(TRACKERS.get(spec.tracker).settings, spec.space, sequences)
-
-    rows = [(p.name, range_text(p), p.default, p.unit, p.meaning) for p in parameters]
-    present(parameters, table(("setting", "range", "default", "unit", "meaning"), rows))
-
-
-@app.command()
-def pilot(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False) -> None:
-    """Measure the spread of a study's instances: what it could show, and what 5, 10 and 20 % would take."""
-    outcome = tuning.pilot_of(tuning.Tuner(tuning.read_study(study), results), jobs=jobs)
-
-    rows = [(f"{100 * n.effect:.0f} %", n.scenes, n.instances, f"{n.minutes:.0f}") for n in outcome.needs]
-    lines = [f"{outcome.sentence}.\n", table(("gain", "scenes", "runs of one configuration", "minutes"), rows)]
-    present(outcome, *lines, *([f"\nWarning: {outcome.warning}."] if outcome.warning else []))
-
-
-@app.command()
-def screen(
-    study: Study,
-    results: Results = Path("results"),
-    jobs: Jobs = 1,
-    points: Annotated[int, typer.Option(min=1, help="Points to move from: the default, and others near it.")] = 2,
-    instances: Annotated[int, typer.Option(min=2, help="Instances of the study to run on.")] = 4,
-    as_json: AsJson = False,
-) -> None:
-    """Find which settings matter, before a study: one at a time, on several instances; print the few worth tuning."""
-    tuner = tuning.Tuner(tuning.read_study(study), results)
-    with progress(f"screening {tuner.spec.name}") as advance:
-        outcome = tuning.screen_study(tuner, points=points, instances=instances, jobs=jobs, on_done=advance)
-
-    verdicts = {name: "kept" for name in outcome.kept} | dict.fromkeys(outcome.dead, "no effect")
-    rows = [
-        (e.name, e.objective, f"{e.size:.3f}", f"[{e.low:.3f}, {e.high:.3f}]", verdicts.get(e.name, ""))
-        for e in outcome.effects
-    ]
-    extent = f"these {outcome.instances} instances ({outcome.runs} runs)"
-    advice = f"No setting matters more than chance on {extent}: try more instances."
-    if outcome.kept:
-        advice = f"[space]\ninclude = [{', '.join(json.dumps(name) for name in outcome.kept)}]"
-    present(
-        outcome,
-        table(("setting", "of", "effect (log ratio)", "90 % interval", ""), rows),
-        "",
-        *(f"{name} broke a run: {reason}" for name, reason in outcome.failed.items()),
-        advice,
-    )
+    rows = [(p.name, range_text(p), plan.base[p.name], p.unit, p.meaning) for p in plan.space]
+    shown = table(("setting", "range", "baseline", "unit", "meaning"), rows)
+    present({"settings": plan.space, "preview": preview}, shown, "", *preview.lines)
 
 
 @app.command()
@@ -97,14 +52,29 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run a study or continue it; then check the best on the held-out split, and write the page."""
+    _tune(study, results, jobs, trials=trials)
+
+
+@app.command()
+def extend(
+    study: Study,
+    results: Results = Path("results"),
+    jobs: Jobs = 1,
+    scenes: Annotated[int, typer.Option(min=0, help="Further rendered scenes to choose and to judge on.")] = 0,
+    trials: Annotated[int, typer.Option(min=0, help="Further trials.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Continue a study with more scenes and trials, where its verdict is not settled."""
+    _tune(study, results, jobs, more_scenes=scenes, more_trials=trials)
+
+
+def _tune(study: Path, results: Path, jobs: int, **how: Any) -> None:
     from dynslam_bench.api import tune
 
     spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
-        outcome = tune(
-            spec, results=results, jobs=jobs, trials=trials, on_event=bar.event, on_run=bar.run, on_note=bar.note
-        )
+        outcome = tune(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run, on_note=bar.note, **how)
     show_summary(outcome.tuner, outcome.summary, outcome.page)
 
 
@@ -114,8 +84,8 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
     spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
-        tuning.run_study(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run)
-    write(f"study '{spec.name}' has its {spec.trials} trials")
+        tuner = tuning.run_study(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run)
+    write(f"study '{spec.name}' has its {tuner.trials} trials")
 
 
 @app.command()
@@ -124,7 +94,7 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
     from dynslam_bench.tuning.trials import best_trials, count_states
 
     tuner = tuning.Tuner(tuning.read_study(study), results, reading=True)
-    facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.spec.trials}
+    facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.trials}
     facts |= count_states(tuner.study)
     settings: dict[str, Any] = {}
     for trial in best_trials(tuner.study, 1):
@@ -141,12 +111,13 @@ def best(
     pick: Annotated[
         str, typer.Option(help="best; of a study of several objectives fast, balanced, accurate too.")
     ] = "best",
+    trial: Annotated[Optional[int], typer.Option(min=0, help="Of a trial, in place of a pick.")] = None,  # noqa: UP045
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")] = None,  # noqa: UP045
 ) -> None:
     """Write a study's settings as a preset that `run --settings` takes."""
     from dynslam_bench.core.records import write_atomic
 
-    text = tuning.read_preset_text(tuning.read_study(study), results, pick)
+    text = tuning.read_preset_text(tuning.read_study(study), results, pick, trial)
     if output is not None:
         write_atomic(output, text)
     write(text.rstrip() if output is None else str(output))
@@ -180,16 +151,16 @@ class StudyBar:
 
     def __init__(self, advance: Advance) -> None:
         self._advance, self._runs = advance, 0
-        self._part, self._at = "pilot", (0.0, None)
+        self._part, self._at = "baseline", (0.0, None)
 
     def event(self, event: tuning.StudyEvent) -> None:
         """A trial has started or finished, or the study has begun another part."""
-        if event.kind in ("pilot", "finished"):
+        if event.kind in ("preview", "finished"):
             note(event.text)
         if event.kind in ("started", "finished"):
             self._begin(event.text, event.number + (event.kind == "finished"), event.total)
         elif event.kind == "reference":
-            self._begin("the default settings", 0, event.total)
+            self._begin(event.text, 0, event.total)
 
     def note(self, text: str) -> None:
         """The final check has begun a step."""
@@ -207,12 +178,12 @@ class StudyBar:
 
 
 def show_summary(tuner: tuning.Tuner, summary: tuning.StudySummary, page: Path) -> None:
-    """The conclusion, the chosen settings and the paths of page and preset."""
+    """The conclusion, the best settings and the paths of page and preset."""
     from dynslam_bench.tuning.splits import seen_note
 
     preset = tuner.folder / "best.toml"
     lines = [summary.conclusion, *filter(None, [seen_note(summary.seen)]), ""]
-    if summary.chosen is not None:
-        lines += [table(("setting", "value"), list(summary.candidates[0].params.items())), ""]
+    if summary.best is not None:
+        lines += [table(("setting", "value"), list(summary.best.params.items())), ""]
     lines.append(f"preset: {preset}\npage:   {page}")
     present({"summary": summary, "page": page, "preset": preset}, *lines)

@@ -5,7 +5,7 @@
 
 Each case is a tracker of which one default was made bad; the study does not know which. At the end the tracker as it is
 published runs on the held-out scenes too: the loss is the log ATE ratio of the bad default to it, the recovered share
-what the study's choice takes back of that. The loss is looked at first: where its interval does not lie above 1 there
+what the study's best trial takes back of that. The loss is looked at first: where its interval does not lie above 1 there
 is nothing to recover, and no study is run. Scenes are rendered; results are kept, so that a second call goes on.
 """
 
@@ -71,7 +71,7 @@ def study_of(case: str, options: argparse.Namespace) -> StudySpec:
     return StudySpec(
         name=f"injected-{case}", tracker=f"{Path(__file__).resolve()}:{case.upper()}",
         tune=scenes(0), confirm=scenes(share), held_out=scenes(110), offsets=(0,), recorded=(),
-        trials=options.trials, top=2, min_coverage=0.9, pilot=False,
+        trials=options.trials, top=2, min_coverage=0.9,
         space=SpaceSpec(include=MASKED if masked else UNMASKED,
                         fixed={"segmentation.source": "embedded"} if masked else {}),
     )  # fmt: skip
@@ -94,12 +94,12 @@ def study(case: str, options: argparse.Namespace) -> str:
     tuner.run(jobs=options.jobs, on_event=lambda event: print(event.text, flush=True))
     summary = finish(tuner, lambda text: print(text, flush=True), jobs=options.jobs)
     minutes = (time.perf_counter() - began) / 60
-    chosen = {} if summary.chosen is None else summary.candidates[0].params
-    left = compared(tuner.evaluate({**fixed, **chosen}, held, jobs=options.jobs, cache=False), published)
+    best = {} if summary.best is None else summary.best.params
+    left = compared(tuner.evaluate({**fixed, **best}, held, jobs=options.jobs, cache=False), published)
     share = 100 * (1 - math.log(left.ratio) / math.log(loss.ratio))
     return (
         f"{case}: injected {loss}, after the study {left}: recovered {share:.0f} % in {minutes:.1f} min, "
-        f"{summary.trials}\n  {summary.conclusion}\n  {chosen}"
+        f"{summary.trials}\n  {summary.conclusion}\n  {best}"
     )
 
 

@@ -279,6 +279,7 @@ STUDY = """
 name = "tiny"
 tracker = "orb-slam2"
 tune = ["synthetic/sitting_xyz?scene=1&frames=8"]
+confirm = ["synthetic/sitting_xyz?scene=2&frames=8"]
 held_out = ["synthetic/sitting_xyz?scene=101&frames=8"]
 seeds = [0]
 offsets = [0]
@@ -291,17 +292,21 @@ include = ["features.n_features"]
 
 def test_a_study(cli, facts, tmp_path):
     Path("study.toml").write_text(STUDY)
-    (parameter,) = facts("tune", "space", "study.toml")
-    assert parameter["name"] == "features.n_features"
+    plan = facts("tune", "space", "study.toml")
+    (parameter,) = plan["settings"]
+    assert parameter["name"] == "features.n_features" and plan["preview"]["needed"] > 2
     assert "there is no study 'tiny'" in one_line(cli("tune", "best", "study.toml")[2])
     found = facts("tune", "run", "study.toml")
     assert Path(found["page"]).is_file() and found["summary"]["trials"]["complete"] == 2
     assert facts("tune", "status", "study.toml")["complete"] == 2
     assert "has its 2 trials" in cli("tune", "worker", "study.toml")[1]
+    more = facts("tune", "extend", "study.toml", "--trials", "1")
+    assert more["summary"]["trials"]["complete"] == 3 == facts("tune", "status", "study.toml")["complete"]
+    assert "not judged" in cli("tune", "best", "study.toml", "--trial", "0")[1]
     assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
     name = "synthetic/sitting_xyz?scene=1&frames=8"
     assert facts("run", "orb-slam2", name, "--settings", "preset.toml")[0]["status"] == "ok"
-    assert cli("tune", "report", "study.toml")[1].splitlines()[0] == found["summary"]["conclusion"]
+    assert cli("tune", "report", "study.toml")[1].splitlines()[0] == more["summary"]["conclusion"]
     Path("study.toml").write_text(STUDY.replace("n_features", "n_featurs"))
     assert "did you mean 'features.n_features'" in one_line(cli("tune", "space", "study.toml")[2])
 

@@ -33,7 +33,7 @@ def offered() -> dict[str, tuple[str, Parameter]]:
     """Every setting that a study of some system draws on rendered sequences, with the first such system."""
     settings: dict[str, tuple[str, Parameter]] = {}
     for spec in SYSTEMS.values():
-        for parameter in search_space(spec.settings, SpaceSpec(), ["synthetic/walking_xyz"]):
+        for parameter in search_space(spec.settings(), SpaceSpec(), ["synthetic/walking_xyz"]):
             settings.setdefault(parameter.name, (spec.id, parameter))
     return settings
 

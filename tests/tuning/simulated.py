@@ -75,16 +75,25 @@ class SimulatedTuner(Tuner):
             patch.multiple(
                 "dynslam_bench.tuning.tuner",
                 open_storage=(lambda *_: optuna.storages.InMemoryStorage()) if in_memory else open_storage,
-                design_of=lambda spec, accept: simulated_design(spec.tune, spec.held_out),
+                design_of=simulated_design,
             ),
+            patch("dynslam_bench.tuning.plan.design_of", simulated_design),
         ):
             super().__init__(spec, results)
+
+    def extend(self, **more: int) -> None:
+        with _PATCHING, patch("dynslam_bench.tuning.tuner.design_of", simulated_design):
+            super().extend(**more)
+
+    def _identify(self) -> dict[str, Any]:
+        return {"code": "simulated"}  # looking it up takes longer than a study here
 
     def evaluate(
         self,
         settings: Mapping[str, Any],
         instances: Sequence[ProblemInstance],
         *,
+        tracker: str = "",
         jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
@@ -102,7 +111,11 @@ class SimulatedTuner(Tuner):
         return math.exp(math.log(0.03) + scene + self.effect(settings) + own + start)
 
 
+def simulated_design(spec: StudySpec, accept: bool = False, further: int = 0) -> Design:
+    return _design(spec.tune, spec.confirm, spec.held_out, further)
+
+
 @cache
-def simulated_design(tune: tuple[str, ...], held_out: tuple[str, ...]) -> Design:
+def _design(tune: tuple[str, ...], confirm: tuple[str, ...], held_out: tuple[str, ...], further: int) -> Design:
     """Opening the sequences takes longer than a study here."""
-    return design_of(make_spec(tune=tune, held_out=held_out))
+    return design_of(make_spec(tune=tune, confirm=confirm, held_out=held_out), further=further)

@@ -10,8 +10,8 @@ import pytest
 import toy_tracker
 
 from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.tuning.instances import ProblemInstance, parse_instances, scenes
-from dynslam_bench.tuning.splits import check_splits, design_of, fresh_starts, with_more_starts
+from dynslam_bench.tuning.instances import ProblemInstance, further_scenes, parse_instances, scenes
+from dynslam_bench.tuning.splits import check_splits, design_of, with_more_starts
 from dynslam_bench.tuning.study_file import StudySpec
 
 WALK = "synthetic/walking_xyz"
@@ -100,19 +100,47 @@ def test_instances_of_one_recording_are_apart_or_repeats(folder: str) -> None:
         check_splits("s", {"tune": [one], "held_out": [later]})
 
 
-def test_the_default_runs_from_three_starts_and_the_choice_is_made_on_unseen_instances() -> None:
+def test_the_baseline_runs_from_three_starts() -> None:
     few = parse_instances(f"{WALK}?scene=0-3&frames=20&offsets=0,3")
     first = [instance.offset for instance in with_more_starts(few) if instance.scene.endswith("?scene=0")]
     assert sorted(first) == [0, 1, 3]
-    fresh = [instance.offset for instance in fresh_starts(few)]
-    assert fresh[:2] == [1, 2] and not set(fresh) & {0, 3}
-    spec = StudySpec(name="s", tracker="orb-slam2", tune=(f"{WALK}?scene=0-3&frames=20",), recorded=())
+
+
+@pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 12), (11, 12), (40, 20)])
+def test_the_choice_is_made_on_further_scenes(scenes_to_tune_on: int, reserved: int) -> None:
+    spec = StudySpec(name="s", tune=(f"{WALK}?scene=0-{scenes_to_tune_on - 1}&frames=20",), recorded=())
     design = design_of(spec)
-    assert {instance.scene for instance in design.confirm} == {instance.scene for instance in design.tune}
-    many = design_of(spec.model_copy(update={"tune": (f"{WALK}?scene=0-11&frames=20",)}))
-    confirm, tune = ({instance.scene for instance in instances} for instances in (many.confirm, many.tune))
-    assert len(confirm) == 4 and len(tune) == 8 and not confirm & tune
-    assert len({instance.scene for instance in many.tune[:8]}) == 8, "a growing set takes one of each scene in turn"
+    confirm, tune = ({instance.scene for instance in split} for split in (design.confirm, design.tune))
+    assert (len(tune), len(confirm)) == (scenes_to_tune_on, reserved) and not confirm & tune
+    assert len({instance.scene for instance in design.tune[:scenes_to_tune_on]}) == scenes_to_tune_on, "in turn"
+    assert {instance.offset for instance in design.confirm} == {0, 3}
+
+
+def test_further_scenes_are_of_all_sequences_in_turn_and_of_their_split() -> None:
+    tune = (f"{WALK}?scene=0-1&frames=20&offsets=0", "synthetic/sitting_xyz?scene=5&frames=20&offsets=2&seeds=3")
+    spec = StudySpec(name="s", tune=tune, confirm=(tune[0].replace("0-1", "7"),), recorded=(),
+                     held_out=(f"{WALK}?scene=100-101&frames=20&offsets=0",))  # fmt: skip
+    design = design_of(spec, further=2)
+    assert [instance.scene.rpartition("=")[2] for instance in design.confirm] == ["7", "2", "3"]
+    assert [instance.scene.rpartition("=")[2] for instance in design.held_out] == ["100", "101", "102", "103"]
+    added = further_scenes(spec.instances(*tune), 2, set(), range(3, 9))
+    assert [str(instance) for instance in added] == [
+        f"{WALK}?scene=3&frames=20&offsets=0", "synthetic/sitting_xyz?scene=3&frames=20&offsets=2&seeds=3"
+    ]  # fmt: skip
+    with pytest.raises(StudyError, match=r"2 further scenes.*only 1"):
+        further_scenes(spec.instances(tune[0]), 2, {f"{WALK}?scene=3"}, range(3, 5))
+
+
+def test_recordings_are_confirmed_on_other_stretches_or_not_at_all(folder: str) -> None:
+    def confirm(*tune: str, **changes: object) -> list[str]:
+        spec = StudySpec.model_validate({"name": "s", "tune": tune, "recorded": (), "offsets": (0,), **changes})
+        return [str(instance).removeprefix(folder) for instance in design_of(spec).confirm]
+
+    assert confirm(f"{folder}[0:3]", f"{folder}[3:5]") == ["[5:8]?offsets=0", "[8:10]?offsets=0"]
+    assert confirm(f"{folder}[0:8]") == [] == confirm(folder), "no frames are left"
+    for other in (f"{folder}[2:6]", f"{folder}[0:4]?offsets=1"):
+        with pytest.raises(StudyError, match=r"share [24] frames"):
+            confirm(f"{folder}[0:4]", confirm=(other,))
 
 
 def test_a_recording_that_is_here_is_in_the_check(folder: str, tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from simulated import SimulatedTuner, make_spec
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.toml import read_settings
-from dynslam_bench.tuning import Outcome, ProblemInstance, finish, read_preset_text, write_page
-from dynslam_bench.tuning.evaluate import InstanceFailedError
+from dynslam_bench.tuning import Outcome, ProblemInstance, Verdict, finish, read_preset_text, write_page
+from dynslam_bench.tuning.evaluate import Configuration, InstanceFailedError
 from dynslam_bench.tuning.objectives import OBJECTIVES, find_objective, own_objective, together
 from dynslam_bench.tuning.page import PLOTS_FILE
 
@@ -61,6 +61,7 @@ class TimedTuner(SimulatedTuner):
         settings: Mapping[str, Any],
         instances: Sequence[ProblemInstance],
         *,
+        tracker: str = "",
         jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
@@ -82,7 +83,7 @@ def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
         tuner.run()
     summary = finish(tuner)
     chosen = summary.candidates[0]
-    assert summary.improves and chosen.params == {"wobble": 0}
+    assert summary.verdict == Verdict.PROVEN and chosen.params == {"wobble": 0}
     assert chosen.held_out is not None and chosen.held_out.ratio == pytest.approx(0.5)
     assert chosen.on_held_out["accuracy"].ratio == pytest.approx(1.0)
 
@@ -92,9 +93,10 @@ def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None
     tuner.price = 0.6
     tuner.run()
     summary = finish(tuner)
-    assert summary.chosen is None and not summary.improves
+    assert not summary.candidates[0].chosen and summary.verdict == Verdict.PROMISING
     assert "1.05" in summary.conclusion
-    assert read_settings(tuner.folder / "best.toml") == {}, "the default"
+    assert read_settings(tuner.folder / "best.toml") == summary.candidates[0].params, "written with its status"
+    assert 'status = "promising"' in (tuner.folder / "best.toml").read_text()
 
 
 @pytest.mark.parametrize("objectives", [["accuracy", "speed"], ["speed", "accuracy"]])
@@ -123,6 +125,7 @@ class DriftingTuner(SimulatedTuner):
         settings: Mapping[str, Any],
         instances: Sequence[ProblemInstance],
         *,
+        tracker: str = "",
         jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
@@ -138,7 +141,9 @@ class DriftingTuner(SimulatedTuner):
 def test_a_machine_that_slows_down_decides_nothing(tmp_path: Path) -> None:
     tuner = DriftingTuner(make_spec(objectives=["speed"]), tmp_path)
     instances = tuner.design.held_out
-    default, same, broken = tuner.evaluate_beside([{}, {"gain": 1.1}, {"gain": 13.0}], instances)
+    default, same, broken = tuner.evaluate_beside(
+        [Configuration("", settings) for settings in ({}, {"gain": 1.1}, {"gain": 13.0})], instances
+    )
     assert isinstance(broken, InstanceFailedError) and not isinstance(default, InstanceFailedError)
     assert list(default) == list(instances) == list(same)
     assert OBJECTIVES["speed"].value(same, default) == pytest.approx(math.log(1.01), abs=0.002), "one run apart"

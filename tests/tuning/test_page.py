@@ -54,6 +54,6 @@ def test_the_table_holds_default_chosen_and_range() -> None:
         ["a.threshold", "1", "3", "0.1 to 10, log", "px"],
         ["a.mode", "fast", "slow", "fast, slow", ""],
     ]
-    assert [column.name for column in table.columns] == ["setting", "default", "chosen", "range", "unit"]
-    unconfirmed = settings_table(SPACE, default, {}, False)
-    assert unconfirmed.rows[0][2].text == "–" and unconfirmed.columns[2].name == "best trial"
+    assert [column.name for column in table.columns] == ["setting", "baseline", "best trial", "range", "unit"]
+    unproven = settings_table(SPACE, default, {}, False)
+    assert unproven.rows[0][2].text == "–" and "keep the baseline" in unproven.caption

@@ -19,7 +19,7 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from simulated import SimulatedTuner, make_spec, nothing, valley
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning import finish
+from dynslam_bench.tuning import Verdict, finish
 from dynslam_bench.tuning.objectives import ACCURACY
 from dynslam_bench.tuning.samplers import is_dominated, step_name, steps
 from dynslam_bench.tuning.trials import errors_of
@@ -63,7 +63,7 @@ def test_values_are_of_the_instances_that_ran(pruner: str, objectives: list[str]
     assert states[0] == TrialState.COMPLETE and TrialState.PRUNED in states
     for trial in trials:
         instances = list(errors_of(trial))
-        value = ACCURACY.value(tuner.evaluate(tuner.settings_of(trial), instances), tuner.reference())
+        value = ACCURACY.value(tuner.evaluate(tuner.configuration_of(trial).settings, instances), tuner.reference())
         if trial.state == TrialState.COMPLETE:
             assert instances == list(tuner.design.tune), "a value is one of all instances"
             assert trial.values[0] == pytest.approx(value, abs=1e-12)
@@ -97,16 +97,17 @@ def test_pruning_takes_half_the_runs_at_the_same_regret(tmp_path: Path) -> None:
 
 def test_nothing_is_claimed_where_nothing_is_better(tmp_path: Path) -> None:
     """Forty studies; a single comparison of the best trial on its own instances would claim a gain in most of them."""
-    chosen = claims = lucky = 0
+    chosen = claims = lucky = no_matter = 0
     for seed in range(40):
         tuner = SimulatedTuner(make_spec(sampler_seed=seed), tmp_path / str(seed), effect=nothing, seed=seed)
         lucky += tuner.run().best_value < math.log(0.95)
         summary = finish(tuner)
-        chosen += summary.chosen is not None
-        claims += summary.improves
-    assert claims <= 2, "5 % of 40"
+        chosen += summary.candidates[0].chosen
+        claims += summary.verdict == Verdict.PROVEN
+        no_matter += summary.verdict == Verdict.NO_MATTER
+    assert claims == 0 and no_matter >= 32
     assert chosen <= 4, "5 % of 40, and its chance"
-    assert lucky >= 20, "what the trials alone say"
+    assert lucky >= 15, "what the trials alone say"
 
 
 def test_an_injected_regression_is_found_and_judged(tmp_path: Path) -> None:
@@ -115,7 +116,7 @@ def test_an_injected_regression_is_found_and_judged(tmp_path: Path) -> None:
     tuner.run()
     summary = finish(tuner)
     held = summary.candidates[0].held_out
-    assert summary.improves and held is not None and held.high < 1
+    assert summary.verdict == Verdict.PROVEN and held is not None and held.high < 1
     injected = 4 * valley({"gain": 1.5})
     assert -math.log(held.ratio) > 0.8 * injected - 0.2, "most of the injected loss, within the noise"
 

@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 import optuna
 import pytest
-from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, simulated_design, valley
+from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, make_spec, simulated_design, valley
 
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.tuning import Outcome, ProblemInstance, Study, StudySpec, Tuner
@@ -21,7 +21,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "tune_in_python.py"
 DOCS = EXAMPLE.parents[1] / "docs"
 FIELDS: dict[str, Any] = {
     "name": "py", "tracker": TRACKER, "tune": [TUNE], "held_out": [HELD_OUT], "recorded": (), "trials": 8,
-    "space": {"include": ["gain", "wobble"]}, "min_coverage": None, "pilot": False,
+    "space": {"include": ["gain", "wobble"]}, "min_coverage": None,
 }  # fmt: skip
 
 
@@ -30,7 +30,8 @@ class DrawnTuner(SimulatedTuner):
 
     def __init__(self, spec: StudySpec, results: Path, **given: Any) -> None:
         self.effect, self.noise_seed, self.runs = valley, 0, 0
-        with patch("dynslam_bench.tuning.tuner.design_of", lambda spec, accept: simulated_design((TUNE,), (HELD_OUT,))):
+        design = simulated_design(make_spec())
+        with patch("dynslam_bench.tuning.plan.design_of", lambda spec, accept: design):
             Tuner.__init__(self, spec, results, **given)
 
 
@@ -96,7 +97,7 @@ def test_the_example_goes_as_it_stands_but_for_its_runs(tmp_path: Path, capsys: 
     runpy.run_path(str(EXAMPLE))["main"](str(tmp_path), 8)
     told = capsys.readouterr().out
     assert "trial 0: {'frames': 5}" in told and "trial 1: {'frames': 2}" in told
-    assert "default" in told.splitlines()[-1], "nothing can be gained there"
+    assert told.splitlines()[-1].startswith("Does not matter here"), "nothing can be gained there"
 
 
 def test_the_notebook_goes_as_it_stands_but_for_its_runs(
@@ -119,7 +120,7 @@ def test_the_page_s_python_goes_as_it_stands_but_for_its_runs(
     (tmp_path / "fast.toml").write_text('"backend.keyframes.tracked_share" = 0.8\n')
     first, second = re.findall(r"^```python\n(.*?)^```", (DOCS / "tuning.md").read_text(), flags=re.S | re.M)
     exec(compile(first.replace("trials=30", "trials=6"), "docs/tuning.md", "exec"), {})
-    assert "default" in capsys.readouterr().out.splitlines()[-1]
+    assert "baseline" in capsys.readouterr().out.splitlines()[-1]
     tuned = "params.backend.keyframes.tracked_share"
     second = second.replace("studies/thresholds", "studies/mine").replace("params.epipolar.threshold_px", tuned)
     names: dict[str, Any] = {}

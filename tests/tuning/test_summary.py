@@ -9,16 +9,17 @@ import numpy as np
 import optuna
 import pytest
 import toy_tracker
+from optuna.trial import TrialState
 from scipy import stats
 from scipy.stats import mstats
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning import Study, StudySpec, finish, run_study, write_page
+from dynslam_bench.tuning import Study, StudySpec, Verdict, finish, run_study, write_page
 from dynslam_bench.tuning.evaluate import Outcome
 from dynslam_bench.tuning.instances import ProblemInstance
-from dynslam_bench.tuning.objectives import bounds, by_scene, centre, upper
+from dynslam_bench.tuning.objectives import bounds, by_scene, centre, detectable, scenes_needed, spread_test, upper
 from dynslam_bench.tuning.storage import open_storage
-from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, choose, compared, conclude
+from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, compared, judge
 from dynslam_bench.tuning.trials import FEWEST_TRIALS, importances
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
@@ -80,57 +81,86 @@ def test_few_scenes_have_an_interval_over_starts_that_shows_nothing() -> None:
     assert Ratio.model_validate_json(one.model_dump_json()) == one
 
 
-def test_the_choice_is_by_the_upper_bound_and_falls_back_to_the_default() -> None:
-    def judged(trial: int, ratio: float, bound: float, **changes: object) -> Candidate:
-        found = Ratio(ratio=ratio, low=0.1, high=bound, n=8, sequences=4, bound=bound)
-        return candidate(0.6, 0.75, 0.9, **({"trial": trial, "confirm": found, "held_out": None} | changes))
+LUCKY = Ratio(ratio=0.9, low=0.6, high=1.3, n=8, sequences=4, bound=1.2, spread=0.3)
+WIDE = Ratio(ratio=0.9, low=0.7, high=1.2, n=12, sequences=6, spread=0.3)
+SPEED = {"confirm": CONFIRM, "ate_margin": 0.05}
 
-    sure, lucky, broken = judged(1, 0.9, 0.97), judged(2, 0.7, 1.2), judged(3, 0.2, 0.3, feasible=False)
-    assert choose([lucky, sure, broken]) is sure
-    assert choose([lucky, broken]) is None and choose([]) is None
-    broke = judged(4, 1, 1, confirm=None, feasible=False, failed="it broke")
-    for candidates, named in (([lucky, broken], "trial 2"), ([broken], "trial 3"), ([broke], "it broke"), ([], "")):
-        text = conclude(candidates, None, [])
-        assert text.startswith("Keep the default: ") and named in text
+
+def accuracy(bound: float) -> dict[str, Ratio]:
+    return {"accuracy": Ratio(ratio=1.0, low=0.9, high=bound, n=8, sequences=4, bound=bound)}
 
 
 @pytest.mark.parametrize(
-    ("chosen", "notes", "start", "named"),
+    ("changes", "p_value", "notes", "verdict", "named"),
     [
-        (candidate(0.6, 0.75, 0.9), [], "Better: trial 7", "25.0 % less ATE on 6 held-out"),
-        (candidate(0.6, 0.75, 0.9), ["same"], "Not better, keep the default", "same"),
-        (candidate(0.7, 0.95, 1.3), [], "Not better, keep the default", "[0.700, 1.300]"),
-        (candidate(1.1, 1.54, 2.0), [], "Worse, keep the default", "54.0 % more ATE"),
-        (candidate(1.1, 1.54, 2.0, 4), [], "Worse, keep the default", "rough below five"),
-        (candidate(0.1, 0.2, 0.3, 2), [], "Not judged, keep the default", "2 held-out scenes"),
-        (candidate(0.6, 0.75, 0.9, held_out=None), [], "Not judged, keep the default", "no held-out split"),
-        (
-            candidate(0.6, 0.75, 0.9, recorded=Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)),
-            [],
-            "Worse on recordings, keep the default",
-            "1.300 [1.100, 1.500]",
-        ),
-        (candidate(0.6, 0.75, 0.9, feasible=False, failed="it broke"), [], "Keep the default", "it broke"),
+        ({}, 0.5, [], Verdict.PROVEN, "25.0 % less ATE: ATE x 0.750 [0.600, 0.900] on 6 scenes"),
+        ({}, 0.5, ["same"], Verdict.PROMISING, "not apart"),
+        ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "upper bound 1.200"),
+        ({"held_out": WIDE}, 0.5, [], Verdict.PROMISING, "about 60 more scenes would settle it"),
+        ({"held_out": None}, 0.5, [], Verdict.PROMISING, "fewer than 3 held-out scenes"),
+        ({"confirm": LUCKY, "held_out": WIDE}, 0.5, [], Verdict.NO_MATTER, "p = 0.50"),
+        ({"confirm": LUCKY, "held_out": WIDE}, 0.001, [], Verdict.PROMISING, "perhaps 10.0 % less"),
+        ({"confirm": LUCKY, "held_out": WIDE}, None, [], Verdict.PROMISING, "perhaps"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.001, [], Verdict.WORSE, "is not better"),
+        ({"held_out": Ratio(ratio=1.5, low=1.1, high=2, n=8, sequences=4)}, 0.5, [], Verdict.WORSE, "50.0 % more ATE"),
+        ({"recorded": Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)}, 0.5, [], Verdict.WORSE, "recordings"),
+        ({"feasible": False}, 0.5, [], Verdict.WORSE, "constraint"),
+        ({**SPEED, "on_confirm": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
+        ({**SPEED, "on_confirm": accuracy(1), "on_held_out": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
+        ({"confirm": None}, 0.5, [], Verdict.NOT_JUDGED, "no frames are left"),
+        ({"confirm": CONFIRM.model_copy(update={"sequences": 2}), "held_out": None}, 0.5, [], Verdict.NOT_JUDGED,
+         "2 scenes only"),
+        ({"failed": "it broke"}, 0.5, [], Verdict.NOT_JUDGED, "it broke"),
     ],
-)
-def test_the_conclusion_is_one_sentence_with_the_numbers(
-    chosen: Candidate, notes: list[str], start: str, named: str
+)  # fmt: skip
+def test_the_verdict_is_one_of_five_with_the_numbers(
+    changes: dict[str, object], p_value: float | None, notes: list[str], verdict: Verdict, named: str
 ) -> None:
-    text = conclude([chosen], chosen.trial, notes)
-    assert text.startswith(start) and named in text
+    given, text = judge([candidate(0.6, 0.75, 0.9, **changes)], p_value, notes)
+    assert (given, text.startswith(verdict.value.capitalize())) == (verdict, True) and named in text
+    assert judge([])[0] == Verdict.NOT_JUDGED
 
 
-@pytest.mark.parametrize("count", [FEWEST_TRIALS - 1, 80])
+@pytest.mark.parametrize("effect", [0.0, 0.3])
+def test_settings_matter_where_trials_differ_by_more_than_their_scenes(effect: float) -> None:
+    def p_value(seed: int) -> float | None:
+        rng = np.random.default_rng(seed)
+        scenes, trials = rng.normal(0, 1, 6), rng.normal(0, effect, 8)
+        table = scenes + trials[:, None] + rng.normal(0, 0.3, (8, 6))
+        return spread_test([dict(zip("abcdef"[: 3 + 3 * (row % 2)], table[row], strict=False)) for row in range(8)])
+
+    found = [p_value(seed) < 0.02 for seed in range(300)]
+    assert np.mean(found) <= 0.04 if effect == 0 else np.mean(found) >= 0.7
+    assert spread_test([{"a": 1.0, "b": 2.0}, {"a": 1.0, "b": 2.0}]) == 1.0, "settings that change nothing"
+    assert spread_test([{"a": 1.0}, {"a": 2.0}]) is None is spread_test([])
+
+
+def test_the_scenes_that_a_gain_needs_are_the_fewest_and_show_it_in_four_of_five_studies() -> None:
+    assert [scenes_needed(0.1, 0.24), scenes_needed(0.1, 0.31)] == [43, 70], "measured: 40 to 70 runs"
+    rng, gain = np.random.default_rng(1), detectable(0.25, 8)
+    assert scenes_needed(gain, 0.25) == 8 and detectable(0.25, 1) == 1
+    for true, share in ((math.log(1 - gain), 0.8), (0.0, 0.025)):
+        intervals = [bounds(rng.normal(true, 0.25, 8)) for _ in range(2000)]
+        assert np.mean([found is not None and found[1] < 0 for found in intervals]) == pytest.approx(share, abs=0.03)
+
+
+@pytest.mark.parametrize("count", [FEWEST_TRIALS - 1, 60])
 def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
     rng = np.random.default_rng(0)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(count):
+    for number in range(count):
         trial = study.ask()
         x, _ = trial.suggest_float("x", 0, 1), trial.suggest_float("y", 0, 1)
-        study.tell(trial, x + rng.normal(0, 0.02))
+        trial.set_user_attr("scenes", {"s": x + rng.normal(0, 0.02)})
+        trial.report(x, 0)
+        state = TrialState.PRUNED if number % 2 else TrialState.COMPLETE
+        study.tell(trial, None if number % 2 else x, state=state)
     shares = importances(study)
     assert (shares == {}) == (count < FEWEST_TRIALS)
-    assert not shares or (sum(shares.values()) == pytest.approx(1.0) and shares["x"] > 0.9)
+    if shares:
+        assert sum(importance.share for importance in shares.values()) == pytest.approx(1.0)
+        assert shares["x"].share > 0.9 and shares["x"].low > shares["y"].share
+        assert all(0 <= importance.low <= importance.high <= 1 for importance in shares.values())
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +180,7 @@ def test_a_study_is_a_frame(folders: list[str], tmp_path: Path) -> None:
     tuner.study.set_user_attr("command", ["/home/x/venv/bin/dynslam-bench", "tune", "run", "my study.toml"])
     page = write_page(tuner, summary).read_text().replace("&#39;", "'")
     assert summary.conclusion in page and "dynslam-bench tune run 'my study.toml'" in page
-    assert ("Use them" in page) == summary.improves
+    assert ("Use them" in page) == (summary.verdict == Verdict.PROVEN)
     assert StudySummary.read(tuner.folder / "summary.json").conclusion == summary.conclusion
 
     frame, trials = Study.open(tuner.folder).frame(), tuner.study.get_trials()

@@ -1,0 +1,186 @@
+"""A study before it runs: its space, baseline and instances, what they could show, and how long that takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from dynslam_bench.core.records import Record
+from dynslam_bench.core.settings import Settings, apply_overrides, field_names, flatten
+from dynslam_bench.core.toml import read_settings
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.runs import RunRecord, RunStore, load_frames
+from dynslam_bench.runs.identity import resolve
+from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.tuning.evaluate import Configuration, held_protocol, outcome
+from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.objectives import (
+    FLOOR_M,
+    Objective,
+    detectable,
+    find_objective,
+    place_of,
+    scenes_needed,
+)
+from dynslam_bench.tuning.space import search_space, starting_point
+from dynslam_bench.tuning.splits import design_of
+from dynslam_bench.tuning.study_file import StudySpec
+
+GAIN = 0.10
+"""The gain of which a preview says how many scenes would show it."""
+SPREAD = 0.31
+"""Standard deviation of the log ratio of two runs of one scene, where no runs are stored: measured 0.24 to 0.31."""
+START_S, FRAME_S = 0.5, 0.05
+"""Seconds of a run and of a frame of it, where no runs are stored."""
+FLOW_FILTERS = {"box_epipolar", "class_rule", "correlation", "epipolar", "motion", "probability"}
+"""Filters that judge the optical flow."""
+
+
+class Preview(Record):
+    """What a study could show, before it runs.
+
+    Attributes:
+        scenes: Scenes that judge it: held-out ones, or those of the choice.
+        runs: Stored runs of the baseline that the figures come from; 0 for figures of other trackers.
+        spread: Standard deviation over scenes of the log ratio of two equal configurations.
+        detectable: Smallest gain, as a share, that so many scenes can show.
+        needed: Scenes that show a gain of `GAIN`.
+        minutes: Of the whole study if no trial is pruned.
+        unused: Settings of the space that belong to a part whose verdicts are not used on these scenes, and why.
+        include: The space without them, as a study names it; empty where nothing is unused.
+    """
+
+    scenes: int
+    runs: int
+    spread: float
+    detectable: float
+    needed: int
+    minutes: float
+    unused: dict[str, str]
+    include: list[str]
+
+    @property
+    def lines(self) -> list[str]:
+        """The same for people."""
+        measured = (
+            f"{self.runs} stored runs of the baseline" if self.runs else "other trackers' runs, none is stored yet"
+        )
+        lines = [
+            f"A gain of {100 * GAIN:.0f} % takes {self.needed} scenes to show; the {self.scenes} that judge this study "
+            f"show {100 * self.detectable:.0f} % (spread {self.spread:.2f} over scenes, from {measured}).",
+            f"The study takes {self.minutes:.0f} min if no trial is pruned.",
+        ]
+        lines += [f"{name} is not used here: {why}." for name, why in self.unused.items()]
+        if self.unused:
+            left = f"The space without them: include = {self.include}"
+            lines.append(left.replace("'", '"') if self.include else "Nothing would be left of the space without them.")
+        return lines
+
+
+class Plan:
+    """What follows from a study alone; nothing runs, and nothing is stored.
+
+    Args:
+        spec: The study.
+        results: The results folder.
+        objectives: In place of those that the study names, in their order.
+        accept: Whether splits that are not apart are only noted.
+
+    Attributes:
+        held: What every trial has beside the tuned settings: the baseline's, where that is a preset, and the fixed.
+        baseline: What ratios are to.
+        shipped: The tracker's default settings, where the baseline is something else.
+        defaults: The settings of trial 0.
+        base: The same by dotted name.
+        space: What is tuned.
+        design: On which instances.
+
+    Raises:
+        DynslamError: Anything in the spec is unknown, unfit or missing.
+    """
+
+    def __init__(
+        self,
+        spec: StudySpec,
+        results: str | Path = "results",
+        *,
+        objectives: Sequence[Objective] | None = None,
+        accept: bool = False,
+    ) -> None:
+        self.spec, self.results, self.store = spec, Path(results), RunStore(results)
+        self.objectives = [find_objective(name) for name in spec.objectives] if objectives is None else list(objectives)
+        fixed, settings = spec.space.fixed, TRACKERS.get(spec.tracker).settings
+        preset = read_settings(Path(spec.baseline)) if spec.baseline.endswith(".toml") else {}
+        self.held = {**preset, **fixed}
+        self.baseline = Configuration(spec.tracker, self.held)
+        if spec.baseline and not preset:
+            names = field_names(TRACKERS.get(spec.baseline).settings)
+            self.baseline = Configuration(spec.baseline, {name: fixed[name] for name in fixed if name in names})
+        self.shipped = Configuration(spec.tracker, fixed) if spec.baseline else None
+        self.defaults: Settings = apply_overrides(settings(), self.held)
+        self.base = flatten(self.defaults)
+        sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
+        self.space = search_space(self.defaults, spec.space, sequences)
+        starting_point({}, self.space, self.base)
+        self.design = design_of(spec, accept=accept)
+
+    def run_options(self) -> dict[str, object]:
+        """Fields of `RunSpec` that all runs of the study share."""
+        return {"threads": self.spec.threads, "cache": self.spec.cache, "data_root": self.spec.data_root}
+
+    def preview(self, jobs: int = 1) -> Preview:
+        """What the study could show, from the baseline's stored runs where there are some."""
+        design, spec = self.design, self.spec
+        records = {instance: record for instance in design.reference if (record := self._stored(instance)) is not None}
+        judged = scenes(design.held_out or design.confirm or design.tune)
+        starts = sum(map(len, judged.values())) / len(judged)
+        spread = (self._scatter(records) or SPREAD) / math.sqrt(starts)
+        seconds = [record.wall_s for record in records.values()]
+        frames = [len(instance.open(spec.data_root)) for instance in design.tune[:1]]
+        run_s = float(np.mean(seconds)) if seconds else START_S + FRAME_S * frames[0]
+        runs = len(design.reference) + spec.trials * len(design.tune) + (spec.top + 1) * len(design.confirm)
+        runs += 2 * (len(design.held_out) + len(design.recorded))
+        unused = self._unused(list(records.values()))
+        return Preview(
+            scenes=len(judged), runs=len(records), spread=spread, detectable=detectable(spread, len(judged)),
+            needed=scenes_needed(GAIN, spread), minutes=math.ceil(runs / jobs) * run_s / 60, unused=unused,
+            include=[parameter.name for parameter in self.space if parameter.name not in unused] if unused else [],
+        )  # fmt: skip
+
+    def _stored(self, instance: ProblemInstance) -> RunRecord | None:
+        """The baseline's run on an instance, if it is stored and came to its end."""
+        tracker, settings = self.baseline
+        run = resolve(instance.run_spec(tracker, settings=dict(settings), **self.run_options()))
+        record = self.store.get(run.run_id)
+        return None if record is None or record.failed or record.status == "stopped" else record
+
+    def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:
+        """Standard deviation between starts of the log ratio of two runs; 0 where no scene has two stored runs."""
+        protocol, logs = held_protocol(get_protocol(self.spec.protocol)), dict[ProblemInstance, list[float]]()
+        for instance, record in records.items():
+            ate = outcome(self.store, record, instance, protocol, self.spec.data_root).ate_m
+            logs.setdefault(place_of(instance), []).append(math.log(max(ate, FLOOR_M)))
+        free = sum(len(values) - 1 for values in logs.values())
+        squares = sum(float(np.var(values)) * len(values) for values in logs.values())
+        return math.sqrt(2 * squares / free) if free else 0.0
+
+    def _unused(self, records: list[RunRecord]) -> dict[str, str]:
+        """Settings of parts that dropped no feature on any frame of the baseline's runs."""
+        if not records or self.baseline.tracker != self.spec.tracker:
+            return {}
+        frames = pd.concat([load_frames(record, self.store) for record in records])
+        most = frames.filter(regex="^stat_.*_dropped$").max()
+        most.index = most.index.str.removeprefix("stat_").str.removesuffix("_dropped")
+        idle = dict.fromkeys(most.index[most == 0], f"its test dropped no feature in {len(records)} runs")
+        if all(record.epipolar_skipped == 1 for record in records):
+            idle["epipolar"] = "F was skipped on all frames"
+        if "semantic" in idle:
+            idle["segmentation"] = "there were no masks on any frame"
+        if (judging := FLOW_FILTERS & set(most.index)) and judging <= idle.keys():
+            idle["flow"] = f"no verdict of {' and '.join(sorted(judging))} on it was used"
+        groups = ((parameter.name, parameter.name.split(".")[0]) for parameter in self.space)
+        return {name: idle[group] for name, group in groups if group in idle}
