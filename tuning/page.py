@@ -208,8 +208,8 @@ def fewer_starts(design: Design) -> str:
         return ""
     return (
         f" Ratios are to the median of the baseline over {FEWEST_STARTS} or more starts in each scene, but every "
-        "trial, the baseline as trial 0 too, ran from fewer: so the ratio of trial 0, and with it the best so far, may differ "
-        "from 1 though no setting was changed."
+        "trial, the baseline as trial 0 too, ran from fewer: so the ratio of trial 0, and with it the best so far, may "
+        "differ from 1 though no setting was changed."
     )
 
 
@@ -277,9 +277,9 @@ def _candidates(summary: StudySummary) -> Table:
     ]
     caption = (
         "Ratios to the baseline on the same instances: the median of a scene's starts, the mean over scenes (trimmed "
-        "from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on instances that no "
-        "trial had seen is the best, and chosen where that bound lies below 1; held-out instances and recordings judge "
-        f"it. Frame times without the stage cache.{_cautions(summary)}"
+        "from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on instances that "
+        "no trial had seen is the best, and chosen where that bound lies below 1; held-out instances and recordings "
+        f"judge it. Frame times without the stage cache.{_cautions(summary)}"
     )
     optimistic = "the trial's own value, optimistic: the trial was selected for it"
     one_sided = "one-sided upper bound for the choice; allows for the number of candidates"

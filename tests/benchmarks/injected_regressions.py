@@ -5,8 +5,8 @@
 
 Each case is a tracker of which one default was made bad; the study does not know which. At the end the tracker as it is
 published runs on the held-out scenes too: the loss is the log ATE ratio of the bad default to it, the recovered share
-what the study's best trial takes back of that. The loss is looked at first: where its interval does not lie above 1 there
-is nothing to recover, and no study is run. Scenes are rendered; results are kept, so that a second call goes on.
+what the study's best trial takes back of that. The loss is looked at first: where its interval does not lie above 1
+there is nothing to recover, and no study is run. Scenes are rendered; results are kept, so that a second call goes on.
 """
 
 from __future__ import annotations
