@@ -11,7 +11,7 @@ import typer
 
 from dynslam_bench import tuning
 from dynslam_bench.cli.options import AsJson, Jobs, Results
-from dynslam_bench.cli.output import Advance, fields, note, present, progress, table, write
+from dynslam_bench.cli.output import Advance, announce, fields, note, present, progress, table, write
 from dynslam_bench.cli.running import event_text
 from dynslam_bench.cli.trackers import range_text
 
@@ -155,7 +155,9 @@ class StudyBar:
 
     def event(self, event: tuning.StudyEvent) -> None:
         """A trial has started or finished, or the study has begun another part."""
-        if event.kind in ("preview", "finished"):
+        if event.kind == "preview":
+            announce(event.text)
+        elif event.kind == "finished":
             note(event.text)
         if event.kind in ("started", "finished"):
             self._begin(event.text, event.number + (event.kind == "finished"), event.total)
