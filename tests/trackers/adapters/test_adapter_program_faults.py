@@ -126,8 +126,8 @@ def test_last_words_are_the_last_ones(program):
     with pytest.raises(TrackerError, match=r"exit code 3; its last line: 'FATAL: no such camera model'"):
         reset(program(said))
     early = (
-        "sys.stderr.write('warning: old driver\\n'); sys.stderr.flush(); next(requests); say({'ok': True}); "
-        "next(requests); time.sleep(0.3); print('lost the map', flush=True); os._exit(1)"
+        "sys.stderr.write('warning: old driver\\n'); sys.stderr.flush(); next(requests); time.sleep(1); "
+        "say({'ok': True}); next(requests); time.sleep(0.3); print('lost the map', flush=True); os._exit(1)"
     )
     tracker = reset(program(early))
     with pytest.raises(TrackerError, match=r"its last line: 'lost the map'"):
