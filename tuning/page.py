@@ -277,8 +277,8 @@ def _candidates(summary: StudySummary) -> Table:
     ]
     caption = (
         "Ratios to the baseline on the same instances: the median of a scene's starts, the mean over scenes (trimmed "
-        "from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on instances that "
-        "no trial saw is the best, chosen where that bound lies below 1; held-out instances and recordings "
+        "from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on instances "
+        "that no trial saw is the best, chosen where that bound lies below 1; held-out instances and recordings "
         f"judge it. Frame times without the stage cache.{_cautions(summary)}"
     )
     optimistic = "the trial's own value, optimistic: the trial was selected for it"

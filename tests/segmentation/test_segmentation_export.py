@@ -64,7 +64,7 @@ def objects(found: tuple[torch.Tensor, ...], threshold: float) -> list[tuple[str
 @pytest.mark.parametrize("exact", [True, False])
 def test_fixed_shapes_give_the_same_objects(exact: bool) -> None:
     network = tiny(exact_paste=exact)
-    settings = SETTINGS.model_copy(update={"classes": CLASSES})
+    settings = SETTINGS.model_copy(update={"classes": ",".join(CLASSES)})
     image = noise(120, 160)
     expected = MaskRCNNSegmenter(network, settings).segment(Frame(0, 0.0, image, np.zeros((120, 160), np.float32)))
     with torch.no_grad():
@@ -110,7 +110,7 @@ def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
     for ours, theirs in zip(expected, found, strict=True):
         assert np.abs(ours.numpy() - theirs).max() < 1e-3
     try:
-        segmenter = OnnxSegmenter(path, SETTINGS.model_copy(update={"classes": CLASSES}))
+        segmenter = OnnxSegmenter(path, SETTINGS.model_copy(update={"classes": ",".join(CLASSES)}))
     except SegmentationError as error:
         pytest.skip(f"this OpenCV cannot load it: {error}")
     seen = segmenter.segment(Frame(0, 0.0, image, np.zeros((120, 160), np.float32)))

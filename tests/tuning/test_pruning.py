@@ -86,7 +86,7 @@ def test_pruning_takes_half_the_runs_at_the_same_regret(tmp_path: Path) -> None:
     runs: dict[str, int] = {"none": 0, "halving": 0}
     regret: dict[str, list[float]] = {"none": [], "halving": []}
     for pruner in runs:
-        for seed in range(5):
+        for seed in range(3):
             spec = make_spec(pruner=pruner, trials=24, sampler_seed=seed)
             tuner = SimulatedTuner(spec, tmp_path / f"{pruner}{seed}", effect=valley, seed=seed)
             regret[pruner].append(valley(tuner.run().best_trial.params))
@@ -96,18 +96,18 @@ def test_pruning_takes_half_the_runs_at_the_same_regret(tmp_path: Path) -> None:
 
 
 def test_nothing_is_claimed_where_nothing_is_better(tmp_path: Path) -> None:
-    """Forty studies; a single comparison of the best trial on its own instances would claim a gain in most of them."""
+    """Twelve studies; tests/benchmarks/study_null.py has more. The trials alone would claim a gain in most of them."""
     chosen = claims = lucky = no_matter = 0
-    for seed in range(40):
+    for seed in range(12):
         tuner = SimulatedTuner(make_spec(sampler_seed=seed), tmp_path / str(seed), effect=nothing, seed=seed)
         lucky += tuner.run().best_value < math.log(0.95)
         summary = finish(tuner)
         chosen += summary.candidates[0].chosen
         claims += summary.verdict == Verdict.PROVEN
         no_matter += summary.verdict == Verdict.NO_MATTER
-    assert claims == 0 and no_matter >= 32
-    assert chosen <= 4, "5 % of 40, and its chance"
-    assert lucky >= 15, "what the trials alone say"
+    assert claims == 0 and no_matter >= 9
+    assert chosen <= 2, "5 % of 12, and its chance"
+    assert lucky >= 5, "what the trials alone say"
 
 
 def test_an_injected_regression_is_found_and_judged(tmp_path: Path) -> None:
