@@ -30,10 +30,18 @@ from dynslam_bench.reports.model.load import (
     without_scale_words,
     worker_pool,
 )
-from dynslam_bench.reports.model.published import is_excerpt, least_length_s, records_for, reported_for
+from dynslam_bench.reports.model.published import (
+    is_excerpt,
+    least_length_s,
+    published_for,
+    records_for,
+    reported_for,
+    spans,
+)
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, command_line
 from dynslam_bench.reports.model.statistics import FEWEST, power_note
 from dynslam_bench.reports.tables import leaderboard as tables
+from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
 from dynslam_bench.runs.store import RunStore, part_words
 
@@ -266,6 +274,7 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
     if parts:
         section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     whole = [name for name in board.sequences if name not in parts]
+    lines = published_for(whole, protocol)
     published = reported_for(whole, protocol) + records_for(whole, protocol)
     beside = {cell.sequence for cell in published}
     unsure = sorted(
@@ -284,6 +293,8 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
         tables.failure_rule_table(board),
         *tables.relative_errors(board, protocol),
         tables.rotation_errors(board, protocol),
+        published_table(lines),
+        span_table(spans(lines)),
         folded=True,
     )
     return section

@@ -25,8 +25,8 @@ SOME_RUNS_FAILED = 3
 VERIFICATION_FAILED = 4
 HEARTBEAT_S = 10.0
 """Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
-_MIN_WIDTH = 8
-"""Characters that a shortened column keeps."""
+_MIN_WIDTH = 12
+"""Characters that a shortened column of names keeps."""
 
 _json_mode = False
 """Whether ``--json`` was given: then nothing but errors goes to standard error."""
@@ -97,18 +97,26 @@ def _plain(value: Any) -> Any:
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Aligned text, the headings first.
 
-    On a terminal it is no wider than that: the last columns are left out and named, then the widest are shortened.
+    On a terminal it is no wider than that: the last columns are left out and named, then the widest names are shortened
+    in the middle. Numbers are never shortened.
     """
     cells = [[cell_text(value) for value in row] for row in (columns, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    least = [_least_width(column) for column in zip(*cells, strict=True)]
     room = _terminal_width() if sys.stdout.isatty() else sys.maxsize
-    while len(widths) > 1 and _line_width([min(width, _MIN_WIDTH) for width in widths]) > room:
+    while len(widths) > 1 and _line_width(least[: len(widths)]) > room:
         widths.pop()
-    while _line_width(widths) > room and max(widths) > _MIN_WIDTH:
-        widths[widths.index(max(widths))] -= 1
+    while _line_width(widths) > room and (wider := [at for at, width in enumerate(widths) if width > least[at]]):
+        widths[max(wider, key=widths.__getitem__)] -= 1
     lines = ["  ".join(map(_fitted, row, widths)).rstrip() for row in cells]
     left_out = cells[0][len(widths) :]
     return "\n".join([*lines, f"(no room for: {', '.join(left_out)})"] if left_out else lines)
+
+
+def _least_width(column: Sequence[str]) -> int:
+    """Characters that a column needs: `_MIN_WIDTH`, or the longest cell that begins with a number."""
+    numbers = (len(cell) for cell in column if cell and not any(map(str.isalpha, cell.split()[0])))
+    return max([min(max(map(len, column)), _MIN_WIDTH), *numbers])
 
 
 def _line_width(widths: Sequence[int]) -> int:
@@ -116,7 +124,9 @@ def _line_width(widths: Sequence[int]) -> int:
 
 
 def _fitted(text: str, width: int) -> str:
-    return text.ljust(width) if len(text) <= width else text[: width - 1] + "…"
+    if len(text) <= width:
+        return text.ljust(width)
+    return text[: width // 2] + "…" + text[len(text) - (width - 1) // 2 :]
 
 
 def fields(facts: Mapping[str, object]) -> str:

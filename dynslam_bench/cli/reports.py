@@ -1,4 +1,4 @@
-"""``report make|publish|compare|audit-paper``."""
+"""``report make|publish|compare|audit-paper``, and ``published``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from dynslam_bench.cli.options import AsJson, DataRoot, DefaultGroup, ProtocolId
+from dynslam_bench.cli.options import AsJson, DataRoot, DefaultGroup, ProtocolId, names_of
 from dynslam_bench.cli.output import present, progress, report_table, wrapped
 
 MOST_ROWS = 5
@@ -150,3 +150,52 @@ def audit_paper(
         caption = wrapped(findings_table.caption)
         lines += [findings_table.title, report_table(findings_table), "", caption, ""]
     present(findings.findings, *lines)
+
+
+def published(
+    sequence: Annotated[
+        str,
+        typer.Argument(help="Id or published folder name.", autocompletion=names_of("cli.reports:published_sequences")),
+    ],
+    protocol: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--protocol",
+            help="Only what is known to be scored alike; see `protocols list`.",
+            autocompletion=names_of("evaluation.protocol:PROTOCOLS"),
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the published errors of a sequence: whose, how measured, and how far those of one system differ."""
+    from dynslam_bench.core.errors import ReportError, did_you_mean
+    from dynslam_bench.evaluation import get_protocol
+    from dynslam_bench.reports.model.published import published_for, spans
+    from dynslam_bench.reports.tables.published import published_table, span_table
+    from dynslam_bench.sequences.catalogue import entry_of
+
+    entry = entry_of(sequence)
+    name = sequence if entry is None else entry.id
+    if name not in published_sequences():
+        raise ReportError(f"no published number of '{name}' was read", did_you_mean(name, published_sequences()))
+    chosen = None if protocol is None else get_protocol(protocol)
+    lines = published_for([name], chosen)
+    errors = published_table(lines)
+    if errors is None:
+        raise ReportError(
+            f"no published number of '{name}' is known to be scored as {protocol}", "leave --protocol out"
+        )
+    differing = spans(lines)
+    span = span_table(differing)
+    text = []
+    if span is not None:
+        text = [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
+    text += [f"{errors.title} of {name}:", report_table(errors.without("sequence")), "", wrapped(errors.caption)]
+    present({"spans": differing.to_dict("records"), "numbers": lines.to_dict("records")}, *text)
+
+
+def published_sequences() -> list[str]:
+    """The sequences of which published numbers were read."""
+    from dynslam_bench.reports.model.published import published as numbers
+
+    return sorted(set(numbers()["sequence"]))

@@ -30,6 +30,12 @@ _LEAST_FRAMES = {
 """Least number of frames of a recording, at 30 Hz. TUM: the pairs of colour and depth in the association files that are
 published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last frame of an excerpt that is numbered as
 in the whole, counted from 0. Of others no source was read."""
+METRICS = (
+    "ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_sd_m", "rpe_1s_trans_rmse_m", "rpe_1s_rot_rmse_deg",
+    "coverage_percent",
+)  # fmt: skip
+"""What was published of a sequence, the error that is always sought first."""
+NOT_STATED = "not stated"
 RECORD = "record"
 KINDS = {
     "best": "lowest error found in print",
@@ -63,10 +69,59 @@ def published() -> pd.DataFrame:
     """All published numbers, one a line.
 
     Columns: system (name collisions are told apart, e.g. ``DGS-SLAM (Kong 2024)``), sequence (its id), metric (as in
-    `Evaluation.metrics`), value, unit, alignment (as far as stated), source (where it was read; this need not be the
-    system's own paper), remarks.
+    `Evaluation.metrics`), value, unit, alignment (as far as stated), source (where it was read), by (``authors`` where
+    that is the system's own publication, ``third party`` where it is another one, which may have run the system or
+    quote its authors; empty where both print the number), year (of the source), hardware (of the runs), remarks.
+    Unknown hardware is empty.
     """
-    return _read("published.csv").astype({"value": float})
+    frame = _read("published.csv")
+    return frame.assign(year=frame["year"].replace("", pd.NA)).astype({"value": float, "year": "Int64"})
+
+
+def published_for(sequences: Sequence[str], protocol: Protocol | None = None) -> pd.DataFrame:
+    """What was published of whole sequences, a line for every system and source, the lowest ATE of a sequence first.
+
+    Args:
+        sequences: Their ids.
+        protocol: Only what is known to be scored alike (`scored_as`); None for everything.
+
+    Returns:
+        Columns: sequence, system, source, by, year, alignment, hardware and remarks as in `published`, then one for
+        every metric (``Float64``).
+    """
+    frame = published()
+    frame = frame[frame["sequence"].isin(sequences)]
+    key = ["sequence", "system", "source"]
+    facts = frame.sort_values("metric").drop_duplicates(key)[[*key, "by", "year", "alignment", "hardware", "remarks"]]
+    values = frame.pivot(index=key, columns="metric", values="value").astype("Float64")
+    lines = facts.join(values.reindex(columns=METRICS), on=key).sort_values(["sequence", METRICS[0], "system"])
+    if protocol is None:
+        return lines
+    return lines.loc[[scored_as(p.alignment, p.sequence, protocol) for p in lines_of(lines)]]
+
+
+def spans(lines: pd.DataFrame) -> pd.DataFrame:
+    """Between which values the published ATEs of one system under one alignment lie, the widest ratio first.
+
+    Args:
+        lines: Lines of `published_for`.
+
+    Returns:
+        One line where there are several. Columns: sequence, system, alignment, numbers, ratio, lowest_m, highest_m,
+        authors_m (the lowest by its authors, missing where none was read).
+    """
+    whole = lines["system"].replace("DynaSLAM N+G", "DynaSLAM")  # what others call by its short name
+    own = lines[METRICS[0]].where(lines["by"] == "authors")
+    errors = lines.assign(system=whole, own=own).dropna(subset=METRICS[0])
+    groups = errors.groupby(["sequence", "system", "alignment"])
+    frame = groups.agg(
+        numbers=(METRICS[0], "size"),
+        lowest_m=(METRICS[0], "min"),
+        highest_m=(METRICS[0], "max"),
+        authors_m=("own", "min"),
+    )
+    frame.insert(1, "ratio", frame["highest_m"] / frame["lowest_m"])
+    return frame[frame["numbers"] > 1].sort_values("ratio", ascending=False).reset_index()
 
 
 @cache
@@ -123,16 +178,16 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
     Returns:
         One cell for every system, source and sequence, and those that the implemented paper claims, tagged so.
     """
-    if protocol.alignment not in ("se3", "sim3") or protocol.thins:
-        return []
-    frame = published()
-    frame = frame[(frame["metric"] == "ate_rmse_m") & frame["sequence"].isin(sequences)]
     cells = [
-        ReportedCell(f"{p.system} ({p.source})", p.sequence, p.value, "; ".join(filter(None, (p.alignment, p.remarks))))
-        for p in lines_of(frame)
-        if scored_as(p.alignment, p.sequence, protocol)
+        ReportedCell(
+            f"{p.system} ({p.by or NOT_STATED}: {p.source})",
+            p.sequence,
+            p.ate_rmse_m,
+            "; ".join(filter(None, (p.alignment, p.hardware, "" if pd.isna(p.year) else str(p.year), p.remarks))),
+        )
+        for p in lines_of(published_for(sequences, protocol).dropna(subset=METRICS[0]))
     ]
-    if protocol.alignment == "se3" and protocol.truth == "as-is":
+    if scored_as("SE(3) or not stated", "", protocol):
         remark = "contradicts itself and what the systems' authors published; see the audit"
         frame = claimed().query("kind == 'value' and quantity == 'ape_rmse'")
         frame = frame[frame["sequence"].isin(sequences)]
@@ -143,11 +198,15 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
 def scored_as(alignment: str, sequence: str, protocol: Protocol) -> bool:
     """Whether a published number was scored as a protocol scores, as far as is known.
 
-    What is aligned by Sim(3) is from tables of WildGS-SLAM's evaluation, which corrects Bonn's truth.
+    A table of a system with depth that states no alignment is taken for TUM's. What is aligned by Sim(3) is from tables
+    of WildGS-SLAM's evaluation, which corrects Bonn's truth.
     """
-    scaled = alignment == "Sim(3)"
-    truth = "bonn-droid-w" if scaled and sequence.startswith("bonn/") else "as-is"
-    return scaled == (protocol.alignment == "sim3") and truth == protocol.truth
+    truth = "bonn-droid-w" if alignment == "Sim(3)" and sequence.startswith("bonn/") else "as-is"
+    return (
+        not protocol.thins
+        and truth == protocol.truth
+        and protocol.alignment == {"Sim(3)": "sim3", "SE(3) or not stated": "se3"}.get(alignment)
+    )
 
 
 def records_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedCell]:

@@ -133,6 +133,12 @@ class Table:
         rows = [[row[at] for at in kept] for row in self.rows[:MOST_ROWS]]
         return replace(self, caption=caption, columns=[self.columns[at] for at in kept], rows=rows)
 
+    def without(self, *names: str) -> Table:
+        """The table without the columns of these names."""
+        kept = [at for at, column in enumerate(self.columns) if column.name not in names]
+        rows = [[row[at] for at in kept] for row in self.rows]
+        return replace(self, columns=[self.columns[at] for at in kept], rows=rows)
+
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
         return [(name, len(list(group))) for name, group in groupby(self.columns, key=lambda column: column.group)]

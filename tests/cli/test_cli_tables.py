@@ -18,14 +18,24 @@ def test_a_table_is_no_wider_than_the_terminal(monkeypatch, width):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setattr(output, "_terminal_width", lambda: width)
     head, row, *left_out = table(ROWS[0], ROWS[1:]).splitlines()
-    assert max(len(head), len(row)) <= width and row.startswith("0123456")
+    assert max(len(head), len(row)) <= width and row.startswith("012345")
     assert bool(left_out) == ("masks" not in head)
     if width == 400:
         assert [head.split("  ")[0], *row.split()] == ["run", *ROWS[1]]
     if width == 80:
-        assert "…" in row and not left_out
+        assert row.split()[2:] == ["synthetic/walkin…ne=0&frames=600", "0.01234", "embedded"] and not left_out
     if width == 40:
-        assert left_out == ["(no room for: masks)"]
+        assert left_out == ["(no room for: ATE (m), masks)"]
+
+
+def test_numbers_are_never_shortened(monkeypatch):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setattr(output, "_terminal_width", lambda: 30)
+    spread = "12.34 ±0.56, F skipped 98 %"
+    assert table(["tracker", "ATE (mm)"], [["x" * 80, 1.5], ["y", 23.0]]).splitlines()[-1].split() == ["y", "23"]
+    assert table(["ATE (mm)"], [[spread]]).splitlines()[1] == spread
+    lines = table(["tracker", "ATE (mm)"], [["x" * 80, spread]]).splitlines()
+    assert lines[1] == "x" * 15 + "…" + "x" * 14 and lines[2] == "(no room for: ATE (mm))"
 
 
 def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():
@@ -80,3 +90,23 @@ def test_the_shell_completes(cli, monkeypatch, words, expected):
     code, out, _ = cli()
     found = set(out.split())
     assert code == 0 and (expected <= found if expected else not found), out
+
+
+def test_published_numbers_are_listed_with_whose_they_are(cli, facts):
+    code, out, _ = cli("published", "rgbd_dataset_freiburg3_walking_xyz")
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    spans, errors = lines[: lines.index("")], lines[lines.index("") :]
+    assert code == 0 and "NGD-SLAM SE(3) or not stated 3 15 34.6 2.31 15" in spans
+    rows = [line for line in errors if line.startswith("NGD-SLAM")]
+    assert "15 authors leaderboard page of arXiv 2405.07392 SE(3) or not stated 2024 Ryzen 7 4800H, no GPU" in rows[0]
+    assert "34.6 third party re-run on a Jetson" in rows[2] and "not stated Jetson" in rows[2]
+    shown = facts("published", "tum/fr3/walking_xyz", "--protocol", "droid-w/v1")
+    values = [line["ate_rmse_m"] for line in shown["numbers"]]
+    assert values == sorted(values) and {line["alignment"] for line in shown["numbers"]} == {"Sim(3)"}
+    for arguments, text in (
+        (["bonn/crowdd"], "did you mean 'bonn/crowd'"),
+        (["bonn/crowd", "--protocol", "kitti"], "leave --protocol out"),
+        (["bonn/crowd", "--protocol", "kiti"], "did you mean 'kitti'"),
+    ):
+        code, _, err = cli("published", *arguments)
+        assert code == 1 and text in one_line(err)

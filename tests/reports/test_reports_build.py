@@ -140,7 +140,7 @@ def test_published_numbers_stand_apart_and_never_compete(store, tmp_path):
         add_run(store, name, "tum/fr3/walking_xyz", seed, duration_s=28.8)
     paths = build_report(store, tmp_path / "report")
     names = {row["tracker"] for row in rows_of(paths.csv["per_sequence"])}
-    assert {"DynaSLAM N+G (DynaSLAM paper) reported", "EMFOA-OFT-SLAM claimed by the paper"} <= names
+    assert {"DynaSLAM N+G (authors: DynaSLAM paper) reported", "EMFOA-OFT-SLAM claimed by the paper"} <= names
     assert not any("DROID-W" in name for name in names)  # aligned by Sim(3)
     records = {name for name in names if name.endswith(" record")}
     assert records == {"lowest error found in print, real time on a CPU record"}
