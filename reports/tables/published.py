@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pandas as pd
 
 from dynslam_bench.reports.model.published import NOT_STATED, lines_of
@@ -83,7 +85,7 @@ def span_table(spans: pd.DataFrame) -> Table | None:
     return Table("published_spans", "What is published of one system differs", caption, columns, rows)
 
 
-def _printed(value: float, name: str) -> TableCell:
+def _printed(value: Any, name: str) -> TableCell:
     """A number with the digits that it was printed with; metres as millimetres."""
     if pd.isna(value):
         return TableCell()
