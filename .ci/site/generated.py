@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
+import itertools
+import re
+import textwrap
+
 from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.settings import Settings, flatten, settings_table
 from dynslam_bench.evaluation import PROTOCOLS
+from dynslam_bench.reports.model.board import Board
+from dynslam_bench.runs import RunRecord, load_frames
+from dynslam_bench.runs.store import runs_frame
 from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.tuning.trials import trials_frame
 
-ROOMS = {
+PACKAGES = {
     "api": ("Public interface", ["api"]),
     "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.errors"]),
     "sequences": (
@@ -34,8 +43,9 @@ MANY = 6
 def reference_pages() -> dict[str, str]:
     """Markdown of every page below ``reference/``, by its path on the site."""
     pages = {"settings": settings(), "commands": commands(), "systems": systems(), "protocols": protocols()}
-    for name, (title, modules) in ROOMS.items():
-        pages[name] = f"# {title}\n\n" + "".join(f"## {m}\n\n::: dynslam_bench.{m}\n\n" for m in modules)
+    pages["columns"] = columns()
+    for name, (title, modules) in PACKAGES.items():
+        pages[f"python/{name}"] = f"# {title}\n\n" + "".join(f"## {m}\n\n::: dynslam_bench.{m}\n\n" for m in modules)
     return {f"reference/{name}.md": text for name, text in pages.items()}
 
 
@@ -50,7 +60,7 @@ def settings() -> str:
     text = [
         "# Settings\n\nEvery group of settings that a built-in tracker has. On the command line a setting is "
         "`--set GROUP.NAME=VALUE`, in a file `GROUP.NAME = VALUE`; a study draws those that have a range, an agent "
-        "steers those that are *online*. What a tracker has: [Systems](systems.md), or "
+        "changes those that are *online*. What a tracker has: [Systems](systems.md), or "
         "`dynslam-bench trackers info ID`.\n"
     ]
     last = ""
@@ -94,7 +104,7 @@ def systems() -> str:
         for s in specs
     ]
     table = "\n".join(["| id | label | provenance | ranked | what it does |", "| --- | --- | --- | --- | --- |", *rows])
-    intro = "What their tags mean, and how they were measured: [Baselines](../baselines.md)."
+    intro = "What the provenance means, and what all systems share: [Systems and baselines](../explanation/baselines.md)."
     return f"# Systems\n\n{intro}\n\n{table}\n\n" + "\n".join(_system(spec) for spec in specs)
 
 
@@ -119,12 +129,37 @@ def _system(spec: TrackerSpec) -> str:
 
 def protocols() -> str:
     """Every named protocol with all of its fields."""
-    text = ["# Protocols\n\nHow errors are measured; a metric is stored with its protocol. [Why](../evaluation.md)\n"]
+    text = ["# Protocols\n\nEvery named protocol with its fields. [Why numbers differ](../explanation/protocols.md)\n"]
     for name, protocol in PROTOCOLS.items():
         values = protocol.model_dump(mode="json")
         lines = "\n".join(f"| `{field}` | `{value}` |" for field, value in values.items())
         text.append(f"## {name}\n\n| field | value |\n| --- | --- |\n{lines}\n")
     return "\n".join(text)
+
+
+def columns() -> str:
+    """The columns of every frame that the package makes, and the fields of a run's record."""
+    frames = {
+        "Runs": ("RunStore.frame()", inspect.getdoc(runs_frame)),
+        "Frames of a run": ("load_frames(run)", inspect.getdoc(load_frames)),
+        "Rows of a report": ("load_board(results).frame()", inspect.getdoc(Board.frame)),
+        "Trials of a study": ("Study.open(folder).frame()", inspect.getdoc(trials_frame)),
+    }
+    text = ["# Columns of frames and records\n\nColumns, units and types of every pandas frame, and the fields of `run.json`.\n"]
+    for title, (call, docstring) in frames.items():
+        text.append(f"## {title}\n\n`{call}`\n\n{_section(docstring or '', 'Returns')}\n")
+    text.append("## The record of a run\n\n`run.json`\n\n| field | meaning |\n| --- | --- |")
+    for entry in re.split(r"\n(?=\w+: )", _section(inspect.getdoc(RunRecord) or "", "Attributes")):
+        name, _, meaning = entry.partition(": ")
+        text.append(f"| `{name}` | {' '.join(meaning.split())} |")
+    return "\n".join(text) + "\n"
+
+
+def _section(docstring: str, name: str) -> str:
+    """A section of a Google-style docstring, without its indentation."""
+    lines = docstring.partition(f"\n{name}:\n")[2].split("\n")
+    body = list(itertools.takewhile(lambda line: not line or line.startswith(" "), lines))
+    return textwrap.dedent("\n".join(body)).strip()
 
 
 def commands() -> str:

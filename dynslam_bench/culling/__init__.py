@@ -1,6 +1,6 @@
 """Dynamic feature filters: published rejection rules.
 
-The building blocks are numbered as in `docs/baselines.md` (B1 to B15). All filters receive the same keypoints and share
+The building blocks are numbered as in `docs/explanation/baselines.md` (B1 to B15). All filters receive the same keypoints and share
 the starvation guard (`guard`).
 """
 

@@ -60,8 +60,8 @@ _UNREFERENCED = _references((np.zeros(1, dtype=np.uint8),))
 class BufferPool:
     """Sets of zeroed uint8 arrays, reused once nothing else refers to any of them or to a view.
 
-    The first access to a page of fresh memory costs more than computing its content (`docs/flow.md`, Speed). A reused
-    set keeps its old content: callers must not write where they rely on zeros.
+    The first access to a page of fresh memory costs more than computing its content (`docs/lab/README.md`).
+    A reused set keeps its old content: callers must not write where they rely on zeros.
 
     Args:
         most: Sets kept at most; older ones are left to the garbage collector.

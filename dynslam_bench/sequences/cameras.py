@@ -29,7 +29,7 @@ PRIMESENSE_READOUT_S = 0.026
 """Of the Kinect and the Xtion, whose colour cameras have rolling shutters; measured, not published with the sequences.
 
 Of 0, 13, 20, 26 and 33 ms it has the least error, or within 2 % of it, on excerpts of fr1_xyz, fr1_rpy and Bonn crowd
-(``docs/backend.md``)."""
+(``docs/results/recordings.md``)."""
 
 CAMERAS: dict[str, Camera] = {
     # Calibration of the colour cameras as published with the TUM RGB-D benchmark.

@@ -271,7 +271,7 @@ def _open_whole(
         return open_folder(path, camera=camera, settings=settings)
     if _is_path(name):
         raise SequenceError(
-            f"there is no sequence folder {path.absolute()}", "a path names a folder, see docs/sequences.md"
+            f"there is no sequence folder {path.absolute()}", "a path names a folder, see docs/reference/sequences.md"
         )
     near = did_you_mean(name, [*sequence_ids(), *by_folder()])
     raise SequenceError(f"unknown sequence '{name}', and there is no such folder", near)

@@ -160,7 +160,7 @@ def _unopened(
             kind = "depth-format"
         elif text.endswith("nor a folder depth"):
             kind, cure = "no-depth", "record or export depth images: a folder is read only with depth"
-        return fault(kind, None, "", text, cure or "docs/sequences.md says what a folder holds")
+        return fault(kind, None, "", text, cure or "docs/reference/sequences.md says what a folder holds")
     (height, width), (rows, columns) = frame.rgb.shape[:2], frame.depth.shape
     text = f"depth images are {columns}x{rows}, colour images {width}x{height}"
     cure = "register the depth to the colour images, pixel by pixel; resizing serves only if both have one view"

@@ -2,7 +2,7 @@
 
 ``map.npz`` holds arrays and nothing else, which are checked before they are used. Keyframes and points are stored
 without gaps, oldest first, and refer to each other by row. Which frames of which recording the keyframes were is left
-out: in another one it means nothing. `docs/backend.md` lists the arrays.
+out: in another one it means nothing. `docs/reference/files.md` says how maps are used.
 """
 
 from __future__ import annotations

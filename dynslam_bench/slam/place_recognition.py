@@ -70,7 +70,7 @@ ALIASING_CANDIDATES = 12
 """Best-ranked keyframes of each submap that are tested for aliasing."""
 ALIASING_SHARE = 0.33
 """What a second place has to show, as a share of what the first one does. Without repetition it is 0.15 at most, with
-repeated walls 0.4 to 1 (rendered buildings, `docs/backend.md`)."""
+repeated walls 0.4 to 1 (rendered buildings)."""
 SAME_PLACE_DEPTHS, SAME_PLACE_ANGLE = 0.3, np.radians(15.0)
 """Poses farther apart, in median depths of what is seen, or rotated by more, are two places."""
 MIN_ALIASING_MATCHES = 30

@@ -35,7 +35,7 @@ CANDIDATES = 10
 """Best-ranked keyframes that are matched feature by feature; bounds the time of a frame."""
 MANY_POINTS = 60
 MANY_POINTS_SHARE = 0.75
-"""With so many matches at a place this factor of the required share suffices (`docs/backend.md`)."""
+"""With so many matches at a place this factor of the required share suffices."""
 
 SLACK_M = 0.5
 """Distance that the camera may have moved in no time, metres."""

@@ -3,7 +3,7 @@
 //     c++ -O3 -march=native -o direct_odometry examples/cpp/direct_odometry.cpp
 //     dynslam-bench run "subprocess:./direct_odometry" 'synthetic/sitting_xyz?scene=100' --frames 0:100
 //
-// It speaks the protocol of docs/plugins.md, "A tracker in another language": one JSON object a line on standard input and
+// It speaks the protocol of docs/how-to/program.md: one JSON object a line on standard input and
 // output; the images lie in a file in shared memory. Replace Odometry by your own system; the rest may stay as it is.
 #include <fcntl.h>
 #include <sys/mman.h>

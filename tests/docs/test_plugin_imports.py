@@ -8,6 +8,7 @@ from documented_names import ROOT
 
 from dynslam_bench.testing.template import write_tracker_template
 
+PAGES = ("reference/plugins.md", "how-to/dataset.md", "how-to/filter.md", "how-to/segmenter.md")
 OPEN = {"dynslam_bench.contracts", "dynslam_bench.core.settings", "dynslam_bench.core.errors"}
 COMPOSING = "dynslam_bench.trackers.systems.composition"
 """Puts filters on our back end: the one thing that a plug-in may take from us that is no contract."""
@@ -24,8 +25,8 @@ def imports(code: str) -> list[tuple[str, str]]:
 
 
 def test_plug_ins_import_from_the_contracts_only(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-    texts = re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M)
+    pages = [ROOT / "docs" / page for page in PAGES]
+    texts = [text for page in pages for text in re.findall(r"^```python\n(.*?)^```", page.read_text(), flags=re.S | re.M)]
     taken = [pair for text in texts for pair in imports(text)]
     assert len(taken) > 10 and {module for module, _ in taken} <= OPEN | {COMPOSING, RULES}
     template = imports(write_tracker_template("my-slam", tmp_path).read_text())

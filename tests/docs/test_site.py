@@ -79,7 +79,7 @@ def test_every_door_setting_command_and_tracker_is_on_a_page(site: Path, pages: 
     from dynslam_bench.core.settings import flatten
     from dynslam_bench.trackers import TRACKERS
 
-    contracts_page = pages[site / "reference" / "contracts.html"].anchors
+    contracts_page = pages[site / "reference" / "python" / "contracts.html"].anchors
     assert [name for name in contracts.__all__ if f"dynslam_bench.contracts.{name}" not in contracts_page] == []
     specs = [found.spec for found in TRACKERS.all()]
     assert [

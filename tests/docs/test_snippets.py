@@ -28,22 +28,28 @@ SHORTER = {
 """What stands in the pages, and what is run in its place."""
 RUN = {
     "README.md": 2,
-    "docs/environments.md": 5,
-    "docs/evaluation.md": 1,
-    "docs/exports.md": 1,
-    "docs/sequences.md": 2,
-    "docs/start/agent.md": 1,
-    "docs/suites.md": 1,
-    "docs/synthetic.md": 1,
+    "docs/how-to/agent.md": 1,
+    "docs/how-to/export.md": 1,
+    "docs/how-to/pandas.md": 2,
+    "docs/how-to/recording.md": 1,
+    "docs/how-to/suite.md": 1,
+    "docs/how-to/trajectory.md": 1,
+    "docs/reference/environments.md": 3,
+    "docs/reference/rendered.md": 1,
 }
 """Pages, and how many of their first Python blocks are run here, one after the other in one namespace."""
-BEFORE = {
-    "docs/exports.md": "from dynslam_bench.runs import RunSpec, run_many\n"
+A_RUN = (
+    "from dynslam_bench.runs import RunSpec, run_many\n"
     "run_many([RunSpec(tracker='never-move', sequence='synthetic/walking_xyz', frames=(0, 4))])"
-}
+)
+BEFORE = {"docs/how-to/export.md": A_RUN, "docs/how-to/pandas.md": A_RUN}
 """What a reader has done already: a run is stored."""
 ELSEWHERE = {
-    "docs/plugins.md": (7, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/how-to/dataset.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/how-to/filter.md": (2, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/how-to/program.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/how-to/segmenter.md": (2, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/reference/plugins.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
     "docs/reports.md": (1, "tests/reports/test_reports_tables.py"),
     "docs/tuning.md": (2, "tests/tuning/test_python_study.py"),
 }
@@ -74,7 +80,7 @@ def test_a_page_s_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
-    (text,) = blocks("docs/suites.md", "toml")
+    (text,) = blocks("docs/how-to/suite.md", "toml")
     (tmp_path / "mine.toml").write_text(text)
     suite = load_suite(tmp_path / "mine.toml")
     trackers = {"orb-slam2", "emfoa-oft", "never-move"}
@@ -83,7 +89,7 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
     assert {spec.tracker for spec in specs} == trackers
 
 
-@pytest.mark.parametrize("page", ["docs/tuning.md", "docs/start/study.md"])
+@pytest.mark.parametrize("page", ["docs/tuning.md", "docs/tutorials/study.md"])
 def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
     (text,) = blocks(page, "toml")
     (tmp_path / "study.toml").write_text(text)
@@ -95,12 +101,12 @@ def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
 
 
 def test_the_camera_on_the_page_is_one(tmp_path: Path) -> None:
-    (text,) = blocks("docs/sequences.md", "toml")
+    (text,) = blocks("docs/how-to/recording.md", "toml")
     (tmp_path / "camera.toml").write_text(text)
     assert read_camera(tmp_path / "camera.toml").fx == 535.4
 
 
 def test_the_entry_point_on_the_page_is_of_a_group_that_is_read() -> None:
-    (text,) = blocks("docs/plugins.md", "toml")
-    (group,) = parse_toml(text, "docs/plugins.md")["project"]["entry-points"]
+    (text,) = blocks("docs/reference/plugins.md", "toml")
+    (group,) = parse_toml(text, "docs/reference/plugins.md")["project"]["entry-points"]
     assert group == f"dynslam_bench.{TRACKERS.kind}"

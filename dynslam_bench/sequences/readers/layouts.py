@@ -1,7 +1,7 @@
 """Every layout of recorded sequences that is read, and which one a folder has.
 
 A new reader is a module beside this one with ``read(folder, fps) -> Contents``, and a row of `LAYOUTS`
-(``docs/sequences.md``, "Adding a reader").
+(``docs/how-to/dataset.md``).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A tracker in a program of its own, in any language, over JSON lines (`docs/plugins.md` states the protocol).
+"""A tracker in a program of its own, in any language, over JSON lines (`docs/how-to/program.md` states the protocol).
 
 A fault or the death of the program becomes one clear error.
 """

@@ -181,7 +181,7 @@ def compose(
         fault, cure = "segmentation.source is 'none'", f"sources: {SOURCES}"
         if not isinstance(settings, SemanticSystemSettings):
             fault = f"{type(settings).__name__} has no group segmentation"
-            cure = "derive it from SemanticSystemSettings, see docs/plugins.md (A filter beside masks)"
+            cure = "derive it from SemanticSystemSettings, see docs/how-to/filter.md (A filter beside masks)"
         raise SegmentationError(f"filter '{needing[0]}' needs masks, but {fault}", cure)
     return SlamPipeline(
         extractor=extractor,

@@ -4,7 +4,7 @@ An ablation is a variant: its id names the system and what differs, as in ``emfo
 
 The paper: masks of an improved Mask R-CNN drop the features on people; DAISY Filter Flow, optimised by the elite
 moth-flame algorithm, matches the remaining ORB points with the previous image; the fundamental matrix of those matches
-culls points off their epipolar lines; the rest is tracked and mapped. `docs/method.md` lists who runs which equation.
+culls points off their epipolar lines; the rest is tracked and mapped. `docs/explanation/paper.md` lists who runs which equation.
 """
 
 from dataclasses import replace
@@ -164,7 +164,7 @@ def _spec(name: str, label: str, settings: type[SystemSettings], summary: str) -
         sensors="rgb" if issubclass(settings, MonocularSemanticSettings) else "rgbd",
         provenance="own",
         license="MIT",
-        citation="EMFOA-OFT-SLAM: the paper that this toolkit implements; see docs/method.md",
+        citation="EMFOA-OFT-SLAM: the paper that this toolkit implements; see docs/explanation/paper.md",
         assumptions=_assumptions(settings()),
     )
 

@@ -1,4 +1,4 @@
-"""The examples of docs/plugins.md are run as they stand."""
+"""The examples of plug-ins on the pages are run as they stand."""
 
 import re
 from pathlib import Path
@@ -16,13 +16,15 @@ from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter,
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.systems.composition import SystemSettings, compose
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "plugins.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+PAGES = ("reference/plugins.md", "how-to/dataset.md", "how-to/filter.md", "how-to/program.md", "how-to/segmenter.md")
 
 
 @pytest.fixture
 def example(tmp_path):
-    """Writes a named example of the page and gives its path."""
-    blocks = re.findall(r"```python\n(# (\w+\.py)\n.*?)```", PAGE.read_text(), re.DOTALL)
+    """Writes a named example of the pages and gives its path."""
+    text = "\n".join((DOCS / page).read_text(encoding="utf-8") for page in PAGES)
+    blocks = re.findall(r"```python\n(# (\w+\.py)\n.*?)```", text, re.DOTALL)
     texts = {name: text for text, name in blocks}
     assert len(texts) == len(blocks) >= 7
 

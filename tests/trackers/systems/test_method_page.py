@@ -1,4 +1,4 @@
-"""What `docs/method.md` says of each equation: the trackers run what it says they run."""
+"""What `docs/explanation/paper.md` says of each equation: the trackers run what it says they run."""
 
 import numpy as np
 import pytest
