@@ -1,6 +1,6 @@
 """The sentences and tables of a page, without code, headings and markup.
 
-    python tests/docs/prose.py      # words, median and longest sentence of every page
+python tests/docs/prose.py      # words, median and longest sentence of every page
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ def main() -> None:
         everything += lengths
         total += len(text.split())
         middle = statistics.median(lengths) if lengths else 0
-        print(f"{len(text.split()):6} words, median {middle:4}, longest {max(lengths, default=0):3}  {page.relative_to(ROOT)}")
+        print(
+            f"{len(text.split()):6} words, median {middle:4}, longest {max(lengths, default=0):3}  {page.relative_to(ROOT)}"
+        )
     print(f"{total:6} words, median {statistics.median(everything)}, longest {max(everything)}")
 
 

@@ -16,7 +16,9 @@ NO_MEASUREMENTS = {"docs/published.md"}
 """Pages whose tables hold figures of others."""
 LATER = {"docs/reports.md", "docs/rescoring.md", "docs/tuning.md"}
 
-FIGURE = re.compile(r"[\d.,±+~<>/()\[\];:\s-]*\d(?:[\d.,±+~<>/()\[\];:\s-]|\bto\b|(?<![A-Za-z])(?:mm|cm|m|ms|s|%|MB|px|fps|x)(?![A-Za-z]))*")
+FIGURE = re.compile(
+    r"[\d.,±+~<>/()\[\];:\s-]*\d(?:[\d.,±+~<>/()\[\];:\s-]|\bto\b|(?<![A-Za-z])(?:mm|cm|m|ms|s|%|MB|px|fps|x)(?![A-Za-z]))*"
+)
 UNIT = re.compile(r"\d\.\d|\d ?(?:mm|cm|m|ms|s|%|MB|px|fps)\b|\d ?%|±")
 
 
@@ -46,7 +48,9 @@ def test_measured_tables_are_told_from_others() -> None:
     assert measured("| system | share |\n| --- | --- |\n| a | 31 % |\n| b | 5 % |\n") == ["system | share"]
     ids = "| ids | frames |\n| --- | --- |\n| `loop_room`: laps of 21 m at 0.45 m/s | 2400 |\n| `fast_desk` | 600 |\n"
     assert measured(ids) == []
-    ranges = "| status | when |\n| --- | --- |\n| `timeout` | no frame within 120 s |\n| `lost` | below 0.02 s apart |\n"
+    ranges = (
+        "| status | when |\n| --- | --- |\n| `timeout` | no frame within 120 s |\n| `lost` | below 0.02 s apart |\n"
+    )
     assert measured(ranges) == []
 
 

@@ -11,7 +11,7 @@ from prose import ROOT, paragraphs, sentences, user_pages, words
 
 LONGEST, MEDIAN = 35, 18
 """Words of a sentence."""
-ALL_PAGES, README, CHANGELOG_LINES = 25_000, 700, 40
+ALL_PAGES, README, CHANGELOG_LINES = 32_000, 700, 40
 """Words of all pages for users, without the tables of results; of the README; lines of a version's changes."""
 LATER = {"docs/published.md", "docs/reports.md", "docs/rescoring.md", "docs/tuning.md"}
 WORDS = {
@@ -43,7 +43,9 @@ def test_sentences_are_short(text: str) -> None:
 
 
 def test_words_are_the_field_s(text: str) -> None:
-    assert [(word, better) for word, better in WORDS.items() if re.search(word, "\n".join(paragraphs(text)), re.I)] == []
+    assert [
+        (word, better) for word, better in WORDS.items() if re.search(word, "\n".join(paragraphs(text)), re.I)
+    ] == []
 
 
 def test_a_page_begins_with_one_sentence_that_says_what_it_is_for(text: str) -> None:
