@@ -104,9 +104,7 @@ def systems() -> str:
         for s in specs
     ]
     table = "\n".join(["| id | label | provenance | ranked | what it does |", "| --- | --- | --- | --- | --- |", *rows])
-    intro = (
-        "What the provenance means, and what all systems share: [Systems and baselines](../explanation/baselines.md)."
-    )
+    intro = "Every built-in tracker. [What the provenance means](../explanation/baselines.md)"
     return f"# Systems\n\n{intro}\n\n{table}\n\n" + "\n".join(_system(spec) for spec in specs)
 
 
@@ -147,9 +145,7 @@ def columns() -> str:
         "Rows of a report": ("load_board(results).frame()", inspect.getdoc(Board.frame)),
         "Trials of a study": ("Study.open(folder).frame()", inspect.getdoc(trials_frame)),
     }
-    text = [
-        "# Columns of frames and records\n\nColumns, units and types of every pandas frame, and the fields of `run.json`.\n"
-    ]
+    text = ["# Columns\n\nColumns, units and types of every pandas frame, and the fields of `run.json`.\n"]
     for title, (call, docstring) in frames.items():
         text.append(f"## {title}\n\n`{call}`\n\n{_section(docstring or '', 'Returns')}\n")
     text.append("## The record of a run\n\n`run.json`\n\n| field | meaning |\n| --- | --- |")

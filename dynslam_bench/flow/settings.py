@@ -34,7 +34,7 @@ class FlowMethodSettings(Settings):
 
 
 class DaisySettings(FlowMethodSettings):
-    """DAISY Filter Flow with its label search; the defaults are those with which `docs/results/flow.md` was measured."""
+    """DAISY Filter Flow with its label search; `docs/results/flow.md` was measured with the defaults."""
 
     search: SearchName = tunable(
         "emfoa+propagation",

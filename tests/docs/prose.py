@@ -67,9 +67,8 @@ def main() -> None:
         everything += lengths
         total += len(text.split())
         middle = statistics.median(lengths) if lengths else 0
-        print(
-            f"{len(text.split()):6} words, median {middle:4}, longest {max(lengths, default=0):3}  {page.relative_to(ROOT)}"
-        )
+        longest = max(lengths, default=0)
+        print(f"{len(text.split()):6} words, median {middle:4}, longest {longest:3}  {page.relative_to(ROOT)}")
     print(f"{total:6} words, median {statistics.median(everything)}, longest {max(everything)}")
 
 

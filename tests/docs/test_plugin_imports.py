@@ -25,10 +25,8 @@ def imports(code: str) -> list[tuple[str, str]]:
 
 
 def test_plug_ins_import_from_the_contracts_only(tmp_path: Path) -> None:
-    pages = [ROOT / "docs" / page for page in PAGES]
-    texts = [
-        text for page in pages for text in re.findall(r"^```python\n(.*?)^```", page.read_text(), flags=re.S | re.M)
-    ]
+    page = "\n".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in PAGES)
+    texts = re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M)
     taken = [pair for text in texts for pair in imports(text)]
     assert len(taken) > 10 and {module for module, _ in taken} <= OPEN | {COMPOSING, RULES}
     template = imports(write_tracker_template("my-slam", tmp_path).read_text())

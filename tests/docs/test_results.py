@@ -16,16 +16,16 @@ NO_MEASUREMENTS = {"docs/published.md"}
 """Pages whose tables hold figures of others."""
 LATER = {"docs/reports.md", "docs/rescoring.md", "docs/tuning.md"}
 
-FIGURE = re.compile(
-    r"[\d.,±+~<>/()\[\];:\s-]*\d(?:[\d.,±+~<>/()\[\];:\s-]|\bto\b|(?<![A-Za-z])(?:mm|cm|m|ms|s|%|MB|px|fps|x)(?![A-Za-z]))*"
-)
-UNIT = re.compile(r"\d\.\d|\d ?(?:mm|cm|m|ms|s|%|MB|px|fps)\b|\d ?%|±")
+SIGN = r"[\d.,±+~<>/()\[\];:\s-]"
+UNIT = r"(?<![A-Za-z])(?:mm|cm|m|ms|s|%|MB|px|fps)(?![A-Za-z])"
+NUMBERS = re.compile(rf"(?:{SIGN}|{UNIT}|\bto\b|\bx\b)*")
+FIGURE = re.compile(rf"\d\.\d|\d ?{UNIT}|±")
 
 
 def is_figure(cell: str) -> bool:
     """Whether a cell is a number with a fraction or a unit, or several, and nothing else."""
     plain = cell.replace("*", "")
-    return FIGURE.fullmatch(plain) is not None and UNIT.search(plain) is not None
+    return NUMBERS.fullmatch(plain) is not None and FIGURE.search(plain) is not None
 
 
 def measured(text: str) -> list[str]:

@@ -4,7 +4,8 @@ An ablation is a variant: its id names the system and what differs, as in ``emfo
 
 The paper: masks of an improved Mask R-CNN drop the features on people; DAISY Filter Flow, optimised by the elite
 moth-flame algorithm, matches the remaining ORB points with the previous image; the fundamental matrix of those matches
-culls points off their epipolar lines; the rest is tracked and mapped. `docs/explanation/paper.md` lists who runs which equation.
+culls points off their epipolar lines; the rest is tracked and mapped. `docs/explanation/paper.md` lists who runs which
+equation.
 """
 
 from dataclasses import replace
