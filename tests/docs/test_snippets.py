@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import doctest
+import io
+import os
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -44,6 +51,8 @@ A_RUN = (
 )
 BEFORE = {"docs/how-to/export.md": A_RUN, "docs/how-to/pandas.md": A_RUN}
 """What a reader has done already: a run is stored."""
+WITH_OUTPUT = {"docs/how-to/trajectory.md": "", "docs/tutorials/study.md": "mine.toml", "docs/tutorials/tracker.md": ""}
+"""Pages that show what commands print, and the file that their block of TOML is."""
 ELSEWHERE = {
     "docs/how-to/dataset.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
     "docs/how-to/filter.md": (2, "tests/trackers/adapters/test_adapter_docs.py"),
@@ -77,6 +86,42 @@ def test_a_page_s_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.Mon
             text = text.replace(long, short)
         exec(compile(text, page, "exec"), names)
     assert len(names) > 3, "it did something"
+
+
+def outputs(page: str, language: str) -> list[tuple[str, str]]:
+    """The blocks of a page that a block of text follows, each with that text."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n([^`]*?)^```\n\n```text\n(.*?)^```", text, flags=re.S | re.M)
+
+
+def test_pages_that_show_outputs_are_compared() -> None:
+    shown = {
+        str(page.relative_to(ROOT)) for page in PAGES if outputs(str(page), "bash") or outputs(str(page), "python")
+    }
+    assert shown == set(WITH_OUTPUT)
+
+
+@pytest.mark.parametrize("page", WITH_OUTPUT)
+def test_commands_print_what_the_page_shows(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for code, shown in outputs(page, "python"):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile(code, page, "exec"), {})
+        assert printed.getvalue() == shown
+    if WITH_OUTPUT[page]:
+        Path(WITH_OUTPUT[page]).write_text(blocks(page, "toml")[0])
+    for commands, shown in outputs(page, "bash"):
+        lines = [shlex.split(line, comments=True) for line in commands.splitlines()]
+        assert {line[0] for line in lines} == {"dynslam-bench"}
+        printed = ""
+        for line in lines:
+            command = [sys.executable, "-m", "dynslam_bench", *line[1:]]
+            done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"})
+            assert done.returncode == 0, done.stderr
+            printed += done.stdout
+        options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+        assert doctest.OutputChecker().check_output(shown, printed, options), printed
 
 
 def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
