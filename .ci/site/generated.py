@@ -9,6 +9,7 @@ import textwrap
 
 from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.settings import Settings, flatten, settings_table
+from dynslam_bench.envs import STATS_LAYOUT
 from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.reports.model.board import Board
 from dynslam_bench.runs import RunRecord, load_frames
@@ -148,7 +149,10 @@ def columns() -> str:
     text = ["# Columns\n\nColumns, units and types of every pandas frame, and the fields of `run.json`.\n"]
     for title, (call, docstring) in frames.items():
         text.append(f"## {title}\n\n`{call}`\n\n{_section(docstring or '', 'Returns')}\n")
-    text.append("## The record of a run\n\n`run.json`\n\n| field | meaning |\n| --- | --- |")
+    text.append("## The observation `stats`\n\nEntries lie in [0, 1], those of the motion in [-1, 1].\n")
+    text.append("What a tracker does not report is 0.\n\n| index | name | meaning |\n| --- | --- | --- |")
+    text += [f"| {index} | `{name}` | {meaning} |" for index, (name, meaning) in enumerate(STATS_LAYOUT)]
+    text.append("\n## The record of a run\n\n`run.json`\n\n| field | meaning |\n| --- | --- |")
     for entry in re.split(r"\n(?=\w+: )", _section(inspect.getdoc(RunRecord) or "", "Attributes")):
         name, _, meaning = entry.partition(": ")
         text.append(f"| `{name}` | {' '.join(meaning.split())} |")
