@@ -138,20 +138,22 @@ def measure(id: str, control: str, runs: list[int], cache: Path) -> list[dict[st
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown: one line an id and control, the final and online ATE of every run."""
-    lines = [
-        "| sequence | control | runs | without a trajectory | final ATE, m: min | median | max | online: median "
-        "| coverage | static camera |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for (id, control), runs in pd.DataFrame(rows).groupby(["id", "control"], sort=False):
-        final = runs["final"].astype(float)
-        lines.append(
-            f"| {id} | {control} | {len(runs)} | {final.isna().sum()} | {final.min():.4f} | {final.median():.4f} "
-            f"| {final.max():.4f} | {runs['online'].astype(float).median():.4f} | {runs['coverage'].min():.3f} "
-            f"| {runs['never'].iloc[0]:.3f} |"
-        )
+    """Markdown: one line an id, the median final ATE of every control's runs, with the coverage where frames are lost."""
+    frame = pd.DataFrame(rows).astype({"final": float, "coverage": float})
+    controls = [control for control in CONTROLS if control in set(frame["control"])]
+    lines = [f"| sequence | {' | '.join(controls)} | static camera |", f"|{' --- |' * (len(controls) + 2)}"]
+    for id, of_id in frame.groupby("id", sort=False):
+        cells = [cell(of_id[of_id["control"] == control]) for control in controls]
+        lines.append(f"| `{id}` | {' | '.join(cells)} | {of_id['never'].iloc[0]:.3f} |")
     return "\n".join(lines)
+
+
+def cell(runs: pd.DataFrame) -> str:
+    """Median error in m of some runs, and the share of the frames that were tracked where it is below 95 %."""
+    if runs.empty:
+        return ""
+    error = "-" if runs["final"].isna().all() else f"{runs['final'].median():.3f}"
+    return error if runs["coverage"].min() >= 0.95 else f"{error} ({runs['coverage'].min():.0%})"
 
 
 def main() -> None:
@@ -160,7 +162,7 @@ def main() -> None:
     parser.add_argument("--controls", nargs="+", default=list(CONTROLS[:4]), choices=CONTROLS)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_difficulty")
-    parser.add_argument("--out", type=Path, default=Path("synthetic_difficulty.jsonl"))
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".jsonl"))
     parser.add_argument("--table", action="store_true")
     arguments = parser.parse_args()
     rows = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
