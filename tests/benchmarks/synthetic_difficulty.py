@@ -138,7 +138,7 @@ def measure(id: str, control: str, runs: list[int], cache: Path) -> list[dict[st
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown: one line an id, the median final ATE of every control's runs, with the coverage where frames are lost."""
+    """Markdown: one line an id, the median final ATE of every control, with the coverage where frames are lost."""
     frame = pd.DataFrame(rows).astype({"final": float, "coverage": float})
     controls = [control for control in CONTROLS if control in set(frame["control"])]
     lines = [f"| sequence | {' | '.join(controls)} | static camera |", f"|{' --- |' * (len(controls) + 2)}"]
