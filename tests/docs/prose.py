@@ -37,7 +37,7 @@ def sentences(text: str) -> list[str]:
     return [
         sentence
         for paragraph in paragraphs(text)
-        for sentence in re.split(r"(?<=[.!?])\)? +(?=[A-Z(\"])", paragraph)
+        for sentence in re.split(r"(?<=[.!?])\)? +(?=[A-Z0-9(\"])", paragraph)
         if len(words(sentence)) > 1
     ]
 
