@@ -90,15 +90,10 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
     if spec.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     if spec.sampler == "tpe":
-        with warnings.catch_warnings():  # `group` (for conditional spaces) counts as experimental
+        with warnings.catch_warnings():  # `constant_liar` counts as experimental
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            return optuna.samplers.TPESampler(
-                n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2),
-                multivariate=True,
-                group=True,
-                constant_liar=True,
-                seed=seed,
-            )
+            startup = min(_STARTUP_TRIALS, spec.trials // 2)
+            return optuna.samplers.TPESampler(n_startup_trials=startup, constant_liar=True, seed=seed)
     if spec.sampler == "nsga2":
         return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed)
     if spec.sampler == "gp":

@@ -69,8 +69,9 @@ class StudySpec(Record, frozen=True):
         top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
-        pruner: ``halving`` is Optuna's `SuccessiveHalvingPruner` over growing sets of instances, ``wilcoxon`` its
-            `WilcoxonPruner` over the single instances, ``none`` its `NopPruner`.
+        pruner: ``wilcoxon`` is Optuna's `WilcoxonPruner` over the single instances, ``halving`` its
+            `SuccessiveHalvingPruner` over growing sets of them, ``none`` its `NopPruner`. Trials of several objectives
+            are pruned by dominance, with either of the first two.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
             ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
             ``~/.pgpass``): it is in no file that is written.
@@ -101,7 +102,7 @@ class StudySpec(Record, frozen=True):
     top: int = Field(default=2, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0
-    pruner: PrunerName = "halving"
+    pruner: PrunerName = "wilcoxon"
     storage: str = ""
     protocol: str = "tum-rgbd/v1"
     cache: bool = True

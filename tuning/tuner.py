@@ -44,7 +44,7 @@ from dynslam_bench.tuning.storage import (
     worker_is_dead,
     worker_name,
 )
-from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.study_file import PrunerName, StudySpec
 from dynslam_bench.tuning.trials import EARLIER, best_trials
 
 CRASHED_WORKER = "worker ended in the middle of the trial"
@@ -100,6 +100,7 @@ class Tuner(Plan):
 
     Attributes:
         on_run: Called with every event of every run from now on; None for no calls.
+        pruner: The study's; trials of several objectives are compared at the steps of ``halving``.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
@@ -117,10 +118,8 @@ class Tuner(Plan):
     ) -> None:
         super().__init__(spec, results, objectives=objectives, accept=reading)
         self.reading = reading
-        if spec.pruner == "wilcoxon" and len(spec.objectives) > 1:
-            raise StudyError(
-                f"pruner 'wilcoxon' takes one objective, the study has {len(spec.objectives)}", "use halving or none"
-            )
+        several = len(self.objectives) > 1  # Optuna's pruners take one objective
+        self.pruner: PrunerName = "halving" if several and spec.pruner == "wilcoxon" else spec.pruner
         sampler = build_sampler(spec) if sampler is None else sampler
         self.steps = self._comparable_steps()
         self.store.prepare()
@@ -266,7 +265,7 @@ class Tuner(Plan):
 
     def _comparable_steps(self) -> list[int]:
         """The steps at which every objective has an instance that counts."""
-        *early, last = steps(self.spec.pruner, len(self.design.tune))
+        *early, last = steps(self.pruner, len(self.design.tune))
         counted = [[objective.counts(instance) for instance in self.design.tune] for objective in self.objectives]
         return [*(step for step in early if all(any(flags[:step]) for flags in counted)), last]
 
@@ -333,7 +332,7 @@ class Tuner(Plan):
         Optuna's pruners know no constraints: a trial that violates one at a step takes no part in the comparison there.
         """
         step, final = len(outcomes), len(outcomes) == self.steps[-1]
-        if self.spec.pruner == "wilcoxon":
+        if self.pruner == "wilcoxon":
             for index, value in enumerate(self.objectives[0].by_start(outcomes, self._reference)):
                 if index >= first:
                     trial.report(value, index)
@@ -393,7 +392,7 @@ class Tuner(Plan):
     ) -> optuna.Study:
         """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.spec.pruner)}
+        how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.pruner)}
         if self.reading:
             study = load_study(self.results, self.spec, **how)
         else:

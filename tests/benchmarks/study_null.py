@@ -1,13 +1,13 @@
 """What studies say where nothing is better and where something is: simulated studies.
 
-    python tests/benchmarks/study_null.py [--studies 100] [--table null planted pruners extended]
+    python tests/benchmarks/study_null.py [--studies 100] [--table null planted regret extended]
 
 Whole studies (trials, choice, held-out check) over runs from a noise model: `sd` is the spread of the log ratio of two
 runs in one scene (measured 0.24 to 0.31), and beside it each setting differs from the baseline by 0.15 in log from
 scene to scene. `null`: no setting is better than another. `planted`: the baseline is 30 % worse than the best setting,
-and a study has at most 40 trial runs. `pruners`: regret is the true log ratio of the best trial to the optimum, for
-studies of the same trials. `extended`: null studies that are extended twice. A run is one of a configuration on one
-instance; `all` are those of baseline, choice and judgement as well.
+and a study has at most 40 trial runs. `regret`: the true log ratio of the best trial to the optimum, beside that of
+fifteen lines of plain Optuna with the same runs and the same bound at the end. `extended`: null studies that are
+extended twice. A run is one of a configuration on one instance; `all` are those of baseline, choice and judgement too.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ import argparse
 import math
 import sys
 import tempfile
+import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import optuna
 from optuna.trial import TrialState
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tuning"))
@@ -106,21 +108,60 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
             yield line(scenes, simulated.STARTS_SD, *shares, runs // studies, every // studies)
 
 
-def pruners(studies: int, folder: Path) -> Iterable[str]:
-    """Regret of each pruner, and its runs."""
+def regret(studies: int, folder: Path) -> Iterable[str]:
+    """Regret of a study with each pruner, beside plain Optuna's on the same runs, and the runs of its trials."""
     import simulated
 
+    from dynslam_bench.tuning import finish
+
     simulated.STARTS_SD = 0.28
-    yield line("pruner", "regret", "runs")
+    yield line("pruner", "regret", "plain Optuna", "trial runs")
     for pruner in ("none", "halving", "wilcoxon"):
-        regret, runs = [], 0
+        ours, others, runs = [], [], []
         for seed in range(studies):
             spec = study_on(8, pruner=pruner, trials=24, sampler="tpe", sampler_seed=seed)
             tuner = simulated.SimulatedTuner(spec, folder / f"{pruner}-{seed}", effect=simulated.valley, seed=seed)
-            complete = tuner.run().get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-            regret.append(simulated.valley(min(complete, key=lambda trial: trial.value).params))
-            runs += tuner.runs - len(tuner.design.reference)
-        yield line(pruner, f"{np.mean(regret):.3f} +- {np.std(regret) / math.sqrt(studies):.3f}", runs // studies)
+            tuner.reference()
+            first = tuner.runs
+            tuner.run()
+            runs.append(tuner.runs - first)
+            ours.append(simulated.valley(finish(tuner).best.params))
+            others.append(simulated.valley(plain(tuner, seed, runs[-1])))
+        yield line(pruner, mean(ours), mean(others), round(np.mean(runs)))
+
+
+def plain(tuner: Any, seed: int, most: int) -> dict[str, Any]:
+    """Settings of the best of two trials by the same bound: TPE and `WilcoxonPruner` as Optuna's manual has them."""
+    from dynslam_bench.tuning.space import distributions
+    from dynslam_bench.tuning.summary import compared
+
+    pruner = optuna.pruners.WilcoxonPruner(p_threshold=0.1)
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), pruner=pruner)
+    study.enqueue_trial({parameter.name: tuner.base[parameter.name] for parameter in tuner.space})
+    order, runs = np.random.default_rng(seed), 0
+    while runs + len(tuner.design.tune) <= most:
+        trial, logs, state = study.ask(distributions(tuner.space)), [], TrialState.COMPLETE
+        for index in order.permutation(len(tuner.design.tune)):
+            (run,) = tuner.evaluate(trial.params, [tuner.design.tune[index]]).values()
+            logs.append(math.log(run.ate_m))
+            trial.report(logs[-1], int(index))
+            if trial.should_prune():
+                state = TrialState.PRUNED
+                break
+        study.tell(trial, float(np.mean(logs)) if state == TrialState.COMPLETE else None, state=state)
+        runs += len(logs)
+    complete = study.get_trials(states=(TrialState.COMPLETE,))
+    best = sorted((trial for trial in complete if trial.number), key=lambda trial: trial.value)[:2]
+    baseline = tuner.evaluate({}, tuner.design.confirm)
+
+    def bound(trial: optuna.trial.FrozenTrial) -> float:
+        return compared(tuner.evaluate(trial.params, tuner.design.confirm), baseline, candidates=2).bound
+
+    return min(best, key=bound).params
+
+
+def mean(values: Sequence[float]) -> str:
+    return f"{np.mean(values):.3f} +- {np.std(values, ddof=1) / math.sqrt(len(values)):.3f}"
 
 
 def extended(studies: int, folder: Path) -> Iterable[str]:
@@ -144,7 +185,7 @@ def extended(studies: int, folder: Path) -> Iterable[str]:
         yield line(extension, chosen[extension] / studies, proven[extension] / studies)
 
 
-TABLES = {"null": null, "planted": recovered, "pruners": pruners, "extended": extended}
+TABLES = {"null": null, "planted": recovered, "regret": regret, "extended": extended}
 
 
 def main() -> None:
@@ -153,6 +194,7 @@ def main() -> None:
     parser.add_argument("--studies", type=int, default=100)
     parser.add_argument("--table", nargs="+", choices=TABLES, default=list(TABLES))
     options = parser.parse_args()
+    warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
     with tempfile.TemporaryDirectory() as temporary:
         for name in options.table:
             print(f"\n{name}, {options.studies} studies a line")

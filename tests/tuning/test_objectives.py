@@ -89,7 +89,7 @@ def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
 
 
 def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None:
-    tuner = TimedTuner(spec(["speed"], ["gain"]), tmp_path)
+    tuner = TimedTuner(spec(["speed"], ["gain"], pruner="halving"), tmp_path)
     tuner.price = 0.6
     tuner.run()
     summary = finish(tuner)
