@@ -134,7 +134,7 @@ def protocols() -> str:
     for name, protocol in PROTOCOLS.items():
         values = protocol.model_dump(mode="json")
         lines = "\n".join(f"| `{field}` | `{value}` |" for field, value in values.items())
-        text.append(f"## {name}\n\n| field | value |\n| --- | --- |\n{lines}\n")
+        text.append(f"## {name}\n\n{protocol.describe()}\n\n| field | value |\n| --- | --- |\n{lines}\n")
     return "\n".join(text)
 
 
