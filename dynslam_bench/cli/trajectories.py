@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal, Optional
 
@@ -68,15 +69,33 @@ def list_(as_json: AsJson = False) -> None:
 
 @protocols.command()
 def compare(
-    estimate: Estimate, ground_truth: GroundTruth, timestamps: Timestamps = None, as_json: AsJson = False
+    estimate: Estimate,
+    ground_truth: GroundTruth,
+    published: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(metavar="METRES", help="A published error as printed, e.g. 0.0733: mark the rows that agree."),
+    ] = None,
+    timestamps: Timestamps = None,
+    as_json: AsJson = False,
 ) -> None:
     """Show how one trajectory scores under every protocol of the field."""
-    from dynslam_bench.evaluation import compare_protocols
+    from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols_of_files
 
-    estimated, truth = (runs.read_trajectory(path, timestamps).trajectory for path in (estimate, ground_truth))
-    scores = compare_protocols(estimated, truth, of_file=True)
-    rows = [(score.metric, score.label, score.rmse_m, score.pairs, score.note) for score in scores]
-    present(scores, table(("metric", "protocol", "rmse (m)", "pairs", "note"), rows))
+    estimated, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
+    scores = compare_protocols_of_files(estimated, truth)
+    columns = ["metric", "protocol", "rmse (m)", "pairs", "note"]
+    rows = [[score.metric, score.label, score.rmse_m, score.pairs, score.note] for score in scores]
+    if published is None:
+        present(scores, table(columns, rows))
+        return
+    marks = [agrees(score, published) for score in scores]
+    defined = [score for score in scores if score.rmse_m is not None]
+    nearest = min(defined, key=lambda score: abs((score.rmse_m or 0.0) - float(published)))
+    last = f"No row agrees with {published}; the nearest is {nearest.label}, {nearest.rmse_m:.6f}." * (not any(marks))
+    columns.insert(2, "published")
+    rows = [[*row[:2], "agrees" if mark else "", *row[2:]] for row, mark in zip(rows, marks, strict=True)]
+    matched = [{**asdict(score), "agrees": mark} for score, mark in zip(scores, marks, strict=True)]
+    present(matched, table(columns, rows), *filter(None, [last]))
 
 
 def import_(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from functools import partial
 
 from dynslam_bench.core.errors import EvaluationError
-from dynslam_bench.evaluation.comparison import truth_of_file
-from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_loaded
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Alignment, Protocol, RPESpec
 from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import TumFile
 
 
 @dataclass(frozen=True)
@@ -32,24 +35,50 @@ class ComparisonRow:
     note: str = ""
 
 
-def compare_protocols(estimate: Trajectory, ground_truth: Trajectory, *, of_file: bool = False) -> list[ComparisonRow]:
+def compare_protocols(estimate: Trajectory, ground_truth: Trajectory) -> list[ComparisonRow]:
     """ATE under every alignment and RPE under every habit of the field, of one and the same trajectory.
 
     Args:
         estimate: Estimated camera-to-world poses.
         ground_truth: True poses.
-        of_file: Whether they are as a ground-truth file has them, rather than a sequence: it matters for Bonn's.
 
     Raises:
         EvaluationError: The trajectory cannot be evaluated under `tum-rgbd/v1` either.
     """
-    evaluate(estimate, ground_truth, "tum-rgbd/v1")
-    rows = []
-    for metric, habits in (("ATE", ABSOLUTE), ("RPE", RELATIVE)):
-        for label, protocol in habits:
-            truth = truth_of_file(ground_truth, protocol) if of_file else ground_truth
-            rows.append(_row(metric, label, estimate, truth, protocol))
-    return rows
+    return _compare(partial(evaluate, estimate, ground_truth))
+
+
+def compare_protocols_of_files(estimate: TumFile, ground_truth: TumFile) -> list[ComparisonRow]:
+    """The same of two files that were read, as `evaluate_loaded` takes them.
+
+    Raises:
+        EvaluationError: As `compare_protocols`.
+    """
+    return _compare(partial(evaluate_loaded, estimate, ground_truth))
+
+
+def agrees(row: ComparisonRow, printed: str) -> bool:
+    """Whether a row is what was printed, to the last digit that was: 0.07326 is ``0.0733``.
+
+    Args:
+        row: A row of `compare_protocols`.
+        printed: The number in metres (of a rate in m/s) as it was printed.
+
+    Raises:
+        EvaluationError: It is no number.
+    """
+    try:
+        number = Decimal(printed)
+        half_digit = Decimal(5).scaleb(int(number.as_tuple().exponent) - 1)
+    except (InvalidOperation, ValueError):
+        raise EvaluationError(f"'{printed}' is not a number in metres as it was printed, e.g. 0.0733") from None
+    return row.rmse_m is not None and abs(Decimal(row.rmse_m) - number) <= half_digit
+
+
+def _compare(score: Callable[[Protocol], Evaluation]) -> list[ComparisonRow]:
+    score(_TUM)  # whatever cannot be scored so has no rows
+    habits = (("ATE", ABSOLUTE), ("RPE", RELATIVE))
+    return [_row(metric, label, score, protocol) for metric, labels in habits for label, protocol in labels]
 
 
 _TUM, _EVO = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS["evo-default"]
@@ -65,7 +94,8 @@ ABSOLUTE = (
     ("yaw-aligned", _variant(_TUM, "tum-rgbd/yaw", alignment="yaw")),
     ("SE(3)-aligned (TUM's ATE)", _variant(_TUM, "tum-rgbd/se3", alignment="se3")),
     ("Sim(3)-aligned", _variant(_TUM, "tum-rgbd/sim3", alignment="sim3")),
-    ("evo_ape -a", _variant(_EVO, "evo -a", alignment="se3")),
+    ("evo_ape -a", PROTOCOLS["evo-as/v1-se3"]),
+    ("evo_ape -as", PROTOCOLS["evo-as/v1"]),
     ("VSLAM-LAB", PROTOCOLS["vslam-lab"]),
     ("WildGS-SLAM, DROID-W", PROTOCOLS["droid-w/v1"]),
     ("MonST3R (90 frames)", _variant(PROTOCOLS["tum-dynamics-90/v1"], "tum-dynamics-90/v1")),
@@ -84,10 +114,10 @@ RELATIVE = (
 )
 
 
-def _row(metric: str, label: str, estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> ComparisonRow:
+def _row(metric: str, label: str, score: Callable[[Protocol], Evaluation], protocol: Protocol) -> ComparisonRow:
     text, spec = protocol.describe(), protocol.rpe[0] if metric == "RPE" else None
     try:
-        result = evaluate(estimate, ground_truth, protocol)
+        result = score(protocol)
     except EvaluationError as error:
         return ComparisonRow(metric, label, None, 0, text, str(error))
     if spec is None:

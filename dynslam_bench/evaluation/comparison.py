@@ -92,6 +92,11 @@ def compare(
         raise EvaluationError(f"{fault}, at least 2 are needed", dropped)
     if dropped:
         diagnostics.append(dropped)
+    if (taken := len(np.unique(estimate_index))) < len(estimate_index):
+        diagnostics.append(
+            f"{len(estimate_index)} pairs are made of {taken} estimated poses: the estimate has more poses than the "
+            "ground truth, so each true pose takes its nearest one"
+        )
     matched, truth = estimate.T_world_cam[estimate_index], ground_truth.T_world_cam[truth_index]
     similarity = align(matched, truth, protocol.alignment)
     return Comparison(
@@ -175,8 +180,8 @@ def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) 
     """For every stamp the nearest of the others, the earlier on a tie (evo's rule: stamps may be used repeatedly).
 
     Args:
-        stamps: Seconds ``[N]``, ascending.
-        others: Seconds ``[M]``, ascending, not empty.
+        stamps: Seconds ``[N]``, ascending; equal ones are allowed here.
+        others: Seconds ``[M]``, ascending, not empty; of equal ones the first is chosen.
         max_dt: Tolerance in seconds.
         strict: Whether a difference that equals it is too much.
 
@@ -187,7 +192,7 @@ def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) 
     left = np.maximum(right - 1, 0)
     right_dt = others[right] - stamps
     left_dt = np.where(right > 0, stamps - others[left], np.inf)
-    chosen = np.where(right_dt < left_dt, right, left)
+    chosen = np.searchsorted(others, others[np.where(right_dt < left_dt, right, left)])
     dt = np.minimum(right_dt, left_dt)
     keep = dt < max_dt if strict else dt <= max_dt
     keep &= (stamps >= others[0] - max_dt) & (stamps <= others[-1] + max_dt)
@@ -240,7 +245,7 @@ def truth_of_file(truth: Trajectory, protocol: Protocol) -> Trajectory:
     """
     if protocol.truth == "as-is":
         return truth
-    return Trajectory(truth.timestamps, in_camera_axes(truth.T_world_cam, BONN_R_BODY_CAM))
+    return truth.with_poses(in_camera_axes(truth.T_world_cam, BONN_R_BODY_CAM))
 
 
 def compared(
@@ -264,7 +269,7 @@ def compared(
     """
     if protocol.truth != "as-is":
         correct = bonn_camera if protocol.truth == "bonn-camera" else bonn_as_droid_w
-        ground_truth = Trajectory(ground_truth.timestamps, correct(ground_truth.T_world_cam))
+        ground_truth = ground_truth.with_poses(correct(ground_truth.T_world_cam))
     if not protocol.thins:
         return estimate, ground_truth
     stamps = estimate.timestamps if input_timestamps is None else np.asarray(input_timestamps, np.float64).reshape(-1)

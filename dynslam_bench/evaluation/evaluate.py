@@ -175,13 +175,20 @@ def evaluate_files(
 def evaluate_loaded(estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str) -> Evaluation:
     """Evaluate a trajectory that was read against a truth that was, with the notes on both files.
 
+    Under evo's association all lines with the same stamp take part, else the last of them.
+
     Raises:
         EvaluationError: As `evaluate`.
     """
     protocol = get_protocol(protocol)
-    result = evaluate(estimate.trajectory, truth_of_file(ground_truth.trajectory, protocol), protocol)
     loaded = {"estimate": estimate, "ground truth": ground_truth}
-    notes = [f"{name}: {note}" for name, file in loaded.items() for note in file.notes.describe()]
+    poses, truth = (
+        file.trajectory if protocol.one_to_one or file.every_line is None else file.every_line
+        for file in loaded.values()
+    )
+    result = evaluate(poses, truth_of_file(truth, protocol), protocol)
+    described = {name: file.notes.describe(repeats=not protocol.one_to_one) for name, file in loaded.items()}
+    notes = [f"{name}: {note}" for name, lines in described.items() for note in lines]
     if protocol.only_for:
         notes.append(f"{protocol.id} means something for {protocol.only_for}* only, which files do not tell")
     return result.model_copy(update={"diagnostics": notes + result.diagnostics})

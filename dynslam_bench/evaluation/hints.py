@@ -103,7 +103,8 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
     if 0 < len(outside) < len(parts):
         rows = sum(map(len, outside))
         evidence.append(
-            f"{rows} of {len(stamps)} poses, in {len(outside)} stretches of time, lie outside of the truth's"
+            f"{len(stamps) - rows} of {len(stamps)} poses lie within the truth's time, the others in {len(outside)} "
+            f"stretch{'es' * (len(outside) > 1)} of time outside of it"
         )
         numbers |= {"poses_outside": float(rows), "stretches_outside": float(len(outside))}
     if notes is not None and notes.back_s > OTHER_RECORDING_S:

@@ -86,8 +86,9 @@ class Protocol(_Frozen):
         id: Name and version.
         max_dt: Largest time difference in seconds between an estimated and a true pose.
         strict: True for ``|dt| < max_dt``, False for ``<=``.
-        one_to_one: True for TUM's greedy one-to-one association; False for evo's nearest neighbour of every pose of
-            the shorter trajectory.
+        one_to_one: True for TUM's greedy one-to-one association; False for evo's: every pose of the shorter trajectory
+            takes its nearest neighbour in the other, which may be taken repeatedly. Of a file evo's takes all lines
+            with the same stamp, TUM's the last.
         alignment: How the estimate is moved onto the ground truth before absolute errors are taken: ``none``,
             ``origin`` (first associated pose), ``se3`` and ``sim3`` (least squares over the positions), ``yaw``
             (translation and rotation about the world's z axis).
@@ -205,6 +206,9 @@ PROTOCOLS: dict[str, Protocol] = {
             alignment="none",
             rpe=(RPESpec(delta=1, unit="f", pairs="consecutive"),),
         ),
+        # evo_ape tum -as and -a, at evo's own tolerance: the convention of most tables that were made with evo
+        Protocol(id="evo-as/v1", max_dt=0.01, strict=False, one_to_one=False, alignment="sim3", trajectory="final"),
+        Protocol(id="evo-as/v1-se3", max_dt=0.01, strict=False, one_to_one=False, alignment="se3", trajectory="final"),
         # evo_ape -as with a tolerance of ten frames at 30 Hz, whatever the sensor
         Protocol(id="vslam-lab", max_dt=1 / 3, strict=False, one_to_one=False, alignment="sim3"),
         Protocol(

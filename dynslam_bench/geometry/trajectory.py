@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ class Trajectory:
     timestamps: NDArray[np.float64]
     T_world_cam: NDArray[np.float64]
     exact_ns: NDArray[np.int64] | None = None
+    _may_repeat: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         stamps = np.ascontiguousarray(self.timestamps, dtype=np.float64)
@@ -35,8 +37,10 @@ class Trajectory:
             raise TrajectoryError(f"a trajectory has {stamps.size} stamps but {len(poses)} poses")
         if not np.isfinite(stamps).all() or not np.isfinite(poses).all():
             raise TrajectoryError("a trajectory holds values that are not finite")
-        if (np.diff(stamps) <= 0).any():
-            at = int(np.argmax(np.diff(stamps) <= 0))
+        steps = np.diff(stamps)
+        wrong = steps < 0 if self._may_repeat else steps <= 0
+        if wrong.any():
+            at = int(np.argmax(wrong))
             raise TrajectoryError(f"stamps are not strictly increasing: {stamps[at]:.9f} then {stamps[at + 1]:.9f}")
         object.__setattr__(self, "timestamps", stamps)
         object.__setattr__(self, "T_world_cam", poses)
@@ -44,7 +48,7 @@ class Trajectory:
             object.__setattr__(self, "exact_ns", np.ascontiguousarray(self.exact_ns, dtype=np.int64))
             if len(self.timestamps_ns) != len(stamps):
                 raise TrajectoryError(f"a trajectory has {stamps.size} stamps but {len(self.timestamps_ns)} in ns")
-        if len(stamps) > 1 and np.diff(stamps).min() * NS_PER_S < LEAST_GAP_NS:
+        if len(stamps) > 1 and steps.min() * NS_PER_S < LEAST_GAP_NS and not self._may_repeat:
             gaps = np.diff(self.timestamps_ns)
             at = int(gaps.argmin())
             if gaps[at] <= 0:
@@ -72,11 +76,11 @@ class Trajectory:
     def select(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Trajectory:
         """The poses at an index, mask or slice."""
         exact = None if self.exact_ns is None else self.exact_ns[index]
-        return Trajectory(self.timestamps[index], self.T_world_cam[index], exact)
+        return type(self)(self.timestamps[index], self.T_world_cam[index], exact)
 
     def with_poses(self, T_world_cam: NDArray[np.float64]) -> Trajectory:
         """Other poses ``[N, 4, 4]`` at the same stamps."""
-        return Trajectory(self.timestamps, T_world_cam, self.exact_ns)
+        return type(self)(self.timestamps, T_world_cam, self.exact_ns)
 
     def with_exact(self, exact: Mapping[float, int]) -> Trajectory:
         """The same trajectory with the nanoseconds of those stamps that a table of seconds to nanoseconds holds."""
@@ -85,3 +89,9 @@ class Trajectory:
             return self
         ns = [exact[stamp] if stamp in exact else ns_of(stamp) for stamp in stamps]
         return Trajectory(self.timestamps, self.T_world_cam, np.array(ns, dtype=np.int64))
+
+
+class RepeatedStamps(Trajectory):
+    """Poses of which several may have the same stamp, in the order of their file."""
+
+    _may_repeat = True

@@ -20,7 +20,7 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 MOST_LINES = 4_000_000
@@ -53,13 +53,20 @@ class FileNotes:
     renormalised: int = 0
     back_s: float = 0.0
 
-    def describe(self) -> list[str]:
-        """One phrase for every count that is not zero, e.g. ``3 of 800 lines skipped: not finite``."""
+    def describe(self, *, repeats: bool = False) -> list[str]:
+        """One phrase for every count that is not zero, e.g. ``3 of 800 lines skipped: not finite``.
+
+        Args:
+            repeats: Whether all lines with the same stamp were taken, not only the last.
+        """
+        duplicates = (
+            "repeat the next line's stamp, all are taken" if repeats else "replaced by a later line with the same stamp"
+        )
         of = f"of {self.lines} lines"
         phrases = [
             (self.not_finite, f"{self.not_finite} {of} skipped: not finite"),
             (self.zero_quaternions, f"{self.zero_quaternions} {of} skipped: all-zero quaternion"),
-            (self.duplicates, f"{self.duplicates} {of} replaced by a later line with the same stamp"),
+            (self.duplicates, f"{self.duplicates} {of} {duplicates}"),
             (self.out_of_order, f"{self.out_of_order} {of} out of order, sorted"),
             (self.renormalised, f"{self.renormalised} {of} with a quaternion far from unit norm, normalised"),
         ]
@@ -68,10 +75,17 @@ class FileNotes:
 
 @dataclass(frozen=True, eq=False)
 class TumFile:
-    """A trajectory and the notes on the file it came from."""
+    """A trajectory and the notes on the file it came from.
+
+    Attributes:
+        trajectory: The last pose of every stamp.
+        notes: What was not taken as it stands.
+        every_line: All poses, where stamps repeat; None where none does.
+    """
 
     trajectory: Trajectory
     notes: FileNotes
+    every_line: RepeatedStamps | None = None
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -114,14 +128,17 @@ def load_tum(path: str | Path) -> TumFile:
     line_of = dict(zip(ns.tolist(), np.array(numbers)[valid].tolist(), strict=True))
     refuse_close(ns[order], str(path), TrajectoryError, line_of.get)
     last_of_stamp = np.append(np.diff(ns[order]) > 0, True)
-    chosen, exact = kept[order][last_of_stamp], ns[order][last_of_stamp]
+    lines, exact = kept[order], ns[order]
     notes = FileNotes(
         **counted,
         duplicates=int((~last_of_stamp).sum()),
         out_of_order=int((np.diff(ns) < 0).sum()),
         back_s=float(-np.diff(ns).min(initial=0)) / 1e9,
     )
-    return TumFile(Trajectory(to_seconds(exact), se3.from_quaternion(chosen[:, 1:4], chosen[:, 4:8]), exact), notes)
+    every_line = RepeatedStamps(to_seconds(exact), se3.from_quaternion(lines[:, 1:4], lines[:, 4:8]), exact)
+    last = np.flatnonzero(last_of_stamp)
+    trajectory = Trajectory(every_line.timestamps[last], every_line.T_world_cam[last], exact[last])
+    return TumFile(trajectory, notes, every_line if notes.duplicates else None)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") -> None:

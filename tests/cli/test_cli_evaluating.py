@@ -59,3 +59,17 @@ def test_hints_are_shown_of_files_runs_and_boards(cli, tmp_path):
 def test_a_protocol_for_some_sequences_says_so(cli, pair):
     code, out, _ = cli("eval", "estimate.txt", "truth.txt", "--protocol", "droid-w/v1-bonn")
     assert code == 0 and "droid-w/v1-bonn means something for bonn/* only" in out
+
+
+def test_the_protocol_of_a_published_number_is_marked(cli, facts, pair):
+    command = ("protocols", "compare", "estimate.txt", "truth.txt")
+    rows = {row["label"]: row["rmse_m"] for row in facts(*command)}
+    printed = f"{rows['evo_ape -as']:.9f}"
+    code, out, _ = cli(*command, "--published", printed)
+    marked = [line for line in out.splitlines() if " agrees " in line]
+    assert code == 0 and any(line.startswith("ATE     evo_ape -as") for line in marked)
+    assert all(row["agrees"] == (f"{row['rmse_m']:.9f}" == printed) for row in facts(*command, "--published", printed))
+    code, out, _ = cli(*command, "--published", "77")
+    assert code == 0 and "No row agrees with 77; the nearest is" in out.splitlines()[-1]
+    code, _, err = cli(*command, "--published", "7cm")
+    assert code == 1 and "as it was printed" in one_line(err)

@@ -14,7 +14,7 @@ SCRIPT = ROOT / "tests" / "benchmarks" / "results.py"
 RESULTS = sorted(page for page in (ROOT / "docs" / "results").glob("*.md") if page.name != "README.md")
 NO_MEASUREMENTS = {"docs/published.md"}
 """Pages whose tables hold figures of others."""
-LATER = {"docs/reports.md", "docs/rescoring.md", "docs/tuning.md"}
+LATER = {"docs/reports.md", "docs/tuning.md"}
 
 SIGN = r"[\d.,±+~<>/()\[\];:\s-]"
 UNIT = r"(?<![A-Za-z])(?:mm|cm|m|ms|s|%|MB|px|fps)(?![A-Za-z])"
