@@ -12,7 +12,7 @@ from prose import ROOT, paragraphs, sentences, user_pages, words
 LONGEST, MEDIAN = 35, 18
 """Words of a sentence."""
 ALL_PAGES, README, CHANGELOG_LINES = 32_000, 700, 40
-"""Words of all pages for users, without the tables and commands of results; of the README; lines of a version's changes."""
+"""Words of all pages for users (of results the prose alone) and of the README; lines of a version's changes."""
 LATER = {"docs/reports.md", "docs/tuning.md"}
 WORDS = {
     r"\bheir\b": "replacement",
