@@ -268,7 +268,7 @@ def load_frames(run: RunRecord | Path | str, results: RunStore | Path | str = "r
         results: The results folder, or a store; not looked at if `run` is a path.
 
     Returns:
-        One row a frame, in order. Columns without which no frame is: index (``int64``, in the run's part of the
+        One row a frame, in order. Columns that are always present: index (``int64``, in the run's part of the
         sequence), timestamp (``float64``, seconds), state (``string``: ``initialising``, ``ok``, ``lost`` or
         ``dropped``), reward_m (``float64``, metres). ``Float64``, missing (``pd.NA``) where there is no ground truth,
         no mask, or the stage did not run: frame_error_trans_m and frame_error_rot_deg (frame to frame, metres and
