@@ -133,7 +133,7 @@ def protocols() -> str:
     text = ["# Protocols\n\nEvery named protocol with its fields. [Why numbers differ](../explanation/protocols.md)\n"]
     for name, protocol in PROTOCOLS.items():
         values = protocol.model_dump(mode="json")
-        lines = "\n".join(f"| `{field}` | `{value}` |" for field, value in values.items())
+        lines = "\n".join(f"| `{field}` | `{value}` |" for field, value in values.items() if value not in ("", []))
         text.append(f"## {name}\n\n{protocol.describe()}\n\n| field | value |\n| --- | --- |\n{lines}\n")
     return "\n".join(text)
 
