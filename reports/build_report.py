@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, render, resource, table_blocks
-from dynslam_bench.reports.model.board import Board, On, make_board, missing_commands, missing_note
+from dynslam_bench.reports.model.board import OVERALL, Board, On, category_boards, make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import (
     Loaded,
     OnProgress,
@@ -39,7 +39,8 @@ from dynslam_bench.reports.model.published import (
     spans,
 )
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, command_line
-from dynslam_bench.reports.model.statistics import FEWEST, power_note
+from dynslam_bench.reports.model.statistics import FEWEST
+from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
 from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
@@ -58,6 +59,7 @@ class ReportPaths:
         csv: The tables as CSV, by name.
         data: All rows, for `compare`.
         leaderboard: The table that the page begins with.
+        headline: Its message in one sentence.
         trials: How many runs were left out since they are trials of studies.
     """
 
@@ -68,6 +70,7 @@ class ReportPaths:
     csv: dict[str, Path]
     data: Path
     leaderboard: Table
+    headline: str
     trials: int = 0
 
 
@@ -130,6 +133,7 @@ def build_report(
         none_failed = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
         sections = [
             leaderboard_section(board, protocol, loaded),
+            categories_section(board, protocol),
             Section("explore", "Explore", "Explore", explore_notes, [Block("explore")]),
             speed_section(board),
             errors_section(board, protocol),
@@ -175,6 +179,7 @@ def _write(
         csv={name: output / "csv" / f"{name}.csv" for name in (*shown, "runs")},
         data=output / REPORT_FILE,
         leaderboard=shown["leaderboard"],
+        headline=headline(board),
         trials=trials,
     )
     for name, table in shown.items():
@@ -222,9 +227,20 @@ def leaderboard_section(board: Board, protocol: Protocol, loaded: Loaded) -> Sec
     return section
 
 
+def categories_section(board: Board, protocol: Protocol) -> Section:
+    """The ratios by category, the leaderboard of every category, and all pairs of trackers."""
+    boards = category_boards(board)
+    blocks = table_blocks(tables.category_table(boards))
+    for category, part in boards.items():
+        if category != OVERALL:
+            table = tables.leaderboard(part, protocol)
+            name = f"leaderboard_{category.replace(' ', '_')}"
+            blocks += table_blocks(replace(table, id=name, title=headline(part)), folded=True)
+    blocks += table_blocks(tables.pair_table(board), folded=True)
+    return Section("categories", "By category, and all pairs", "Categories", blocks=blocks)
+
+
 def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list[str]:
-    cells = [cell for key in board.ranked for name, cell in board.cells[key].items() if name in board.common]
-    fewest_repeats = min((len(cell.scores) for cell in cells if cell.scores), default=0)
     conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
     final_only = ", ".join(board.labels[key] for key in board.final_only)
     older = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
@@ -235,9 +251,11 @@ def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list
     }
     counts = ", ".join(f"{count} {words}" for words, count in left_out.items() if count)
     notes = [
+        headline(board),
         f"Runs with one id must be equal, but these have different results: {conflicts}." if conflicts else "",
         missing_note(board),
-        power_note(board.standings, len(board.common), fewest_repeats),
+        explanation(board),
+        mean_rank_note(board),
         f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
         if final_only
         else "",

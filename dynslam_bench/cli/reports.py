@@ -65,12 +65,13 @@ def make(
             on_progress=advance,
         )
 
-    top = ["#", "tracker", "ATE ratio", "success", "coverage", "× real time"]
+    top = ["#", "tracker", "ATE ratio", "better?", "success", "coverage", "× real time"]
     board = paths.leaderboard
     more = len(board.rows) - MOST_ROWS
     left_out = [wrapped(f"Left out: {trial_words(paths.trials)}.")] if paths.trials else []
     present(
-        {name: getattr(paths, name) for name in ("html", "markdown", "latex", "csv", "data")},
+        {name: getattr(paths, name) for name in ("headline", "html", "markdown", "latex", "csv", "data")},
+        wrapped(paths.headline),
         report_table(board, top, MOST_ROWS),
         (f"... and {more} more; " if more > 0 else "") + board.brief,
         *left_out,

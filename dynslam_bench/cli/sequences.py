@@ -23,7 +23,7 @@ Name = Annotated[str, typer.Argument(help="Id, published folder name or path.", 
 @app.command("list")
 def list_(
     pattern: Annotated[str, typer.Argument(help="Which, e.g. tum/fr3 or 'tum/fr3/*xyz'.")] = "*",
-    tag: Annotated[Optional[str], typer.Option(help="Only static, low-dynamic or high-dynamic ones.")] = None,  # noqa: UP045
+    tag: Annotated[Optional[str], typer.Option(help="Only those with a tag: static, low-dynamic, high-dynamic, unknown-objects.")] = None,  # noqa: UP045
     here: Annotated[bool, typer.Option("--here", help="Only those on this machine.")] = False,
     data_root: DataRoot = None,
     as_json: AsJson = False,

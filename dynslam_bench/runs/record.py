@@ -69,7 +69,7 @@ class SequenceInfo(Record):
         ground_truth: Whether it has any.
         license: Licence of the data.
         citation: What to cite.
-        tags: For example ``high-dynamic``.
+        tags: For example ``high-dynamic``, see `sequences.tags`.
         split: ``tune``, ``held-out`` or empty.
     """
 

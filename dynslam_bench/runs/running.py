@@ -36,6 +36,7 @@ from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verd
 from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
 from dynslam_bench.runs.spec import RunSpec, place_of
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RUN_FILE, RunStore
+from dynslam_bench.sequences.tags import sequence_tags
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.slam.map_files import MAP_FILE
 
@@ -149,7 +150,7 @@ def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> Se
         ground_truth=sequence.ground_truth is not None,
         license=sequence.license,
         citation=sequence.citation,
-        tags=sorted(getattr(sequence, "tags", ())),
+        tags=sequence_tags(sequence),
         split=getattr(sequence, "split", ""),
     )
 

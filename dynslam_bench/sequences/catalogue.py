@@ -24,9 +24,9 @@ from dynslam_bench.sequences.cameras import CAMERAS, MARKER_TO_CAMERA, chosen_ca
 from dynslam_bench.sequences.readers.layouts import find_layout, is_bag, layout_of
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
+from dynslam_bench.sequences.tags import Tag
 from dynslam_bench.sequences.view import SequenceView
 
-Tag = Literal["static", "low-dynamic", "high-dynamic"]
 Split = Literal["tune", "held-out", ""]
 _FILES = ("tum", "bonn", "wild_slam", "eth3d", "icl", "seven_scenes", "shibuya", "openloris")
 

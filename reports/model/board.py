@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
 from statistics import geometric_mean, median
 from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import ReportError, did_you_mean
 from dynslam_bench.core.toml import assignments
@@ -18,16 +21,30 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
-from dynslam_bench.reports.model.statistics import FLOOR_M, Standing, standings
+from dynslam_bench.reports.model.statistics import (
+    FLOOR_M,
+    Standing,
+    log_medians,
+    ratio_interval,
+    separable,
+    standings,
+)
 from dynslam_bench.runs.store import RunStore, part_words
 
 STATIC_CAMERA = "static camera (from ground truth)"
 DEFAULT_REFERENCE = "orb-slam2"
 On = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
-_GROUPS = {"static": "static", "low-dynamic": "low dynamic", "high-dynamic": "high dynamic"}
-"""Tag of a sequence to the name of its group, in their order."""
-_NAMES = (("walking", "high dynamic"), ("sitting", "low dynamic"))
+OVERALL = "overall"
+_GROUPS = {
+    "unknown-objects": "unknown objects",
+    "static": "static",
+    "low-dynamic": "low dynamic",
+    "high-dynamic": "high dynamic",
+}
+"""Tag of a sequence to the name of its group; the first one that a sequence has counts."""
+_FURTHER = {"fast": "fast", "loop": "loops", "recorded": "recorded", "rendered": "rendered"}
+"""Tag of a sequence to a category that it has beside its group."""
 _OTHER = "other"
 _MOST_MISSING = 8
 """Trackers whose missing cells are named."""
@@ -48,7 +65,9 @@ class Board:
         sequences: Names of the sequences with ground truth, grouped and sorted.
         common: Those of them that the standings are taken over.
         short: Sequence to what is left of its name without the parts that all share.
-        groups: Sequence to the name of its group.
+        tags: Sequence to its tags, with ``recorded`` or ``rendered``.
+        groups: Sequence to the name of its group: what moves in its scene.
+        category: Which category the board is of, `OVERALL` for all sequences: then groups have equal weights.
         unscored: Names of the sequences without ground truth.
         cells: Variant key to sequence to its runs.
         static_camera: Sequence to the error of a static camera.
@@ -73,7 +92,9 @@ class Board:
     sequences: list[str] = field(default_factory=list)
     common: list[str] = field(default_factory=list)
     short: dict[str, str] = field(default_factory=dict)
+    tags: dict[str, set[str]] = field(default_factory=dict)
     groups: dict[str, str] = field(default_factory=dict)
+    category: str = OVERALL
     unscored: list[str] = field(default_factory=list)
     cells: dict[str, dict[str, Cell]] = field(default_factory=dict)
     static_camera: dict[str, float] = field(default_factory=dict)
@@ -89,6 +110,20 @@ class Board:
     @cached_property
     def _by_key(self) -> dict[str, list[RunRow]]:
         return grouped(self.rows, lambda row: row.variant_key)
+
+    @property
+    def categories(self) -> dict[str, list[str]]:
+        """Category to its sequences, of those categories that hold some of the sequences and not all."""
+        categories = grouped(self.sequences, self.groups.__getitem__)
+        for tag, category in _FURTHER.items():
+            categories[category] = [name for name in self.sequences if tag in self.tags[name]]
+        return {category: names for category, names in categories.items() if 0 < len(names) < len(self.sequences)}
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weights of the common sequences: on an overall board all groups weigh the same, elsewhere all sequences."""
+        sizes = Counter(self.groups[name] for name in self.common)
+        return {name: 1.0 / sizes[self.groups[name]] if self.category == OVERALL else 1.0 for name in self.common}
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
@@ -213,8 +248,27 @@ def make_board(
     trackers = sorted({row.tracker.id for row in rows})
     if reference is not None and reference not in trackers:
         raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, trackers))
-    board = Board(list(rows), on, rank_seen, name_columns(rows), asked_reference=reference or "")
-    board.labels = make_labels(rows)
+    board = Board(
+        list(rows), on, rank_seen, name_columns(rows), labels=make_labels(rows), asked_reference=reference or ""
+    )
+    return _completed(board)
+
+
+def category_boards(board: Board) -> dict[str, Board]:
+    """A board of its own for every category of an overall board, under the same labels and with the same reference."""
+    boards = {OVERALL: board}
+    for category, names in board.categories.items():
+        rows = [row for row in board.rows if board.sequence(row) in names]
+        keys = {row.variant_key for row in rows}
+        part = Board(rows, board.on, board.rank_seen, board.columns, asked_reference=board.asked_reference)
+        part.labels = {key: label for key, label in board.labels.items() if key in keys}
+        part.category = category
+        boards[category] = _completed(part)
+    return boards
+
+
+def _completed(board: Board) -> Board:
+    """The board of rows with labels, ordered and ranked."""
     _order_sequences(board)
     for key in board.labels:
         cells = grouped(board.runs(key), board.sequence)
@@ -227,7 +281,7 @@ def make_board(
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
-    _choose_reference(board, scored, reference or DEFAULT_REFERENCE)
+    _choose_reference(board, scored, board.asked_reference or DEFAULT_REFERENCE)
     board.standings = rank(board, scored, board.ranked)
     placed = [standing.key for standing in board.standings]
     placed += sorted((key for key in shown if key not in placed), key=board.labels.__getitem__)
@@ -274,7 +328,37 @@ def rank(
         return []
     placed = [key for key in scored if any(cells[key].get(name) for name in shared)]
     full = [key for key in ranked if key in placed and all(cells[key].get(name) for name in shared)]
-    return standings({key: cells[key] for key in placed}, shared, full)
+    placed_cells = {key: cells[key] for key in placed}
+    return [
+        replace(standing, verdict="reference") if standing.key == board.reference and standing.verdict else standing
+        for standing in standings(placed_cells, shared, full, board.weights)
+    ]
+
+
+def ranked_logs(board: Board) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+    """Logarithms of the median errors of the ranked trackers on the common sequences, and these sequences' weights."""
+    logs = {
+        key: log_medians({name: board.cells[key][name].scores for name in board.common}, board.common)
+        for key in board.ranked
+    }
+    return logs, np.array([*board.weights.values()])
+
+
+def pair_frame(board: Board) -> pd.DataFrame:
+    """How every ranked tracker compares with every other one, Holm-corrected over all pairs.
+
+    Returns:
+        One line a pair: tracker, other (labels), ratio (geometric mean of the errors of the first over those of the
+        second), low, high (95 % interval, NaN for few sequences), p_value (corrected), verdict (of the first).
+    """
+    logs, weights = ranked_logs(board)
+    lines = []
+    for (a, b), (apart, p_value) in separable(logs, weights).items():
+        ratio = ratio_interval(logs[a] - logs[b], weights)
+        verdict = "cannot tell" if not apart else "better" if ratio.value < 1 else "worse"
+        names = board.labels[a], board.labels[b]
+        lines.append((*names, ratio.value, ratio.low, ratio.high, p_value, verdict))
+    return pd.DataFrame(lines, columns=["tracker", "other", "ratio", "low", "high", "p_value", "verdict"])
 
 
 def _order_sequences(board: Board) -> None:
@@ -285,12 +369,12 @@ def _order_sequences(board: Board) -> None:
             board.static_camera[name] = median(errors)
         else:
             board.unscored.append(name)
-        tagged = [group for tag, group in _GROUPS.items() if tag in rows[0].sequence.tags]
-        named = [group for part, group in _NAMES if part in rows[0].sequence.id]
-        board.groups[name] = [*tagged, *named, _OTHER][0]
+        board.tags[name] = {tag for row in rows for tag in row.sequence.tags}
+        board.tags[name].add("rendered" if rows[0].sequence.id.startswith("synthetic/") else "recorded")
+        board.groups[name] = next((group for tag, group in _GROUPS.items() if tag in board.tags[name]), _OTHER)
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
-    order = [*_GROUPS.values(), _OTHER, ""]
+    order = ["static", "low dynamic", "high dynamic", "unknown objects", _OTHER, ""]
     board.sequences = sorted(board.static_camera, key=lambda name: (order.index(board.groups[name]), name))
     board.short = shortened(board.sequences)
 

@@ -1,15 +1,18 @@
-"""Statistics of a leaderboard: ratios to a reference, groups of trackers that the data can separate, paired tests.
+"""Statistics of a leaderboard: ratios to a reference, who is better than it, and which trackers can be told apart.
 
 Errors of different sequences are never averaged as they are (a hard sequence would drown the rest); they are compared
-as ratios to a reference on the same sequence and averaged geometrically. Sequences are the sample: the repeats of a
-cell give its median, and are no further evidence about other sequences.
+as ratios on the same sequence and averaged geometrically. Sequences are the sample: the repeats of a cell give its
+median, and are no further evidence about other sequences. Sequences may have weights, so that a mean over categories
+does not depend on how many sequences each category has; with equal weights all formulas are Student's.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -18,13 +21,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Cells = Mapping[str, Mapping[str, Sequence[float]]]
 """Tracker to sequence to the errors of its runs there, in metres."""
+Verdict = Literal["better", "worse", "cannot tell", "reference", ""]
+"""How a tracker stands to the reference; empty for one that is not ranked."""
 
 FLOOR_M = 1e-6
 """Errors below a micrometre count as one, so that their logarithm exists."""
 FEWEST = 5
 """Sequences below which no interval is given and no two trackers are called different."""
 FAMILY_ERROR = 0.04
-"""Chance that any pair of trackers is put into a wrong order; below 5 % since errors are only about log-normal."""
+"""Chance of any wrong claim in one family of tests; below 5 % since errors are only about log-normal."""
 
 
 @dataclass(frozen=True)
@@ -42,16 +47,15 @@ class Standing:
 
     Attributes:
         key: The tracker.
-        ratio: Geometric mean over sequences of its median error over the reference's; with Student's interval from
+        ratio: Geometric mean over sequences of its median error over the reference's; with a 95 % interval from
             `FEWEST` sequences on.
         rank: Rank by that ratio among the ranked trackers, 1 is best; None for an unranked one.
         group: First and last rank that the data leave open; None for an unranked tracker.
         mean_rank: Mean over sequences of its rank there; None for an unranked one.
         wins: Sequences on which its median error is smaller than the reference's.
-        better: Probability that a run of it has a smaller error than a run of the reference.
-        p_value: Two-sided Wilcoxon signed-rank test of its medians against the reference's over sequences,
-            Holm-corrected over the ranked trackers; None for others, for the reference itself, and where so few
-            sequences can never give 0.05.
+        verdict: Whether it is better than the reference.
+        p_value: Two-sided paired t test of the log errors against the reference's, Holm-corrected over the ranked
+            trackers; None where there is no verdict.
         sequences: Sequences it was run on.
     """
 
@@ -61,45 +65,62 @@ class Standing:
     group: tuple[int, int] | None
     mean_rank: float | None
     wins: int
-    better: float
+    verdict: Verdict
     p_value: float | None
     sequences: int
 
 
-def standings(cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Sequence[str]) -> list[Standing]:
+@dataclass(frozen=True)
+class MeanRanks:
+    """Friedman's test with Nemenyi's critical difference (Demsar 2006): ranks on every sequence, weights do not count.
+
+    Attributes:
+        ranks: Tracker to the mean of its ranks, the best first.
+        p_value: Of Friedman's test that all trackers are alike.
+        critical_difference: Mean ranks that differ by more are different at 5 %.
+    """
+
+    ranks: dict[str, float]
+    p_value: float
+    critical_difference: float
+
+
+def standings(
+    cells: Cells,
+    reference: Mapping[str, Sequence[float]],
+    ranked: Sequence[str],
+    weights: Mapping[str, float] | None = None,
+) -> list[Standing]:
     """Compare trackers over sequences.
 
     Args:
         cells: Errors of the trackers; a tracker may lack sequences if it is not ranked.
         reference: The reference's errors on every sequence.
         ranked: Trackers that take part in the ranking; each needs a value on every sequence.
+        weights: Weight of each sequence; all the same where there are none.
 
     Returns:
         The ranked trackers from the best to the worst, then the others by their ratio.
     """
     names = list(reference)
-    base = _log_medians(reference, names)
-    logs = {key: _log_medians(cell, names) for key, cell in cells.items()}
-    p_values = {key: paired_p_value(logs[key], base) for key in ranked}
-    tested = {key: p for key, p in p_values.items() if p is not None}
-    shown = attainable_p(len(names), len(tested)) <= 0.05
-    corrected = dict(zip(tested, holm([*tested.values()]).tolist(), strict=True)) if shown else {}
+    base = log_medians(reference, names)
+    share = np.array([1.0 if weights is None else weights[name] for name in names])
+    logs = {key: log_medians(cell, names) for key, cell in cells.items()}
     ranked_logs = {key: logs[key] for key in ranked}
-    means = [round(float(np.mean(log)), 12) for log in ranked_logs.values()]
+    verdicts = verdicts_against(ranked_logs, base, share)
+    means = [round(float(np.average(log, weights=share)), 12) for log in ranked_logs.values()]
     ranks = dict(zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True))
-    by_sequence = scipy.stats.rankdata(np.reshape([*ranked_logs.values()], (-1, len(names))), axis=0)
-    mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
-    groups = rank_groups(ranked_logs)
+    groups, mean_ranks = rank_groups(ranked_logs, share), _mean_ranks(ranked_logs)
     unordered = [
         Standing(
             key=key,
-            ratio=ratio_interval(log - base),
+            ratio=ratio_interval(log - base, share),
             rank=ranks.get(key),
             group=groups.get(key),
             mean_rank=mean_ranks.get(key),
             wins=int((log < base).sum()),
-            better=_better(cells[key], reference),
-            p_value=corrected.get(key),
+            verdict=verdicts.get(key, ("", None))[0],
+            p_value=verdicts.get(key, ("", None))[1],
             sequences=int(np.isfinite(log).sum()),
         )
         for key, log in logs.items()
@@ -107,70 +128,114 @@ def standings(cells: Cells, reference: Mapping[str, Sequence[float]], ranked: Se
     return sorted(unordered, key=lambda s: (s.rank is None, s.rank or 0, s.ratio.value))
 
 
-def ratio_interval(log_ratios: Array) -> Interval:
-    """Geometric mean of ratios, with Student's 95 % interval where there are `FEWEST` or more; nan values are left out.
+def ratio_interval(log_ratios: Array, weights: Array | None = None) -> Interval:
+    """Geometric mean of ratios, with a 95 % interval where there are `FEWEST` or more; nan values are left out.
 
     Args:
         log_ratios: Their logarithms ``[S]``.
+        weights: Their weights ``[S]``; all the same where there are none.
     """
-    values = log_ratios[np.isfinite(log_ratios)]
-    if not len(values):
-        return Interval(np.nan, np.nan, np.nan)
-    mean = float(values.mean())
+    known = np.isfinite(log_ratios)
+    if not known.any():
+        return Interval(math.nan, math.nan, math.nan)
+    values, share = log_ratios[known], np.ones(known.sum()) if weights is None else weights[known]
     if len(values) < FEWEST:
-        return Interval(float(np.exp(mean)), np.nan, np.nan)
-    half = float(scipy.stats.t.ppf(0.975, len(values) - 1) * scipy.stats.sem(values))
+        return Interval(float(np.exp(np.average(values, weights=share))), math.nan, math.nan)
+    mean, error, freedom = _weighted_mean(values, share)
+    half = float(scipy.stats.t.ppf(0.975, freedom) * error)
     return Interval(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))
 
 
-def separable(logs: Mapping[str, Array]) -> dict[tuple[str, str], bool]:
+def _weighted_mean(values: Array, weights: Array) -> tuple[Array, Array, float]:
+    """Weighted mean of ``[..., S]``, its standard error, and the degrees of freedom (of Kish's effective sample)."""
+    share = weights / weights.sum()
+    effective = 1.0 / float((share**2).sum())
+    mean = values @ share
+    spread = ((share * (values - mean[..., None])) ** 2).sum(axis=-1)
+    return mean, np.sqrt(spread * effective / (effective - 1.0)), effective - 1.0
+
+
+def p_values(differences: Array, weights: Array) -> Array:
+    """Two-sided one-sample t tests of log ratios ``[K, S]`` against 0; below `FEWEST` sequences all are 1."""
+    if not len(differences) or differences.shape[1] < FEWEST:
+        return np.ones(len(differences))
+    means, errors, freedom = _weighted_mean(differences, weights)
+    constant = np.ptp(differences, axis=1) == 0  # the same ratio on every sequence
+    with np.errstate(divide="ignore", invalid="ignore"):
+        p = 2.0 * scipy.stats.t.sf(np.abs(means / errors), freedom)
+    return np.where(constant, np.where(differences[:, 0] == 0, 1.0, 0.0), p)
+
+
+def verdicts_against(
+    logs: Mapping[str, Array], base: Array, weights: Array
+) -> dict[str, tuple[Verdict, float | None]]:
+    """Whether each tracker is better than the reference, Holm-corrected over the trackers.
+
+    All claims of a board are right together with a chance of at least 95 % (a family-wise error of `FAMILY_ERROR`).
+
+    Args:
+        logs: Tracker to the logarithms of its median errors ``[S]``.
+        base: Those of the reference.
+        weights: Weights ``[S]`` of the sequences.
+
+    Returns:
+        Verdict and corrected p value of every tracker.
+    """
+    verdicts: dict[str, tuple[Verdict, float | None]] = dict.fromkeys(logs, ("cannot tell", None))
+    others = [key for key, log in logs.items() if not np.array_equal(log, base)]  # not the reference itself
+    corrected = holm(p_values(np.reshape([logs[key] - base for key in others], (-1, len(base))), weights))
+    for key, p in zip(others, corrected.tolist(), strict=True):
+        smaller = np.average(logs[key] - base, weights=weights) < 0
+        verdicts[key] = ("cannot tell" if p > FAMILY_ERROR else "better" if smaller else "worse"), p
+    return verdicts
+
+
+def separable(logs: Mapping[str, Array], weights: Array) -> dict[tuple[str, str], tuple[bool, float]]:
     """Which trackers the sequences tell apart: paired t tests of the log errors, Holm-corrected over all pairs.
 
-    The order of all pairs that are called separable is right together with a chance of at least 95 % (a family-wise
-    error of `FAMILY_ERROR`). Below `FEWEST` sequences nothing is separable.
+    The order of all pairs that are called separable is right together with a chance of at least 95 %.
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of sequences, none missing.
+        weights: Weights ``[S]`` of the sequences.
 
     Returns:
-        For every pair ``(a, b)``, a before b in `logs`, whether they differ.
+        For every pair ``(a, b)``, a before b in `logs`, whether they differ, and the corrected p value.
     """
     pairs = list(combinations(logs, 2))
-    if not pairs:
-        return {}
-    differences = np.stack([logs[a] - logs[b] for a, b in pairs])
-    p_values = np.ones(len(pairs))
-    if differences.shape[1] >= FEWEST:
-        varied = np.ptp(differences, axis=1) > 0
-        p_values[varied] = scipy.stats.ttest_1samp(differences[varied], 0.0, axis=1).pvalue
-        p_values[~varied & (differences[:, 0] != 0)] = 0.0  # the same ratio on every sequence
-    return dict(zip(pairs, (holm(p_values) <= FAMILY_ERROR).tolist(), strict=True))
+    differences = np.reshape([logs[a] - logs[b] for a, b in pairs], (-1, len(weights)))
+    corrected = holm(p_values(differences, weights)).tolist()
+    return {pair: (p <= FAMILY_ERROR, p) for pair, p in zip(pairs, corrected, strict=True)}
 
 
-def rank_groups(logs: Mapping[str, Array]) -> dict[str, tuple[int, int]]:
-    """First and last rank that the data leave open to every tracker.
-
-    Args:
-        logs: As in `separable`.
-    """
+def rank_groups(logs: Mapping[str, Array], weights: Array) -> dict[str, tuple[int, int]]:
+    """First and last rank that the data leave open to every tracker; arguments as in `separable`."""
     better, worse = dict.fromkeys(logs, 0), dict.fromkeys(logs, 0)
-    for (a, b), apart in separable(logs).items():
+    means = {key: np.average(log, weights=weights) for key, log in logs.items()}
+    for (a, b), (apart, _) in separable(logs, weights).items():
         if apart:
-            first, second = (a, b) if logs[a].mean() < logs[b].mean() else (b, a)
+            first, second = (a, b) if means[a] < means[b] else (b, a)
             worse[first] += 1
             better[second] += 1
     return {key: (1 + better[key], len(logs) - worse[key]) for key in logs}
 
 
-def paired_p_value(log_a: Array, log_b: Array) -> float | None:
-    """Two-sided Wilcoxon signed-rank test of paired logarithms; None for no pair that differs."""
-    difference = (log_a - log_b)[log_a != log_b]
-    return float(scipy.stats.wilcoxon(difference).pvalue) if len(difference) else None
+def mean_rank_test(logs: Mapping[str, Array]) -> MeanRanks | None:
+    """Friedman's test and Nemenyi's critical difference; None for fewer than three trackers or `FEWEST` sequences.
 
-
-def attainable_p(sequences: int, tests: int = 1) -> float:
-    """The smallest Holm-corrected p that a signed-rank test can give."""
-    return min(1.0, max(tests, 1) * 2.0 / 2.0**sequences)
+    Args:
+        logs: As in `separable`.
+    """
+    trackers, sequences = len(logs), len(next(iter(logs.values()), ()))
+    if trackers < 3 or sequences < FEWEST:
+        return None
+    ranks = _mean_ranks(logs)
+    quantile = scipy.stats.studentized_range.ppf(0.95, trackers, np.inf) / math.sqrt(2.0)
+    return MeanRanks(
+        dict(sorted(ranks.items(), key=lambda item: item[1])),
+        float(scipy.stats.friedmanchisquare(*logs.values()).pvalue),
+        float(quantile * math.sqrt(trackers * (trackers + 1) / (6.0 * sequences))),
+    )
 
 
 def holm(p_values: Sequence[float] | Array) -> Array:
@@ -180,44 +245,15 @@ def holm(p_values: Sequence[float] | Array) -> Array:
     return np.asarray(np.maximum.accumulate(steps)[np.argsort(order)])
 
 
-def power_note(standings: Sequence[Standing], sequences: int, fewest_repeats: int) -> str:
-    """One paragraph on what a sample of this size can show.
-
-    Args:
-        standings: The ranked ones count.
-        sequences: Sequences that they are ranked on.
-        fewest_repeats: Repeats that count in the smallest of their cells, 0 if there is none.
-    """
-    if not sequences:
-        return "No sequence has ground truth, so nothing can be compared."
-    groups = [s.group for s in standings if s.group is not None]
-    count = f"{sequences} sequence{'s' if sequences != 1 else ''}"
-    pairs = len(groups) * (len(groups) - 1) // 2
-    apart = sum(len(groups) - (last - first + 1) for first, last in groups) // 2
-    smallest_p = attainable_p(sequences, len(groups))
-    sentences = {
-        f"With {count} no two trackers are called different (below {FEWEST} there are no intervals): read the order "
-        "as a description of these sequences, not as evidence about others.": sequences < FEWEST,
-        f"{count}, {len(groups)} ranked trackers: {apart} of {pairs} pairs can be told apart (paired t tests of "
-        "the log errors over sequences, Holm).": sequences >= FEWEST and pairs,
-        f"The smallest p that a signed-rank test can reach is {smallest_p:.3g}, so none is shown.": smallest_p > 0.05,
-        f"Some cells hold only {fewest_repeats} run{'s' if fewest_repeats != 1 else ''} that count: the spread "
-        "from run to run is unknown there.": 0 < fewest_repeats < 3,
-    }
-    shown = [sentence for sentence, holds in sentences.items() if holds]
-    return " ".join(shown) or f"{count}, {len(groups)} ranked trackers, at least {fewest_repeats} runs a cell."
-
-
-def _log_medians(cell: Mapping[str, Sequence[float]], names: Sequence[str]) -> Array:
+def log_medians(cell: Mapping[str, Sequence[float]], names: Sequence[str]) -> Array:
     """Logarithms of the median errors ``[S]``; nan where there is no run."""
     medians = [float(np.median(cell[name])) if cell.get(name) else np.nan for name in names]
     return np.asarray(np.log(np.maximum(np.asarray(medians, dtype=np.float64), FLOOR_M)))
 
 
-def _better(cell: Mapping[str, Sequence[float]], reference: Mapping[str, Sequence[float]]) -> float:
-    shares = []
-    for name, others in reference.items():
-        a, b = np.asarray(cell.get(name, ())), np.asarray(others)
-        if len(a) and len(b):
-            shares.append(float((a[:, None] < b).mean() + 0.5 * (a[:, None] == b).mean()))
-    return float(np.mean(shares)) if shares else np.nan
+def _mean_ranks(logs: Mapping[str, Array]) -> dict[str, float]:
+    """Mean over sequences of each tracker's rank there."""
+    if not logs:
+        return {}
+    ranks = scipy.stats.rankdata(np.stack(list(logs.values())), axis=0)
+    return dict(zip(logs, ranks.mean(axis=1).tolist(), strict=True))

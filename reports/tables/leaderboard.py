@@ -14,7 +14,7 @@ import numpy as np
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import STATIC_CAMERA, Board, Cell, mean_skipped, rank
+from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, Cell, mean_skipped, pair_frame, rank
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
@@ -81,21 +81,17 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
 
 
 COLUMNS = (
-    Column("#", meaning="ranks that the data leave open; several: not separable from the others with that rank"),
+    Column("#", meaning="ranks that the data leave open; several: these trackers cannot be told apart"),
     Column("success", meaning="runs that ended and could be evaluated, of all"),
     Column("tracker", numeric=False),
     Column("ATE ratio", meaning="geometric mean over sequences of the median ATE over that of {reference}"),
+    Column(
+        "better?",
+        meaning="better than {reference}, worse, or cannot tell: paired t test of the log errors over sequences, "
+        "Holm-corrected over the ranked trackers; behind it the corrected p",
+    ),
+    Column("wins", meaning="sequences with a smaller median ATE than {reference}"),
     Column("mean rank", meaning="mean over sequences of the rank there", latex=False),
-    Column(
-        "wins",
-        meaning="sequences with a smaller median ATE than the reference; behind it the probability that a run has a "
-        "smaller error than one of the reference",
-    ),
-    Column(
-        "p",
-        meaning="paired Wilcoxon test against the reference over sequences, Holm-corrected; none where it could never "
-        "be below 0.05",
-    ),
     Column("coverage", meaning="tracked frames over associated input frames"),
     Column(
         "× real time",
@@ -124,7 +120,7 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
     parts = [
         f"{protocol.describe()}; for the ranking a lost frame counts as not having moved since the last tracked one.",
         f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
-        f"{board.reference_name}; below 1 is better. {intervals}",
+        f"{board.reference_name}; below 1 is better. {_mean_words(board)}{intervals}",
         f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
@@ -150,6 +146,13 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"({hinted}), as the diagnostics say; no number is changed for that.": hinted,
     }
     return " ".join(parts + [remark for remark, holds in remarks.items() if holds])
+
+
+def _mean_words(board: Board) -> str:
+    groups = list(dict.fromkeys(board.groups[name] for name in board.common))
+    if len(groups) < 2 or board.category != OVERALL:
+        return ""
+    return f"It is a mean over {_count(len(groups), 'category')} ({', '.join(groups)}), which all weigh the same. "
 
 
 def _hinted(rows: Iterable[RunRow]) -> str:
@@ -193,15 +196,89 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
         ratio = TableCell(
             ratio.text, f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip(), ratio.value
         )
-    better = f"P {standing.better:.2f}" if standing.sequences >= FEWEST else ""
-    wins = TableCell(f"{standing.wins} of {standing.sequences}", better, standing.wins)
+    wins = TableCell(f"{standing.wins} of {standing.sequences}", value=standing.wins)
     return cells | {
         "#": TableCell("–", "no better than a static camera") if key in board.no_better else rank_cell(standing),
         "ATE ratio": ratio,
+        "better?": verdict_cell(board, standing),
+        "wins": TableCell() if key == board.reference else wins,
         "mean rank": number(standing.mean_rank, ".2f"),
-        "wins": TableCell("reference") if key == board.reference else wins,
-        "p": number(standing.p_value, ".3f"),
     }
+
+
+def verdict_cell(board: Board, standing: Standing) -> TableCell:
+    """Better than the reference, worse, or cannot tell, with the corrected p value; coloured where it is shown."""
+    if not standing.verdict or len(board.common) < FEWEST and standing.verdict != "reference":
+        return TableCell()
+    p = "" if standing.p_value is None else "p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}"
+    colours = {"better": shade(0.5), "worse": shade(2.0)}
+    return TableCell(standing.verdict, p, standing.p_value, shade=colours.get(standing.verdict))
+
+
+def category_table(boards: Mapping[str, Board]) -> Table | None:
+    """The ratios of all trackers by category; None where there is one category only.
+
+    Args:
+        boards: Category to its board, see `category_boards`.
+    """
+    if len(boards) < 2:
+        return None
+    overall = boards[OVERALL]
+    standings = {name: {s.key: s for s in board.standings} for name, board in boards.items()}
+    best = {
+        name: {s.key for s in board.standings if s.group is not None and s.group[0] == 1}
+        for name, board in boards.items()
+    }
+    rows = []
+    for key in overall.trackers:
+        cells = [TableCell(overall.labels[key])]
+        for name, board in boards.items():
+            standing = standings[name].get(key)
+            if standing is None:
+                cells.append(TableCell())
+                continue
+            few = 2 * len(best[name]) <= len(board.ranked)
+            cell = interval_cell(standing.ratio, ".2f", "best" if few and key in best[name] else "")
+            cells.append(replace(cell, shade=verdict_cell(board, standing).shade, tip=standing.verdict))
+        rows.append(cells)
+    columns = [
+        Column(name, meaning=f"{_count(len(board.common), 'sequence')}, against {board.reference_name}")
+        for name, board in boards.items()
+    ]
+    caption = (
+        "Geometric mean of the median ATE over that of the reference, by category; brackets are 95 % intervals from "
+        f"{FEWEST} sequences on. Green: better than the reference; red: worse; no colour: cannot tell, or not ranked. "
+        "A sequence may be in several categories: what moves there, how the camera moves, recorded or rendered."
+    )
+    muted, separators = overall.unranked_rows(overall.trackers), overall.separators()
+    return Table("categories", "By category", caption, [*texts("tracker"), *columns], rows, muted, separators)
+
+
+def pair_table(board: Board) -> Table | None:
+    """Every ranked tracker against every other; None below `FEWEST` sequences or for fewer than three trackers."""
+    if len(board.common) < FEWEST or len(board.ranked) < 3:
+        return None
+    pairs = {(line.tracker, line.other): line for line in pair_frame(board).itertuples()}
+    rows = []
+    for key in board.ranked:
+        label = board.labels[key]
+        cells = [TableCell(label)]
+        for other in (board.labels[other] for other in board.ranked):
+            line = pairs.get((label, other)) or pairs.get((other, label))
+            if line is None:
+                cells.append(TableCell("–", emphasis="muted"))
+                continue
+            ratio = line.ratio if line.tracker == label else 1.0 / line.ratio
+            apart = line.verdict != "cannot tell"
+            colour = shade(0.5 if ratio < 1 else 2.0) if apart else None
+            cells.append(TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {line.p_value:.3f}"))
+        rows.append(cells)
+    caption = (
+        "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart (paired "
+        "t tests of the log errors over sequences, Holm-corrected over all pairs); '?': they cannot."
+    )
+    columns = [*texts("tracker"), *numbers(*(board.labels[key] for key in board.ranked))]
+    return Table("pairs", "All pairs", caption, columns, rows)
 
 
 def timed(runs: Sequence[RunRow]) -> list[RunRow]:
@@ -226,7 +303,7 @@ def rank_cell(standing: Standing) -> TableCell:
     if standing.rank is None or standing.group is None:
         return TableCell("–")
     first, last = standing.group
-    return TableCell(str(first)) if first == last else TableCell(f"{first}–{last}", "not separable")
+    return TableCell(str(first)) if first == last else TableCell(f"{first}–{last}")
 
 
 def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:

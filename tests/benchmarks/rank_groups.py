@@ -1,10 +1,11 @@
-"""How often the leaderboard's rank groups hold the true order of all trackers, and how much they separate.
+"""How often a leaderboard is right, and how many true differences it finds, on boards whose truth is known.
 
-Errors are simulated: a hardness for every sequence, a quality for every tracker, and a scatter of several shapes. A
-board counts as right if the true rank of every tracker lies in its group. Of trackers that are exactly equal, any
-separation counts as wrong. In the shape "failures" every tracker fails as often as every other. "Unlike failures" is
-outside of what a test on few sequences can hold: the more a tracker fails there, the better it is where it does not,
-so that all have the same mean; on few sequences most failures are not seen, and what is seen is a difference.
+Errors are simulated: a hardness for every sequence, a quality for every tracker, and a scatter of several shapes. Two
+questions are asked of every board: is a tracker better than the reference (Holm over the trackers), and what is the
+order of all pairs (Holm over the pairs). A board counts as right if none of its claims is wrong; of trackers that are
+exactly equal, any claim counts as wrong. In the shape "failures" every tracker fails as often as every other. "Unlike
+failures" is outside of what a test on few sequences can hold: the more a tracker fails there, the better it is where it
+does not, so that all have the same mean.
 
 Run: python tests/benchmarks/rank_groups.py [boards]
 """
@@ -13,9 +14,9 @@ import sys
 
 import numpy as np
 
-from dynslam_bench.reports.model.statistics import rank_groups
+from dynslam_bench.reports.model.statistics import separable, verdicts_against
 
-SEQUENCES = (3, 4, 5, 6, 8, 12, 20)
+SEQUENCES = (5, 8, 12, 24)
 TRACKERS = (2, 5, 10, 20)
 
 
@@ -35,37 +36,71 @@ SHAPES = {
 }
 
 
-def simulate(shape, quality, sequences, boards, seed=0):
-    """Share of boards that are right, and mean share of the pairs that were separated."""
+def simulate(shape, quality, sequences, boards, seed=0, weights=None):
+    """What boards claim where the truth is known.
+
+    Args:
+        shape: Of the scatter, see `SHAPES`.
+        quality: Mean log error of each tracker ``[K]``.
+        sequences: How many sequences a board has.
+        boards: How many boards.
+        seed: Of the draws.
+        weights: Of the sequences; all the same where there are none.
+
+    Returns:
+        For the pairs and for the comparisons with the reference, the middle tracker: share of boards without a wrong
+        claim, and mean share of the true differences that are claimed.
+    """
     rng = np.random.default_rng(seed)
-    trackers = len(quality)
-    true = [(1 + int((quality < q).sum()), trackers - int((quality > q).sum())) for q in quality]
-    right, apart = 0, 0.0
+    trackers, middle = len(quality), len(quality) // 2
+    weights = np.ones(sequences) if weights is None else weights
+    right, claimed = np.zeros(2), np.zeros(2)
     for _ in range(boards):
         log = quality[:, None] + rng.normal(-3, 1, sequences) + SHAPES[shape](rng, (trackers, sequences))
-        groups = list(rank_groups({str(k): log[k] for k in range(trackers)}).values())
-        right += all(g[0] <= t[0] and t[1] <= g[1] for g, t in zip(groups, true, strict=True))
-        apart += sum(trackers - (g[1] - g[0] + 1) for g in groups) / (trackers * (trackers - 1))
-    return right / boards, apart / boards
+        logs = {str(k): log[k] for k in range(trackers)}
+        means = log @ weights
+        pairs = [
+            (quality[int(a)] - quality[int(b)]) * (means[int(a)] - means[int(b)]) > 0
+            for (a, b), (apart, _) in separable(logs, weights).items()
+            if apart
+        ]
+        others = {key: log for key, log in logs.items() if key != str(middle)}
+        against = [
+            (quality[int(key)] - quality[middle]) * (1 if verdict == "worse" else -1) > 0
+            for key, (verdict, _) in verdicts_against(others, log[middle], weights).items()
+            if verdict in ("better", "worse")
+        ]
+        right += [all(pairs), all(against)]
+        claimed += [sum(pairs) / (trackers * (trackers - 1) / 2), sum(against) / (trackers - 1)]
+    return right / boards, claimed / boards
 
 
 def main():
     """Print one line a shape and spread of the qualities, over all numbers of trackers."""
-    boards = int(sys.argv[1]) if len(sys.argv) > 1 else 500
-    print(f"share of boards whose groups hold the true order / share of the pairs separated; {boards} boards each of")
-    print(f"{', '.join(map(str, TRACKERS))} trackers, by number of sequences")
-    print(f"{'shape':20s}{'qualities':>12s}" + "".join(f"{n:>14d}" for n in SEQUENCES), flush=True)
+    boards = int(sys.argv[1]) if len(sys.argv) > 1 else 300
+    print(f"share of boards without a wrong claim / share of the true differences found; {boards} boards each of")
+    print(f"{', '.join(map(str, TRACKERS))} trackers, by number of sequences; first all pairs, then the reference")
+    print(f"{'shape':18s}{'qualities':>10s}" + "".join(f"{n:>28d}" for n in SEQUENCES), flush=True)
     for shape in SHAPES:
         for name, spread in (("equal", 0.0), ("sd 25 %", 0.25), ("sd 70 %", 0.7)):
             cells = ""
-            for n in SEQUENCES:
-                found = []
+            for sequences in SEQUENCES:
+                outcomes = []
                 for trackers in TRACKERS:
                     quality = np.sort(np.random.default_rng(1).normal(0, 1, trackers)) * spread
-                    found.append(simulate(shape, quality, n, boards, seed=trackers))
-                right, apart = np.mean(found, axis=0)
-                cells += f"{right:>8.3f}/{apart:.3f}"
-            print(f"{shape:20s}{name:>12s}{cells}", flush=True)
+                    outcomes.append(simulate(shape, quality, sequences, boards, seed=trackers))
+                (pairs, against), (pairs_claimed, against_claimed) = np.mean(outcomes, axis=0)
+                cells += f"{pairs:>10.3f}/{pairs_claimed:.3f} {against:.3f}/{against_claimed:.3f}"
+            print(f"{shape:18s}{name:>10s}{cells}", flush=True)
+    print(f"\n20 trackers whose qualities spread by {SPREAD:.0%}: share of the true differences found")
+    quality = np.sort(np.random.default_rng(1).normal(0, 1, 20)) * SPREAD
+    for shape in ("normal", "heavy tails", "failures"):
+        for sequences in (8, 24):
+            _, (pairs, against) = simulate(shape, quality, sequences, boards)
+            print(f"{shape:18s}{sequences:3d} sequences: all pairs {pairs:.3f}, against the reference {against:.3f}")
+
+
+SPREAD = 0.4
 
 
 if __name__ == "__main__":

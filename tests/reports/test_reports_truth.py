@@ -252,10 +252,10 @@ def test_little_data_claims_little():
     names = [c.name for c in table.columns]
     assert "P(better)" not in names
     for cells in table.rows:
-        assert (cells[0].text, cells[0].small) == ("1–2", "not separable")
+        assert (cells[0].text, cells[0].small) == ("1–2", "")
         assert cells[names.index("ATE ratio")].small == ""
         assert cells[names.index("ATE ratio")].emphasis == ""
-        assert cells[names.index("p")].text == ""
+        assert cells[names.index("better?")].text == ""
     assert [cells[names.index("wins")].text for cells in table.rows] == ["2 of 2", "reference"]
 
 

@@ -368,7 +368,7 @@ _SCRIPTS: dict[str, Callable[[Draw, int, Plan], Cast]] = {
     "trolley": _trolley, "chair": _chair, "door": _door,
 }  # fmt: skip
 
-OBJECTS = {f"objects_{name}": Variant(partial(build_objects, name), "high-dynamic") for name in _SCRIPTS}
+OBJECTS = {f"objects_{name}": Variant(partial(build_objects, name), "unknown-objects") for name in _SCRIPTS}
 
 
 # Long paths that return: a room circled (20 m), a ring of corridors (60 m), six rooms along a corridor (120 m).

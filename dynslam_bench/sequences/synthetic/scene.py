@@ -19,6 +19,7 @@ from dynslam_bench.sequences.synthetic.arithmetic import norm, product
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE, Parts
 from dynslam_bench.sequences.synthetic.people import Person, Posture, add_person
 from dynslam_bench.sequences.synthetic.settings import CAMERA, DEFAULT_FRAMES, FPS, RenderSettings
+from dynslam_bench.sequences.tags import Tag
 
 Array = NDArray[np.float64]
 Placement = Callable[[float], tuple[Array, Array]]
@@ -99,13 +100,13 @@ class Variant:
 
     Attributes:
         build: Scene number to the world that is filmed.
-        tag: As in the catalogue: ``static``, ``low-dynamic`` or ``high-dynamic``.
+        tag: How much of the scene moves.
         frames: Default length.
         version: Raised whenever any pixel, pose or mask changes; 0 where the renderer's version alone counts.
     """
 
     build: Callable[[int], World]
-    tag: str
+    tag: Tag
     frames: int = DEFAULT_FRAMES
     version: int = 1
 

@@ -155,6 +155,7 @@ class SyntheticSequence:
         whole_id: The id without its length, for example ``synthetic/walking_xyz?scene=0``: all lengths cut the same
             script.
         split: ``tune`` (scenes 0-99) or ``held-out`` (100-199).
+        tags: How much of the scene moves.
         noise: Seed of the sensors' noise; None for the scene's own.
         timestamps: Stamps of all frames in seconds.
         store: The cache of its frames; None without one.
@@ -167,6 +168,7 @@ class SyntheticSequence:
         self.settings, self.threads = settings, threads or default_threads()
         self.id, self.whole_id = str(sequence), sequence.whole
         self.split, self.noise = sequence.split, sequence.noise
+        self.tags = frozenset({sequence.variant.tag if settings.people == "moving" else "static"})
         self.fps, self.license = FPS, "CC0-1.0"
         self.citation = f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
         self.timestamps = np.round(START_S + np.arange(sequence.frames) / FPS, 6)

@@ -1,0 +1,49 @@
+"""What a sequence is hard for: how much of its scene moves, and how its camera moves."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
+
+Tag = Literal["static", "low-dynamic", "high-dynamic", "unknown-objects"]
+"""What moves in a scene: nothing, people who stay where they are, people who walk, things that are no people."""
+FAST_M_S, FAST_DEG_S = 1.0, 40.0
+"""Mean speeds from which a camera counts as fast; TUM's fr1/desk has 0.4 m/s and 23 deg/s, fr1/rpy 0.06 and 50."""
+STEP_S = 0.1
+"""Time over which speeds are taken, so that the noise of a motion capture system does not count as motion."""
+LOOP_PATH_M, LOOP_EXTENT_M, LOOP_GAP_M = 10.0, 2.0, 1.0
+"""A loop is a path of such a length and extent at least, whose ends come as close as this."""
+MOST_POSES = 500
+
+
+def sequence_tags(sequence: Any) -> list[str]:
+    """Tags of a sequence or a part of one: those it brings, and ``fast`` and ``loop`` from its ground truth."""
+    truth: Trajectory | None = sequence.ground_truth
+    if truth is not None:
+        times = sequence.timestamps
+        truth = truth.select((truth.timestamps >= times[0]) & (truth.timestamps <= times[-1]))
+    motion = set() if truth is None or len(truth) < 2 else motion_tags(truth)
+    return sorted({*getattr(sequence, "tags", ()), *motion})
+
+
+def motion_tags(truth: Trajectory) -> set[str]:
+    """``fast`` and ``loop``, as far as they hold for the ground truth of a camera of two poses or more."""
+    times = truth.timestamps
+    index = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + STEP_S, STEP_S)).clip(max=len(times) - 1))
+    poses, duration_s = truth.T_world_cam[index], times[-1] - times[0]
+    steps = se3.inverse(poses[:-1]) @ poses[1:]
+    steps_m, turned_deg = np.linalg.norm(steps[:, :3, 3], axis=1), np.degrees(se3.rotation_angle(steps))
+    tags = set()
+    if steps_m.sum() >= FAST_M_S * duration_s or turned_deg.sum() >= FAST_DEG_S * duration_s:
+        tags.add("fast")
+    some = np.linspace(0, len(index) - 1, min(len(index), MOST_POSES)).astype(int)
+    path_m, positions = np.concatenate([[0.0], steps_m.cumsum()])[some], poses[some, :3, 3]
+    apart_m = np.linalg.norm(positions[:, None] - positions, axis=2)
+    closes = (apart_m <= LOOP_GAP_M) & (path_m - path_m[:, None] >= LOOP_PATH_M)
+    if apart_m.max() >= LOOP_EXTENT_M and closes.any():
+        tags.add("loop")
+    return tags
