@@ -19,7 +19,15 @@ from dynslam_bench.reports import figures
 from dynslam_bench.reports.figures import colours, safe
 from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, render, resource, table_blocks
-from dynslam_bench.reports.model.board import OVERALL, Board, On, category_boards, make_board, missing_commands, missing_note
+from dynslam_bench.reports.model.board import (
+    OVERALL,
+    Board,
+    On,
+    category_boards,
+    make_board,
+    missing_commands,
+    missing_note,
+)
 from dynslam_bench.reports.model.load import (
     Loaded,
     OnProgress,

@@ -23,7 +23,9 @@ Name = Annotated[str, typer.Argument(help="Id, published folder name or path.", 
 @app.command("list")
 def list_(
     pattern: Annotated[str, typer.Argument(help="Which, e.g. tum/fr3 or 'tum/fr3/*xyz'.")] = "*",
-    tag: Annotated[Optional[str], typer.Option(help="Only those with a tag: static, low-dynamic, high-dynamic, unknown-objects.")] = None,  # noqa: UP045
+    tag: Annotated[
+        str | None, typer.Option(help="Only those with a tag: static, low-dynamic, high-dynamic, unknown-objects.")
+    ] = None,
     here: Annotated[bool, typer.Option("--here", help="Only those on this machine.")] = False,
     data_root: DataRoot = None,
     as_json: AsJson = False,

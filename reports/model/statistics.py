@@ -166,9 +166,7 @@ def p_values(differences: Array, weights: Array) -> Array:
     return np.where(constant, np.where(differences[:, 0] == 0, 1.0, 0.0), p)
 
 
-def verdicts_against(
-    logs: Mapping[str, Array], base: Array, weights: Array
-) -> dict[str, tuple[Verdict, float | None]]:
+def verdicts_against(logs: Mapping[str, Array], base: Array, weights: Array) -> dict[str, tuple[Verdict, float | None]]:
     """Whether each tracker is better than the reference, Holm-corrected over the trackers.
 
     All claims of a board are right together with a chance of at least 95 % (a family-wise error of `FAMILY_ERROR`).

@@ -21,7 +21,7 @@ def headline(board: Board) -> str:
     where = f"On {_sequences(board)} "
     best = ranked[0]
     if len(ranked) == 1:
-        return f"{where}{board.labels[best.key]} alone is ranked: {_ratio_words(board, best)}."
+        return f"{where}{board.labels[best.key]} alone is ranked; its error is {_ratio_words(board, best)}."
     if len(board.common) < FEWEST:
         ratio = "" if best.key == board.reference else f", {_ratio_words(board, best)}"
         return (

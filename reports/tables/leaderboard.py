@@ -208,7 +208,7 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
 
 def verdict_cell(board: Board, standing: Standing) -> TableCell:
     """Better than the reference, worse, or cannot tell, with the corrected p value; coloured where it is shown."""
-    if not standing.verdict or len(board.common) < FEWEST and standing.verdict != "reference":
+    if not standing.verdict or (len(board.common) < FEWEST and standing.verdict != "reference"):
         return TableCell()
     p = "" if standing.p_value is None else "p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}"
     colours = {"better": shade(0.5), "worse": shade(2.0)}
@@ -271,7 +271,9 @@ def pair_table(board: Board) -> Table | None:
             ratio = line.ratio if line.tracker == label else 1.0 / line.ratio
             apart = line.verdict != "cannot tell"
             colour = shade(0.5 if ratio < 1 else 2.0) if apart else None
-            cells.append(TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {line.p_value:.3f}"))
+            cells.append(
+                TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {line.p_value:.3f}")
+            )
         rows.append(cells)
     caption = (
         "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart (paired "

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from reports_rows import row
 
 from dynslam_bench.reports.model.board import OVERALL, category_boards, make_board, pair_frame
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
 from dynslam_bench.reports.tables import leaderboard as tables
-from reports_rows import row
 
 
 def rows_of_truth(sizes, sequences, spread=0.05, seed=0):
@@ -46,9 +46,7 @@ def test_every_category_has_a_board_and_the_overall_one_is_a_mean_over_what_move
 
 def test_verdicts_are_those_of_the_category():
     boards = category_boards(make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6})))
-    verdicts = {
-        name: {s.key.split("|")[0]: s.verdict for s in part.standings} for name, part in boards.items()
-    }
+    verdicts = {name: {s.key.split("|")[0]: s.verdict for s in part.standings} for name, part in boards.items()}
     assert verdicts["high dynamic"] == {
         "masks": "better", "flow": "better", "orb-slam2": "reference", "bad": "worse",
     }  # fmt: skip
@@ -65,7 +63,9 @@ def test_the_headline_names_the_best_and_whether_they_can_be_told_apart():
     assert "MASKS" in said and "FLOW" in said and said.endswith("these cannot be told apart.")
     assert "below 5 sequences" in headline(boards["fast"])
     alone = make_board(rows_of_truth({"bad": SIZES["bad"]}, {"high-dynamic": 12}))
-    assert headline(alone) == "On 12 high dynamic sequences no tracker is shown to be better than ORB-SLAM2; 1 is worse."
+    assert (
+        headline(alone) == "On 12 high dynamic sequences no tracker is shown to be better than ORB-SLAM2; 1 is worse."
+    )
     assert "not as evidence" in explanation(boards["fast"])
     assert "2 are better, 1 is worse" in explanation(boards["high dynamic"])
 

@@ -255,8 +255,8 @@ def test_little_data_claims_little():
         assert (cells[0].text, cells[0].small) == ("1–2", "")
         assert cells[names.index("ATE ratio")].small == ""
         assert cells[names.index("ATE ratio")].emphasis == ""
-        assert cells[names.index("better?")].text == ""
-    assert [cells[names.index("wins")].text for cells in table.rows] == ["2 of 2", "reference"]
+        assert cells[names.index("better?")].text in ("", "reference")
+    assert [cells[names.index("wins")].text for cells in table.rows] == ["2 of 2", ""]
 
 
 def test_bold_is_not_given_to_most():
