@@ -135,10 +135,10 @@ def ratio_interval(log_ratios: Array, weights: Array | None = None) -> Interval:
         log_ratios: Their logarithms ``[S]``.
         weights: Their weights ``[S]``; all the same where there are none.
     """
-    known = np.isfinite(log_ratios)
-    if not known.any():
+    finite = np.isfinite(log_ratios)
+    if not finite.any():
         return Interval(math.nan, math.nan, math.nan)
-    values, share = log_ratios[known], np.ones(known.sum()) if weights is None else weights[known]
+    values, share = log_ratios[finite], np.ones(finite.sum()) if weights is None else weights[finite]
     if len(values) < FEWEST:
         return Interval(float(np.exp(np.average(values, weights=share))), math.nan, math.nan)
     mean, error, freedom = _weighted_mean(values, share)

@@ -76,31 +76,32 @@ def simulate(shape, quality, sequences, boards, seed=0, weights=None):
 
 
 def main():
-    """Print one line a shape and spread of the qualities, over all numbers of trackers."""
+    """Print two Markdown tables: all shapes over all numbers of trackers, and what more sequences find."""
     boards = int(sys.argv[1]) if len(sys.argv) > 1 else 300
-    print(f"share of boards without a wrong claim / share of the true differences found; {boards} boards each of")
-    print(f"{', '.join(map(str, TRACKERS))} trackers, by number of sequences; first all pairs, then the reference")
-    print(f"{'shape':18s}{'qualities':>10s}" + "".join(f"{n:>28d}" for n in SEQUENCES), flush=True)
+    print(f"| scatter | qualities | question | {' | '.join(f'{n} sequences' for n in SEQUENCES)} |")
+    print("| --- | --- | --- |" + " ---: |" * len(SEQUENCES))
     for shape in SHAPES:
-        for name, spread in (("equal", 0.0), ("sd 25 %", 0.25), ("sd 70 %", 0.7)):
-            cells = ""
+        for name, spread in (("all equal", 0.0), ("sd 25 %", 0.25), ("sd 70 %", 0.7)):
+            cells = []
             for sequences in SEQUENCES:
                 outcomes = []
                 for trackers in TRACKERS:
                     quality = np.sort(np.random.default_rng(1).normal(0, 1, trackers)) * spread
                     outcomes.append(simulate(shape, quality, sequences, boards, seed=trackers))
-                (pairs, against), (pairs_claimed, against_claimed) = np.mean(outcomes, axis=0)
-                cells += f"{pairs:>10.3f}/{pairs_claimed:.3f} {against:.3f}/{against_claimed:.3f}"
-            print(f"{shape:18s}{name:>10s}{cells}", flush=True)
-    print(f"\n20 trackers whose qualities spread by {SPREAD:.0%}: share of the true differences found")
+                cells.append(np.mean(outcomes, axis=0))
+            for at, question in enumerate(("all pairs", "reference")):
+                words = " | ".join(f"{right[at]:.3f}, {claimed[at]:.3f}" for right, claimed in cells)
+                print(f"| {shape} | {name} | {question} | {words} |", flush=True)
+    print("\n| scatter | sequences | all pairs | reference |\n| --- | ---: | ---: | ---: |")
     quality = np.sort(np.random.default_rng(1).normal(0, 1, 20)) * SPREAD
     for shape in ("normal", "heavy tails", "failures"):
         for sequences in (8, 24):
             _, (pairs, against) = simulate(shape, quality, sequences, boards)
-            print(f"{shape:18s}{sequences:3d} sequences: all pairs {pairs:.3f}, against the reference {against:.3f}")
+            print(f"| {shape} | {sequences} | {pairs:.3f} | {against:.3f} |")
 
 
 SPREAD = 0.4
+"""Of the qualities of 20 trackers, as a standard deviation of log errors."""
 
 
 if __name__ == "__main__":
