@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import sys
 import textwrap
@@ -26,7 +28,7 @@ VERIFICATION_FAILED = 4
 HEARTBEAT_S = 10.0
 """Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
 _MIN_WIDTH = 12
-"""Characters that a shortened column of names keeps."""
+"""Characters that a shortened column of names keeps, unless more are asked for."""
 
 _json_mode = False
 """Whether ``--json`` was given: then nothing but errors goes to standard error."""
@@ -44,9 +46,18 @@ def json_mode() -> bool:
     return _json_mode
 
 
-def write(text: str = "") -> None:
-    """Write a line to standard output at once, without escape sequences that a terminal would execute."""
-    sys.stdout.write(printable(text) + "\n")
+def write(text: str = "", *, colours: Mapping[str, int] | None = None) -> None:
+    """Write a line to standard output at once, without escape sequences that a terminal would execute.
+
+    Args:
+        text: The line, or lines.
+        colours: ANSI codes of words that are coloured on a terminal where they fill a cell of a table.
+    """
+    text = printable(text)
+    if colours and sys.stdout.isatty() and "NO_COLOR" not in os.environ:
+        cell = re.compile(rf"(?<=  )(?:{'|'.join(colours)})(?=  |$)", re.MULTILINE)
+        text = cell.sub(lambda word: f"\033[{colours[word[0]]}m{word[0]}\033[0m", text)
+    sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 
@@ -94,29 +105,34 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+def table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, least: int = _MIN_WIDTH) -> str:
     """Aligned text, the headings first.
 
     On a terminal it is no wider than that: the last columns are left out and named, then the widest names are shortened
     in the middle. Numbers are never shortened.
+
+    Args:
+        columns: The headings.
+        rows: The values below them.
+        least: Characters that a shortened column of names keeps.
     """
     cells = [[cell_text(value) for value in row] for row in (columns, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    least = [_least_width(column) for column in zip(*cells, strict=True)]
+    needed = [_least_width(column, least) for column in zip(*cells, strict=True)]
     room = _terminal_width() if sys.stdout.isatty() else sys.maxsize
-    while len(widths) > 1 and _line_width(least[: len(widths)]) > room:
+    while len(widths) > 1 and _line_width(needed[: len(widths)]) > room:
         widths.pop()
-    while _line_width(widths) > room and (wider := [at for at, width in enumerate(widths) if width > least[at]]):
+    while _line_width(widths) > room and (wider := [at for at, width in enumerate(widths) if width > needed[at]]):
         widths[max(wider, key=widths.__getitem__)] -= 1
     lines = ["  ".join(map(_fitted, row, widths)).rstrip() for row in cells]
     left_out = cells[0][len(widths) :]
     return "\n".join([*lines, f"(no room for: {', '.join(left_out)})"] if left_out else lines)
 
 
-def _least_width(column: Sequence[str]) -> int:
-    """Characters that a column needs: `_MIN_WIDTH`, or the longest cell that begins with a number."""
+def _least_width(column: Sequence[str], least: int) -> int:
+    """Characters that a column needs: `least`, or the longest cell that begins with a number."""
     numbers = (len(cell) for cell in column if cell and not any(map(str.isalpha, cell.split()[0])))
-    return max([min(max(map(len, column)), _MIN_WIDTH), *numbers])
+    return max([min(max(map(len, column)), least), *numbers])
 
 
 def _line_width(widths: Sequence[int]) -> int:

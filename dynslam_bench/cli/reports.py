@@ -75,8 +75,22 @@ def make(
         report_table(board, top, MOST_ROWS),
         (f"... and {more} more; " if more > 0 else "") + board.brief,
         *left_out,
+        *failure_lines(paths.csv.get("failures")),
         str(paths.html),
     )
+
+
+def failure_lines(file: Path | None) -> list[str]:
+    """One line on how many runs failed, and whose, from a report's table of failures; none without."""
+    import pandas as pd
+
+    if file is None:
+        return []
+    failed = pd.read_csv(file, dtype=str, keep_default_na=False)
+    counts = (failed["tracker"] + " " + failed["ended"].str.split().str[0]).value_counts()
+    words = [f"{name} ({count})" for name, count in counts.head(MOST_ROWS).items()]
+    more = f" and {len(counts) - MOST_ROWS} more" * (len(counts) > MOST_ROWS)
+    return [wrapped(f"{len(failed)} run{'s' * (len(failed) > 1)} failed: {', '.join(words)}{more}.")]
 
 
 @app.command()

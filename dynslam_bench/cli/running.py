@@ -131,7 +131,15 @@ def run(
     ] = "",
     time_limit: opts.TimeLimit = None,
     memory_limit: opts.MemoryLimit = None,
-    protocol: opts.ProtocolId = "tum-rgbd/v1",
+    protocol: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            "--protocol",
+            help="How to evaluate; default tum-rgbd/v1, of a monocular tracker its Sim(3) variant.",
+            rich_help_panel=opts.OUTPUT,
+            autocompletion=opts.names_of("evaluation.protocol:PROTOCOLS"),
+        ),
+    ] = None,
     yes: opts.Yes = False,
     help_all: opts.HelpAll = False,
     as_json: opts.AsJson = False,
@@ -152,8 +160,20 @@ def run(
         rrd=rrd, save_map=save_map, label=label, degrade=opts.gather_settings(degrade),
         limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )  # fmt: skip
-    make = partial(run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=protocol)
-    finish(make, results, jobs, protocol, yes, pictures_asked(specs[0]))
+    scored_under = protocol or default_protocol(tracker)
+    make = partial(run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under)
+    finish(make, results, jobs, scored_under, yes, pictures_asked(specs[0]))
+
+
+def default_protocol(tracker: str) -> str:
+    """The protocol of a tracker's runs where none is named; says so where it is not TUM's."""
+    from dynslam_bench.evaluation.protocol import MONOCULAR
+    from dynslam_bench.trackers import TRACKERS
+
+    if TRACKERS.get(tracker).sensors != "rgb":
+        return "tum-rgbd/v1"
+    announce(f"'{tracker}' is monocular, its scale is unknown: scored under {MONOCULAR}, which finds the scale")
+    return MONOCULAR
 
 
 def bench(
@@ -319,11 +339,16 @@ class WatchedRuns:
 
 
 def event_text(event: runs.RunEvent) -> str:
-    """Tracker, sequence and progress of a run, for a progress bar."""
+    """Tracker, sequence and progress of a run, for a progress bar: the frame, then what is written behind the last."""
+    from dynslam_bench.runs.running import pictures_asked
+
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
     if event.kind != "progress" or event.partial is None:
         return text
-    return f"{text}, frame {event.partial['frames_done']} of {event.partial['frames']}"
+    done, frames = event.partial["frames_done"], event.partial["frames"]
+    if done < frames:
+        return f"{text}, frame {done} of {frames}"
+    return f"{text}, writing {', '.join(['trajectories', *pictures_asked(event.spec)])}"
 
 
 def describe_plan(runs: Collection[runs.ResolvedRun], store: runs.RunStore, jobs: int, protocol: str) -> str:

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import re
+import sys
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
 
 from dynslam_bench import runs as stored
-from dynslam_bench.cli.options import AsJson, ProtocolId, Results, complete_statuses
+from dynslam_bench.cli.options import (
+    AsJson,
+    ProtocolId,
+    Results,
+    complete_sequences,
+    complete_statuses,
+    complete_trackers,
+)
 from dynslam_bench.cli.output import announce, fields, json_mode, present, progress, table, warn, write
 from dynslam_bench.core.errors import RunError, did_you_mean
 from dynslam_bench.core.toml import label_text
@@ -37,6 +47,16 @@ COLUMNS = {
 """Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
 HINT_FRAMES = 60
 """Frames of a recording that are checked when a run on it fails: a few seconds."""
+COLOURS = {
+    "ok": 32, "lost": 33, "stopped": 33, "crashed": 31, "timeout": 31, "out-of-memory": 31, "invalid": 31,
+}  # fmt: skip
+"""Colours of the statuses on a terminal, as ANSI codes."""
+SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
+_SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
+_ID_DIGITS = 8
+"""Digits of an id on a terminal: enough to name the run."""
+_NAME_WIDTH = 24
+"""Characters that a sequence keeps on a terminal, so that rendered ones are told apart."""
 _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
@@ -57,18 +77,43 @@ def list_(
         Optional[str],  # noqa: UP045
         typer.Option(help="Only runs that ended so, e.g. ok or crashed.", autocompletion=complete_statuses),
     ] = None,
+    tracker: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Only trackers of this id, or with this in it.", autocompletion=complete_trackers),
+    ] = None,
+    sequence: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Only sequences of this id, or with this in it.", autocompletion=complete_sequences),
+    ] = None,
+    sort: Annotated[
+        str,
+        typer.Option(
+            help=f"{', '.join(SORTED_BY)}; with a - before it the other way round.",
+            autocompletion=lambda: list(SORTED_BY),
+        ),
+    ] = "started",
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
-    """List the runs of a results folder, oldest first."""
+    """List the runs of a results folder, oldest first unless sorted otherwise."""
     from dynslam_bench.runs.store import list_runs
 
     if status not in (None, *complete_statuses()):
         raise RunError(f"unknown status '{status}'", did_you_mean(str(status), complete_statuses()))
+    column = sort.removeprefix("-")
+    if column not in SORTED_BY:
+        raise RunError(f"runs are not sorted by '{column}'", did_you_mean(column, SORTED_BY))
     store = _open(results)
     with progress("reading runs") as advance:
         rows, unreadable = list_runs(store, protocol, on_progress=advance)
-    show_rows([row for row in rows if status in (None, row["status"])], store, protocol)
+    chosen = [
+        row
+        for row in rows
+        if status in (None, row["status"]) and (tracker or "") in row["tracker"] and (sequence or "") in row["sequence"]
+    ]
+    key = _SORT_KEYS.get(column, column)
+    valued = sorted((row for row in chosen if row[key] is not None), key=itemgetter(key), reverse=sort.startswith("-"))
+    show_rows(valued + [row for row in chosen if row[key] is None], store, protocol)
     for file in unreadable:
         warn(f"unreadable: {file.path}: {file.reason}")
 
@@ -192,8 +237,12 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     columns = {
         title: name for title, name in COLUMNS.items() if any(row.get(name) not in (None, "", False) for row in rows)
     }
-    write(table(list(columns), [[shown_cell(name, row[name]) for name in columns.values()] for row in rows]))
+    cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in rows]
+    write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
     pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in rows]
+    ended = Counter(row["status"] for row in rows if row["status"] != "ok")
+    if ended:
+        write(f"{ended.total()} of {len(rows)} runs are not ok: {', '.join(f'{n} {s}' for s, n in ended.items())}.")
     worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in pairs)
     if worse:
         write(f"{worse} of {len(rows)} runs are worse than a static camera.")
@@ -202,7 +251,9 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
 
 
 def shown_cell(name: str, value: Any) -> Any:
-    """A cell of the table: paths without their folders; ``--json`` and ``runs show`` have them whole."""
+    """A cell of the table: paths without folders, a terminal's ids shortened; ``--json`` has them whole."""
+    if name == "run_id" and sys.stdout.isatty():
+        return value[:_ID_DIGITS]
     if name in ("tracker", "segmentation"):
         return label_text(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value

@@ -703,7 +703,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
     """
     from dynslam_bench.segmentation.networks.checkpoints import seen_in_training  # loads the catalogue of all sequences
 
-    errors = {} if metrics is None else metrics.metrics
+    errors = {} if metrics is None or record.failed else metrics.metrics  # what a part of a run scores says nothing
     not_scored = "" if metrics is None or errors else metrics.reasons.get(metrics.trajectory, "")
     return {
         "run_id": record.run_id,

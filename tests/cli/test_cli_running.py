@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import hostile
 import pytest
 from cli_helpers import one_line
 from envs_toys import write_folder
@@ -14,6 +15,7 @@ from envs_toys import write_folder
 from dynslam_bench.cli import output, running, runs
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.geometry.trajectory_files import read_tum
+from dynslam_bench.runs import RunEvent, RunSpec
 from dynslam_bench.segmentation.networks import checkpoints
 
 
@@ -158,3 +160,48 @@ def test_with_json_nothing_but_errors_goes_to_standard_error(cli, capsys, monkey
     assert cli("protocols", "list", "--json")[2] == ""
     output.note("text")  # that command is over
     assert capsys.readouterr().err == "text\n"
+
+
+def test_runs_are_filtered_sorted_and_coloured(cli, facts, walk, monkeypatch):
+    assert cli("run", "never-move", walk)[0] == 0
+    assert cli("run", "constant-velocity", walk, "--frames", "0:3")[0] == 0
+    assert cli("run", hostile.TARGET, walk, "--set", "mode=raise")[0] == 3
+    listed = facts("runs", "list")
+    (crashed,) = (row for row in listed if row["status"] == "crashed")
+    assert crashed["coverage"] == 0.5 and crashed["ate_rmse_m"] is None, "two poses have an error, the run has none"
+    assert [row["tracker"] for row in facts("runs", "list", "--tracker", "never")] == ["never-move"]
+    assert facts("runs", "list", "--sequence", "elsewhere") == []
+    errors = [row["ate_rmse_m"] for row in facts("runs", "list", "--sort", "-ate")]
+    assert errors[0] >= errors[1] and errors[2] is None
+    assert [row["tracker"] for row in facts("runs", "list", "--sort", "tracker")] == sorted(
+        r["tracker"] for r in listed
+    )
+    code, out, _ = cli("runs", "list")
+    assert code == 0 and "1 of 3 runs are not ok: 1 crashed." in out and "\033" not in out
+    assert "did you mean 'coverage'" in one_line(cli("runs", "list", "--sort", "coverge")[2])
+    assert "1 run failed: Hostile · mode=raise crashed (1)." in cli("report")[1]
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    out = cli("runs", "list")[1]
+    assert "\033[31mcrashed\033[0m" in out and "\033[32mok\033[0m" in out
+    assert crashed["run_id"] not in out and crashed["run_id"][:8] in out
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\033" not in cli("runs", "list")[1]
+
+
+def test_a_monocular_tracker_is_scored_with_its_scale_unless_told_otherwise(cli, facts, walk):
+    code, _, err = cli("run", "orb-slam2-mono", walk)
+    assert code in (0, 3) and "scored under tum-rgbd/v1-sim3" in err.splitlines()[0]
+    (row,) = facts("run", "orb-slam2-mono", walk, code=code)
+    assert row["protocol"] == "tum-rgbd/v1-sim3"
+    (row,) = facts("run", "orb-slam2-mono", walk, "--protocol", "tum-rgbd/v1", code=code)
+    assert row["protocol"] == "tum-rgbd/v1" and row["ate_rmse_m"] is None
+    assert "monocular" not in cli("run", "never-move", walk)[2]
+
+
+def test_progress_names_what_is_written_behind_the_last_frame():
+    spec = RunSpec(tracker="never-move", sequence="walk", video=True, sheet=True)
+    texts = [
+        running.event_text(RunEvent("progress", "id", spec, 1, partial={"frames_done": done, "frames": 9}))
+        for done in (8, 9)
+    ]
+    assert texts[0].endswith(", frame 8 of 9") and texts[1].endswith(", writing trajectories, video.webm, sheet.png")
