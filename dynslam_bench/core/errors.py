@@ -118,6 +118,6 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name.lower(), list(lowered), n=3, cutoff=0.5)
     if close:
         return "did you mean " + " or ".join(repr(candidate) for match in close for candidate in lowered[match]) + "?"
-    if 0 < len(names) <= 12:
+    if 0 < len(names) <= 16:
         return "known: " + ", ".join(names)
     return f"{len(names)} are known, none is close" if names else ""
