@@ -89,6 +89,7 @@ mean_iou  # segmenter evaluate
 tracker_provenance  # provenance.json of an export
 checked  # record of a fetched sequence
 improves  # a study's summary
+by_category  # a row of the board, read by its template
 cost_after  # BundleResult, the same
 frame_error_trans_m  # a column of frames.csv
 frame_error_rot_deg  # a column of frames.csv

@@ -21,9 +21,9 @@ HEIGHT = 480
 STRIP = 64
 ALIGN_FROM = 30
 """Tracked frames with ground truth from which on the estimate is drawn aligned."""
-KEPT = (60, 220, 60)
-CULLED = (235, 50, 50)
-MASK = (255, 120, 0)
+KEPT = (86, 180, 233)
+CULLED = (213, 94, 0)
+MASK = (240, 228, 66)
 TRUTH = (90, 90, 90)
 TRUTH_AHEAD = (205, 205, 205)
 ESTIMATE = (20, 90, 220)
@@ -35,7 +35,7 @@ _STATE_COLOUR = {"ok": (30, 140, 30), "lost": (200, 30, 30), "initialising": (19
 class Canvas:
     """Draws the frames of one episode; all pictures of a sequence have the same even size, as video encoders want.
 
-    Left: the image the tracker saw, with kept features in green, culled ones in red and the dynamic mask in orange.
+    Left: the image the tracker saw, see `annotated`.
     Right: the estimated camera centres (blue), aligned, over the ground truth (grey), both in the first camera's frame,
     with a scale bar, seen along the axis in which the true path spreads least: from above where there is no truth.
     Below: state, counts, errors, and from `ALIGN_FROM` frames on the ATE of the frames so far.
@@ -64,21 +64,7 @@ class Canvas:
 
     def picture(self, frame: Frame, result: TrackResult) -> Image:
         """The image alone with its features and mask, uint8 ``[480, W, 3]``, red first."""
-        image = np.array(frame.rgb, dtype=np.uint8)
-        if result.dynamic_mask is not None and result.dynamic_mask.any():
-            mask = np.asarray(result.dynamic_mask, dtype=bool)
-            image[mask] = (0.6 * image[mask] + 0.4 * np.array(MASK)).astype(np.uint8)
-            outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-            cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
-        image = np.asarray(cv2.resize(image, (self._width, HEIGHT), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        if result.keypoints_xy is not None:
-            points = np.asarray(result.keypoints_xy, dtype=np.float64).reshape(-1, 2)
-            kept = result.keypoints_keep
-            kept = np.ones(len(points), bool) if kept is None else np.asarray(kept, dtype=bool)
-            for flag, colour in ((True, KEPT), (False, CULLED)):
-                for x, y in (points[kept == flag] * self._scale).round().astype(int).tolist():
-                    cv2.circle(image, (x, y), 2, colour, -1, cv2.LINE_AA)
-        return image
+        return annotated(frame.rgb, result, self._width)
 
     def _plot(self, estimate: Array, pieces: list[slice], now: int) -> Image:
         """A square plot of the estimated centres ``[N, 2]`` over the ground truth up to frame `now` and ahead."""
@@ -130,6 +116,36 @@ class Canvas:
             cv2.line(strip, (width - x, 19), (width - x + 20, 19), colour, 3, cv2.LINE_AA)
             _text(strip, name, (width - x + 26, 24), _INK, 0.45)
         return strip
+
+
+def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
+    """An image as its tracker saw it: static features as circles, dynamic ones as crosses, the dynamic mask in yellow.
+
+    Args:
+        rgb: The image, uint8 ``[H, W, 3]``, red first.
+        result: What the tracker said of it.
+        width: Of the result, whose pixels are square as the image's.
+    """
+    image = np.array(rgb, dtype=np.uint8)
+    scale = width / image.shape[1]
+    if result.dynamic_mask is not None and result.dynamic_mask.any():
+        mask = np.asarray(result.dynamic_mask, dtype=bool)
+        image[mask] = (0.6 * image[mask] + 0.4 * np.array(MASK)).astype(np.uint8)
+        outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
+    size = (width, round(image.shape[0] * scale))
+    image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if result.keypoints_xy is not None:
+        points = np.asarray(result.keypoints_xy, dtype=np.float64).reshape(-1, 2)
+        kept = result.keypoints_keep
+        kept = np.ones(len(points), bool) if kept is None else np.asarray(kept, dtype=bool)
+        radius = max(round(width / 320), 1)
+        for (x, y), static in zip((points * scale).round().astype(int).tolist(), kept.tolist(), strict=True):
+            if static:
+                cv2.circle(image, (x, y), radius, KEPT, -1, cv2.LINE_AA)
+            else:
+                cv2.drawMarker(image, (x, y), CULLED, cv2.MARKER_TILTED_CROSS, 2 * radius + 3, radius, cv2.LINE_AA)
+    return image
 
 
 VIEWS = {

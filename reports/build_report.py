@@ -1,24 +1,32 @@
-"""A report: load the runs, order them, put the sections together, write; and the site that is published of it."""
+"""A report: load the runs, order them, put the pages together, write; and the site that is published of it."""
 
 from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-
-from jinja2 import Environment
+from typing import Any
 
 import dynslam_bench
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports import figures
-from dynslam_bench.reports.figures import colours, safe
-from dynslam_bench.reports.html.explore import MOST_FRAMES, PICTURE_SECONDS, RUN_PAGE, write_explore
-from dynslam_bench.reports.html.page import Block, Section, figure_blocks, render, resource, table_blocks
+from dynslam_bench.reports.html.board_page import entries_of, side_content
+from dynslam_bench.reports.html.page import (
+    ASSETS,
+    Block,
+    Section,
+    figure_blocks,
+    render,
+    table_blocks,
+    write_assets,
+    write_side,
+)
+from dynslam_bench.reports.html.run_pages import RUN_PAGE, SHARE_EDGES, RunPage, error_by_share, write_run_pages
 from dynslam_bench.reports.model.board import (
     OVERALL,
     Board,
@@ -46,7 +54,7 @@ from dynslam_bench.reports.model.published import (
     reported_for,
     spans,
 )
-from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, command_line
+from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, RunRow, command_line, grouped
 from dynslam_bench.reports.model.statistics import FEWEST
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
 from dynslam_bench.reports.tables import leaderboard as tables
@@ -54,13 +62,28 @@ from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
 from dynslam_bench.runs.store import RunStore, part_words
 
+COMPARE_PAGE = "compare.html"
+LINKS = (
+    ("index.html", "Board"),
+    ("errors.html", "Errors by sequence"),
+    (COMPARE_PAGE, "Compare"),
+    ("paper.html", "As in the paper"),
+    ("diagnostics.html", "Diagnostics"),
+    ("reproduce.html", "Reproduce"),
+)
+"""The pages of a report, and their names."""
+MOST_PAGES = 5000
+"""Runs of which all have a page of their own unless something else is asked for."""
+FEWER_PAGES = 2000
+"""Pages of a report of more runs than that: those of the median run of every cell, and others up to this number."""
+
 
 @dataclass(frozen=True)
 class ReportPaths:
     """The files of a report.
 
     Attributes:
-        html: The page; what it shows on demand lies in ``data/`` and ``frames/`` beside it.
+        html: The first page; the others, and what they show on demand, lie beside it.
         run: The page that shows one run.
         markdown: The tables as Markdown.
         latex: The main tables as LaTeX.
@@ -94,14 +117,12 @@ def build_report(
     on: On = "common",
     rank_seen: bool = False,
     trials: bool = False,
-    picture_seconds: float = PICTURE_SECONDS,
-    most_frames: int = MOST_FRAMES,
     most_pages: int | None = None,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = no_progress,
 ) -> ReportPaths:
-    """Make one offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it.
+    """Make offline HTML pages of stored runs, with Markdown, CSV and LaTeX beside them.
 
     SLAM is not run; metrics that are missing under the protocol are computed from the stored trajectories.
 
@@ -114,8 +135,6 @@ def build_report(
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
         trials: Whether the trials of studies count like other runs; without, they are left out and counted.
-        picture_seconds: Time that drawing pictures of frames may take; the next report into the folder goes on there.
-        most_frames: Frames of a run that its page shows; of longer ones every second, third, ...
         most_pages: Runs that have a page of their own, typical ones of their cells first; None for `pages_for`.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
@@ -131,32 +150,66 @@ def build_report(
     with worker_pool(sum(len(store.ids()) for store in stores)) as pool:
         loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)
         board = make_board(loaded.rows, reference, on, rank_seen=rank_seen)
-        explore_notes = write_explore(
-            board, protocol, output, title=title, pool=pool,
-            picture_seconds=picture_seconds, most_frames=most_frames, most_pages=most_pages,
-            progress=lambda done, total: on_progress(done, total, "writing the pages of the runs"),
+        typical = {row.run_id for name in board.sequences for row in board.typical_runs(name).values()}
+        paged = _paged(board, typical, most_pages)
+        pictured = {row.run_id for row in paged if row.failed or row.run_id in typical}
+        pages = write_run_pages(
+            paged, pictured, protocol, output, pool,
+            lambda done, total: on_progress(done, total, "writing the pages of the runs"),
         )  # fmt: skip
-        on_progress(0, None, "putting the tables and figures together")
-        again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
-        none_failed = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
-        sections = [
-            leaderboard_section(board, protocol, loaded),
-            categories_section(board, protocol),
-            Section("explore", "Explore", "Explore", explore_notes, [Block("explore")]),
-            speed_section(board),
-            errors_section(board, protocol),
-            paper_section(board, protocol),
-            trajectories_section(board, protocol),
-            Section(
-                "repeatability", "Repeatability", "Repeatability", blocks=table_blocks(tables.repeatability(board))
-            ),
+    on_progress(0, None, "putting the tables and figures together")
+    pageless = _pageless(len(paged), len(board.rows))
+    again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
+    none_failed = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
+    boards = category_boards(board)
+    sections = {
+        "errors.html": [errors_section(board, protocol), categories_section(boards, protocol)],
+        "paper.html": [paper_section(board, protocol)],
+        "diagnostics.html": [
+            Section("failures", "Failures", blocks=table_blocks(tables.failures(board)) or none_failed),
+            Section("repeatability", "Repeatability", blocks=table_blocks(tables.repeatability(board))),
             masks_section(board),
-            Section("failures", "Failures", "Failures", blocks=table_blocks(tables.failures(board)) or none_failed),
-            provenance_section(board, loaded, again),
-        ]
+            share_section(board, pages),
+        ],
+        "reproduce.html": [provenance_section(board, loaded, again)],
+    }
     on_progress(0, None, "writing")
-    shown = [section for section in sections if section.blocks or section.notes]
-    return _write(shown, board, protocol, output, title, loaded.trials)
+    paged_ids = {row.run_id for row in paged}
+    write_side(output, "board", side_content(board, boards, protocol, paged_ids, pictured, pageless))
+    return _write(
+        sections, board, boards, protocol, output, title, _notes(board, protocol, loaded, pageless), loaded.trials
+    )
+
+
+def pages_for(runs: int, typical: int) -> int:
+    """How many pages a report has where nobody asks for another number: of very many runs most are never opened.
+
+    Args:
+        runs: Runs of the report.
+        typical: Those of them with the median error of their cell.
+    """
+    return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
+
+
+def _paged(board: Board, typical: set[str], most: int | None) -> list[RunRow]:
+    """The runs that have a page: the typical one of every cell, then its first, its second, ... repeat."""
+    most = pages_for(len(board.rows), len(typical)) if most is None else most
+    if len(board.rows) <= most:
+        return board.rows
+    cells = [cell.rows for cells in board.cells.values() for cell in cells.values()]
+    turn = {row.run_id: at for rows in cells for at, row in enumerate(rows)} | dict.fromkeys(typical, -1)
+    return sorted(board.rows, key=lambda row: turn[row.run_id])[:most]
+
+
+def _pageless(pages: int, runs: int) -> str:
+    """Which runs have no page, in words; empty if all have one."""
+    if pages == runs:
+        return ""
+    return (
+        f"{runs - pages} of {runs} runs have no page of their own, and their frames stand in no figure: pages are made "
+        f"of {pages}, those with the median error of their cell first (`report --most-pages {runs}` makes all). "
+        "Every number of the tables counts all runs."
+    )
 
 
 def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool) -> str:
@@ -169,16 +222,22 @@ def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int 
 
 
 def _write(
-    sections: Sequence[Section], board: Board, protocol: Protocol, output: Path, title: str, trials: int
+    pages: dict[str, list[Section]],
+    board: Board,
+    boards: dict[str, Board],
+    protocol: Protocol,
+    output: Path,
+    title: str,
+    notes: list[str],
+    trials: int,
 ) -> ReportPaths:
-    n_sequences = len(board.sequences) + len(board.unscored)
-    counts = {"tracker": len(board.labels), "sequence": n_sequences, "run": len(board.rows)}
-    facts = [(str(count), name + "s" * (count != 1)) for name, count in counts.items()]
-    facts.append((str(sum(row.failed for row in board.rows)), "failed"))
+    """Write the pages, and the tables in all formats."""
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. This page works without a network."
-    blocks = [block for section in sections for block in section.blocks]
-    shown = {block.table.id: block.table for block in blocks if block.table is not None}
+    footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. These pages work without a network."
+    blocks = [block for sections in pages.values() for section in sections for block in section.blocks]
+    shown = {
+        t.id: t for t in (tables.leaderboard(board, protocol), *(block.table for block in blocks)) if t is not None
+    }
     paths = ReportPaths(
         html=output / "index.html",
         run=output / RUN_PAGE,
@@ -193,11 +252,12 @@ def _write(
     for name, table in shown.items():
         write_atomic(paths.csv[name], csv_text(table.frame()))
     write_atomic(paths.csv["runs"], csv_text(board.frame()))
-    counted = ", ".join(f"{value} {name}" for value, name in facts)
-    notes = "".join(f"> {prose(note)}\n\n" for section in sections for note in section.notes)
+    facts = facts_of(board, protocol)
+    counted = ", ".join(f"{value} {name}" for value, name, _ in facts)
+    notes_text = "".join(f"> {prose(note)}\n\n" for note in [how_to_read(board), *_all_notes(notes, pages)])
     texts = "\n".join(map(to_markdown, shown.values()))
-    head = f"# {prose(title)}\n\n{protocol.describe()}\n\n{counted}\n\n"
-    write_atomic(paths.markdown, f"{head}{notes}{texts}\n{footer}\n")
+    head = f"# {prose(title)}\n\n{prose(headline(board))}\n\n{protocol.describe()}\n\n{counted}\n\n"
+    write_atomic(paths.markdown, f"{head}{notes_text}{texts}\n{footer}\n")
     write_atomic(
         paths.latex,
         "% needs \\usepackage{booktabs}\n"
@@ -210,8 +270,100 @@ def _write(
         version=dynslam_bench.__version__,
         rows=board.rows,
     ).write(paths.data)
-    write_atomic(paths.html, render(sections, title=title, protocol=protocol.describe(), facts=facts, footer=footer))
+    write_assets(output)
+    write_atomic(paths.html, _first_page(board, boards, protocol, facts, notes, title, footer))
+    for page, sections in pages.items():
+        name = dict(LINKS)[page]
+        text = sections_page(
+            sections, title=f"{title}: {name}", links=LINKS, here=page, footer=footer, protocol=protocol.describe(),
+            errors_table=page == "errors.html", scripts=["errors.js"] if page == "errors.html" else [],
+        )  # fmt: skip
+        write_atomic(output / page, text)
+    write_atomic(paths.run, render("run.html.j2", title=title, links=LINKS, footer=footer, scripts=["run.js"]))
+    compare = {"title": "Two trackers side by side", "links": LINKS, "here": COMPARE_PAGE, "footer": footer}
+    write_atomic(output / COMPARE_PAGE, render("compare.html.j2", scripts=["run.js", "compare.js"], **compare))
     return paths
+
+
+def _all_notes(notes: Sequence[str], pages: dict[str, list[Section]]) -> list[str]:
+    return [*notes, *(note for sections in pages.values() for section in sections for note in section.notes)]
+
+
+def _first_page(
+    board: Board,
+    boards: dict[str, Board],
+    protocol: Protocol,
+    facts: Sequence[Fact],
+    notes: Sequence[str],
+    title: str,
+    footer: str,
+) -> str:
+    """The board: the sentence first, then the data, the ranking by category, and accuracy against speed."""
+    captions = {
+        "ratio": f"Geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} on. Open: not ranked.",
+        "speed": "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame "
+        "times hold for the machine named under Reproduce."
+        + f" {tables.CACHED_NOTE}"
+        * any(r.cached for r in board.rows),
+    }
+    shown = {"ratio": figures.ratio_figure(board), "speed": figures.speed_figure(board)}
+    return render(
+        "board.html.j2",
+        title=title,
+        links=LINKS,
+        here="index.html",
+        footer=footer,
+        scripts=["board.js"],
+        sentence=headline(board),
+        sentences={name: headline(some) for name, some in boards.items()},
+        facts=facts,
+        categories={name: entries_of(some, board, boards, protocol) for name, some in boards.items()},
+        reference=board.reference_name,
+        explanation=how_to_read(board),
+        notes=notes,
+        captions=captions,
+        figures={name: figure for name, figure in shown.items() if figure is not None},
+    )
+
+
+def how_to_read(board: Board) -> str:
+    """What the ranking says, for a reader without statistics."""
+    return " ".join(filter(None, [explanation(board), mean_rank_note(board)]))
+
+
+def sections_page(sections: Sequence[Section], **values: Any) -> str:
+    """A page of sections; `values` are what `sections.html.j2` shows beside them."""
+    shown = [section for section in sections if section.blocks or section.notes]
+    charts = {
+        f"{section.id}-{at}": block.figure
+        for section in shown
+        for at, block in enumerate(section.blocks, 1)
+        if block.figure is not None
+    }
+    return render("sections.html.j2", sections=shown, figures=charts, **values)
+
+
+Fact = tuple[str, str, list[str]]
+"""A number, what it counts, and its details."""
+
+
+def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
+    """What the board stands on."""
+    names = [*board.sequences, *board.unscored]
+    by_group = grouped(names, lambda name: board.groups[name])
+    sequences = [f"{group}: {', '.join(some)}" if group else ", ".join(some) for group, some in by_group.items()]
+    repeats = sorted({len(cell.rows) for cells in board.cells.values() for cell in cells.values()})
+    failed = [row for row in board.rows if row.failed]
+    endings = [f"{board.labels[row.variant_key]} on {board.sequence(row)}: {row.ending}" for row in failed]
+    several = f"{repeats[0]}–{repeats[-1]}" if len(repeats) > 1 else str(repeats[0])
+    return [
+        (str(len(names)), "sequence" + "s" * (len(names) != 1), sequences),
+        (str(len(board.labels)), "tracker" + "s" * (len(board.labels) != 1), []),
+        (several, "repeats a cell", []),
+        (str(len(board.rows)), "run" + "s" * (len(board.rows) != 1), []),
+        (str(len(failed)), "failed", first_of(endings, _MOST_NOTES, "and {} more, see Diagnostics")),
+        (protocol.id, "protocol", [protocol.describe()]),
+    ]
 
 
 # -- the sections: what they show, in which order, below which words
@@ -220,35 +372,7 @@ _MOST_NOTES = 60
 _MOST_COMMANDS = 200
 
 
-def leaderboard_section(board: Board, protocol: Protocol, loaded: Loaded) -> Section:
-    """The ranking, what is missing for more of it, and the commands that fill the gaps."""
-    section = Section("leaderboard", "Leaderboard", "Leaderboard", notes=_leaderboard_notes(board, protocol, loaded))
-    section.blocks.append(Block("table", table=tables.leaderboard(board, protocol)))
-    caption = (
-        f"Points: geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} sequences on. Open "
-        "points are not ranked."
-    )
-    section.blocks += figure_blocks("ratio", figures.ratio_figure(board), caption)
-    commands = missing_commands(board)
-    if commands:
-        section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(commands)))
-    return section
-
-
-def categories_section(board: Board, protocol: Protocol) -> Section:
-    """The ratios by category, the leaderboard of every category, and all pairs of trackers."""
-    boards = category_boards(board)
-    blocks = table_blocks(tables.category_table(boards))
-    for category, part in boards.items():
-        if category != OVERALL:
-            table = tables.leaderboard(part, protocol)
-            name = f"leaderboard_{category.replace(' ', '_')}"
-            blocks += table_blocks(replace(table, id=name, title=headline(part)), folded=True)
-    blocks += table_blocks(tables.pair_table(board), folded=True)
-    return Section("categories", "By category, and all pairs", "Categories", blocks=blocks)
-
-
-def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list[str]:
+def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> list[str]:
     conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
     final_only = ", ".join(board.labels[key] for key in board.final_only)
     older = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
@@ -259,11 +383,8 @@ def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list
     }
     counts = ", ".join(f"{count} {words}" for words, count in left_out.items() if count)
     notes = [
-        headline(board),
         f"Runs with one id must be equal, but these have different results: {conflicts}." if conflicts else "",
         missing_note(board),
-        explanation(board),
-        mean_rank_note(board),
         f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
         if final_only
         else "",
@@ -275,23 +396,26 @@ def _leaderboard_notes(board: Board, protocol: Protocol, loaded: Loaded) -> list
         else "",
         f"Left out: {without_scale_words(loaded.without_scale, protocol)}." if loaded.without_scale else "",
         f"Left out: {trial_words(loaded.trials)}." if loaded.trials else "",
+        pageless,
     ]
     return [note for note in notes if note]
 
 
-def speed_section(board: Board) -> Section:
-    """Accuracy against speed."""
-    caption = (
-        "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame times "
-        "include segmentation and exclude decoding; they hold for the machine named below."
-    ) + f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
-    blocks = figure_blocks("speed", figures.speed_figure(board), caption)
-    return Section("speed", "Accuracy against speed", "Speed", blocks=blocks)
+def categories_section(boards: Mapping[str, Board], protocol: Protocol) -> Section:
+    """The ratios by category, the leaderboard of every category, and all pairs of trackers."""
+    blocks = table_blocks(tables.category_table(boards))
+    for category, part in boards.items():
+        if category != OVERALL:
+            table = tables.leaderboard(part, protocol)
+            name = f"leaderboard_{category.replace(' ', '_')}"
+            blocks += table_blocks(replace(table, id=name, title=headline(part)), folded=True)
+    blocks += table_blocks(tables.pair_table(boards[OVERALL]), folded=True)
+    return Section("categories", "By category, and all pairs", blocks=blocks)
 
 
 def errors_section(board: Board, protocol: Protocol) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
-    section = Section("errors", "Errors by sequence", "Errors")
+    section = Section("errors", "Tables")
     if not board.sequences:
         return section
     excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
@@ -326,29 +450,6 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
     return section
 
 
-def trajectories_section(board: Board, protocol: Protocol) -> Section:
-    """Paths and errors over time of one run a tracker, by sequence; drawn of the runs' side files when it opens."""
-    caption = (
-        f"The run with the median error of each tracker, aligned ({protocol.alignment}). Lines are broken where a "
-        "gap exceeds twice the median interval. Click a name to show or hide it."
-    )
-    palette = colours(board)
-    shown = {*(board.ranked or board.trackers)[:6], board.reference}
-    blocks: list[Block] = []
-    for sequence in board.sequences:
-        tracks = [
-            {"run": row.run_id, "name": safe(board.labels[key]), "colour": palette[key], "shown": key in shown}
-            for key, row in board.typical_runs(sequence).items()
-        ]
-        if tracks:
-            words = ", ".join(filter(None, (board.groups[sequence], f"{len(tracks)} tracker{'s' * (len(tracks) > 1)}")))
-            blocks.append(Block("tracks", sequence, caption=words, tracks=tracks, folded=bool(blocks)))
-    return Section(
-        "trajectories", "Trajectories and error over time", "Trajectories",
-        blocks=[Block("caption", text=caption), *blocks] if blocks else [],
-    )  # fmt: skip
-
-
 def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
     caption = "One point a run."
@@ -356,19 +457,32 @@ def masks_section(board: Board) -> Section:
         caption += (
             f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
         )
-    blocks = figure_blocks("masks", figures.mask_figure(board), caption) + table_blocks(tables.mask_quality(board))
-    return Section("masks", "Mask quality and pose error", "Masks", blocks=blocks)
+    blocks = figure_blocks(figures.mask_figure(board), caption) + table_blocks(tables.mask_quality(board))
+    return Section("masks", "Mask quality and pose error", blocks=blocks)
+
+
+def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
+    """Frame-to-frame error against the share of people."""
+    bins = {key: error_by_share(some) for key, some in grouped(pages, lambda page: page.variant_key).items()}
+    caption = (
+        "Frame-to-frame error (translation, RMSE) over the frames of all successful runs, by the share of the image "
+        "that shows people (exact masks)."
+    )
+    blocks = figure_blocks(figures.share_figure(board, bins, SHARE_EDGES), caption)
+    return Section("share", "Error against the share of people", blocks=blocks)
 
 
 def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
-    section = Section("provenance", "Machines, versions, commands", "Reproduce")
+    section = Section("provenance", "Machines, versions, commands")
     section.blocks.append(Block("table", table=tables.machines(board)))
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     section.blocks.append(
         Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
     )
+    if missing := missing_commands(board):
+        section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(missing)))
     notes = [
         f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
     ]
@@ -388,7 +502,7 @@ def first_of(entries: list[str], most: int, others: str) -> list[str]:
 
 def paper_section(board: Board, protocol: Protocol) -> Section:
     """Tables 1 to 3 and Figures 9 to 12, as the paper lays them out."""
-    section = Section("paper", "As in the paper: four statistics of the errors, and time", "As in the paper")
+    section = Section("paper", "Four statistics of the errors, and time")
     section.blocks += table_blocks(
         tables.absolute_table(board, protocol),
         tables.relative_table(board, protocol),
@@ -397,20 +511,18 @@ def paper_section(board: Board, protocol: Protocol) -> Section:
     )
     for statistic, number in figures.FIGURES.items():
         figure = figures.bar_figure(board, statistic)
-        lost = figure is not None and any(tables.LOST_MARK in trace["text"] for trace in figure["data"])
+        lost = figure is not None and any(tables.LOST_MARK in trace.text for trace in figure.data)
         caption = (
             f"As the paper's Figure {number}: {tables.STATISTICS[statistic]} of the absolute pose error, median over "
             "the runs that succeeded; pale bars are not ranked." + f" {tables.LOST_NOTE}" * lost
         )
-        section.blocks += figure_blocks(f"paper-{statistic}", figure, caption)
+        section.blocks += figure_blocks(figure, caption)
     return section
 
 
 # -- the site that is published
 
 STUDY_PAGE = "index.html"
-FRAMES = 100
-"""Frames of a run that its published page shows: a site of hundreds of runs has to fit into a repository."""
 _PUBLISHED = ("*.html", "*.csv", "*.toml", "csv/*.csv", "data/*")
 """What of a study's folder is published; its runs and its journal are not."""
 
@@ -437,7 +549,6 @@ def publish(
     study: Path | None = None,
     title: str = "Visual SLAM in dynamic scenes",
     note: str = "",
-    picture_seconds: float = PICTURE_SECONDS,
     protocol: Protocol | str = "tum-rgbd/v1",
     on_progress: OnProgress = no_progress,
 ) -> Site:
@@ -452,7 +563,6 @@ def publish(
         study: Folder of a study with its page; None for none.
         title: Heading.
         note: What a reader should know, shown on the first page.
-        picture_seconds: Time that drawing pictures of frames may take; the frames of an earlier site stay.
         protocol: How to evaluate.
         on_progress: As in `build_report`.
 
@@ -463,11 +573,11 @@ def publish(
     output = output.expanduser().absolute()
     if study is not None and not (study / STUDY_PAGE).is_file():
         raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune report STUDY.toml")
-    for part in ("leaderboard/data", "leaderboard/csv", "study"):
+    for part in ("leaderboard/data", "leaderboard/csv", "leaderboard/frames", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(
         list(runs), output / "leaderboard", protocol=protocol, title=title, command="dynslam-bench report RESULTS",
-        picture_seconds=picture_seconds, most_frames=FRAMES, on_progress=on_progress,
+        on_progress=on_progress,
     )  # fmt: skip
     for path in (report.data, report.markdown, report.latex):  # for work with the results, not for looking at them
         path.unlink()
@@ -479,11 +589,12 @@ def publish(
             target = output / "study" / source.relative_to(study)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
+        page = output / "study" / STUDY_PAGE
+        shared = f"../leaderboard/{ASSETS}/"
+        page.write_text(page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', f'="{shared}'), encoding="utf-8")
         pages.append((f"study/{STUDY_PAGE}", "Study", "What tuning the settings gained, and how sure that is."))
-    template = Environment(autoescape=True, trim_blocks=True).from_string(resource("site.html.j2"))
-    write_atomic(
-        output / "index.html", template.render(title=title, pages=pages, note=note, version=dynslam_bench.__version__)
-    )
+    site = render("site.html.j2", title=title, pages=pages, note=note, version=dynslam_bench.__version__)
+    write_atomic(output / "index.html", site)
     write_atomic(output / ".nojekyll", "")
     sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
     return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)

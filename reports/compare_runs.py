@@ -11,8 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from dynslam_bench.core.errors import ReportError
+from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.toml import setting_text
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.reports.html.board_page import pairs_content
+from dynslam_bench.reports.html.page import render, write_assets, write_side
+from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
 from dynslam_bench.reports.model.board import Cell, make_cell
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
@@ -35,6 +39,7 @@ class Comparison:
         only_b: Runs that only B has.
         differences: Tracker, as in `overall`, to the settings that differ, e.g. ``epipolar.threshold_px: default in A,
             2 in B``; empty where the settings are the same.
+        page: The page that shows it; None where none was asked for.
     """
 
     overall: dict[str, Interval]
@@ -42,10 +47,15 @@ class Comparison:
     only_a: int
     only_b: int
     differences: dict[str, list[str]]
+    page: Path | None = None
 
 
 def compare(
-    a: Path | str | RunStore, b: Path | str | RunStore, *, protocol: Protocol | str = "tum-rgbd/v1"
+    a: Path | str | RunStore,
+    b: Path | str | RunStore,
+    *,
+    protocol: Protocol | str = "tum-rgbd/v1",
+    output: Path | str | None = None,
 ) -> Comparison:
     """Compare two results folders, or two reports, on the sequences that both have.
 
@@ -56,6 +66,7 @@ def compare(
         a: Results folder, store, or folder of a report (``report.json``).
         b: Likewise.
         protocol: How results folders are evaluated; a report brings its own.
+        output: Folder of a page that shows it; None for none.
 
     Raises:
         ReportError: One holds no runs, nothing is in both, or their numbers stem from different protocols.
@@ -103,9 +114,27 @@ def compare(
         f"Student's 95 % interval over sequences, from {FEWEST} of them on. "
         + (f"What differs: {changed}." if changed else "The settings are the same.")
     )
-    return Comparison(
-        overall, _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall), only_a, only_b, differences
+    page = None if output is None else _write_page(Path(output), protocol, evaluated, compared)
+    table = _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall)
+    return Comparison(overall, table, only_a, only_b, differences, page)
+
+
+def _write_page(output: Path, protocol: Protocol, evaluated: str, compared: Mapping[str, Sequence[Paired]]) -> Path:
+    """Write the page: both sides of every tracker, with the pages of the runs that stand for a cell."""
+    output = output.expanduser().absolute()
+    typical = {cell.typical.run_id: cell.typical for pairs in compared.values() for _, *c in pairs for cell in c}
+    runs = [row for row in typical.values() if row.folder.is_dir()]  # a report alone brings no files
+    paged = {row.run_id for row in runs}
+    write_run_pages(runs, paged, protocol, output)
+    write_side(output, "board", pairs_content(compared, evaluated, paged))
+    write_assets(output)
+    links = [("index.html", "Comparison")]
+    page = render(
+        "compare.html.j2", title="B against A", links=links, here="index.html", scripts=["run.js", "compare.js"]
     )
+    write_atomic(output / "index.html", page)
+    write_atomic(output / RUN_PAGE, render("run.html.j2", title="Run", links=links, scripts=["run.js"]))
+    return output / "index.html"
 
 
 def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRow], str]:

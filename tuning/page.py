@@ -1,4 +1,4 @@
-"""The page of a study: result, settings, course, importances and all trials; Optuna's plots lie beside it."""
+"""The page of a study: verdict, what was tried, confirmed and held out, settings, Optuna's plots, all trials."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import optuna
-from markupsafe import Markup
+import plotly.graph_objects as go
 from optuna.trial import TrialState
 
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.core.toml import setting_text
-from dynslam_bench.reports.figures import GRID, axis, guide, layout_of
-from dynslam_bench.reports.html.page import Block, Section, render
+from dynslam_bench.reports.build_report import sections_page
+from dynslam_bench.reports.figures import COLOURS, NEUTRAL, figure_of, guide
+from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
 from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 from dynslam_bench.tuning.final_runs import preset_text
@@ -28,10 +30,8 @@ from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, Verdict
 from dynslam_bench.tuning.trials import EARLIER, FEWEST_TRIALS, errors_of
 from dynslam_bench.tuning.tuner import Tuner
 
-PLOTS_FILE = "plots.html"
-_PLOTS = Markup(
-    '<a href="{}">Optuna\'s plots</a><iframe src="{}" title="Optuna\'s plots" width="100%" height="900"></iframe>'
-)
+_LEVELS = {Verdict.PROVEN: "green", Verdict.WORSE: "red"}
+"""Colour of the verdict; all others are amber."""
 _CONTOURS = 4
 """Contours of so many parameters are drawn, the most important ones."""
 
@@ -44,7 +44,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
         summary: What `finish` made of it.
 
     Returns:
-        Path of ``index.html`` in the study's folder; its tables lie beside it as CSV, Optuna's plots in `PLOTS_FILE`.
+        Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
     spec = tuner.spec
     candidates, trials = _candidates(summary), _trials(tuner, summary)
@@ -52,78 +52,87 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     settings = settings_table(tuner.space, tuner.base, summary.best.params if summary.best else {}, proven)
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
-    write_atomic(tuner.folder / PLOTS_FILE, _plots(tuner, list(summary.importances)))
-    result = [Block("table", table=candidates)]
-    if figure := _ratio_figure(summary):
-        caption = (
-            "Ratio to the baseline and its 95 % interval: on the instances of the choice (confirm), which no trial had "
-            "seen, and, for the best trial, on the held-out instances and on recordings."
-        )
-        result.append(Block("figure", figure="ratios", chart=figure, caption=caption))
-    conclusion = [summary.conclusion, *filter(None, [_shipped(summary), seen_note(summary.seen)])]
+    caption = (
+        "Ratios to the baseline, below 1 is better: of the trials, where the best is partly luck; of the best "
+        "ones on scenes that no trial had seen (confirm); and of the choice on held-out scenes and on recordings. "
+        "Bars: 95 % intervals over scenes. The star is the choice, if one was confirmed."
+    )
+    remarks = [*filter(None, [_shipped(summary), seen_note(summary.seen)])]
     sections = [
-        Section("result", "What the study found", "Result", conclusion, result),
         Section(
-            "preset", "Settings: baseline, best trial, range", "Settings", _picks(summary),
-            _preset(tuner, summary, settings),
+            "result", "Tried, confirmed, held out", remarks,
+            [*figure_blocks(_funnel_figure(tuner, summary), caption), Block("table", table=candidates)],
         ),
-        Section(
-            "course", "How it went", "Course", [*warnings_of(tuner), _importance_note(summary)],
-            [Block("list", entries=[_PLOTS.format(PLOTS_FILE, PLOTS_FILE)])],
-        ),
-        Section("trials", "All trials", "Trials", [], [Block("table", table=trials)]),
+        Section("preset", "Settings: baseline, best trial, range", _picks(summary), _preset(tuner, summary, settings)),
+        Section("course", "How it went", [*warnings_of(tuner), _importance_note(summary)], _plots(tuner, summary)),
+        Section("trials", "All trials", [], [Block("table", "All trials", trials, folded=True)]),
     ]  # fmt: skip
-    html = render(
+    html = sections_page(
         sections,
         title=f"Study {spec.name}: {spec.tracker}",
-        protocol=summary.protocol,
-        facts=[
-            (str(sum(summary.trials.values())), "trials"),
-            (str(summary.trials.get("pruned", 0)), "pruned"),
-            (str(summary.trials.get("fail", 0)), "failed"),
-            (_size(tuner.design.tune), "to tune on"),
-            (_size(tuner.design.confirm), "to choose on"),
-            (_size(tuner.design.held_out), "held out"),
-        ],
+        banner=summary.conclusion,
+        level=_LEVELS.get(summary.verdict, "amber"),
+        protocol=f"{_asked(tuner, summary)} {summary.protocol}.",
+        evaluates=True,
         footer=f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}. "
         f"Reproduce: {command_line(tuner.study.user_attrs.get('command', []))}",
     )
     path = tuner.folder / "index.html"
+    write_assets(tuner.folder)
     write_atomic(path, html)
     return path
+
+
+def _asked(tuner: Tuner, summary: StudySummary) -> str:
+    """What the study was asked, in words."""
+    goals = " and ".join(objective.what for objective in tuner.objectives)
+    trials = ", ".join(f"{count} {state}" for state, count in summary.trials.items() if count)
+    design = tuner.design
+    splits = {"to tune on": design.tune, "to choose on": design.confirm, "held out": design.held_out}
+    sizes = ", ".join(f"{name} {_size(instances)}" for name, instances in splits.items())
+    limits = {"coverage": tuner.spec.min_coverage, "frames a second": tuner.spec.min_fps}
+    named = ", ".join(f"{name} of {least:g} or more" for name, least in limits.items() if least is not None)
+    constraints = f" Constraints: {named}." if named else ""
+    return (
+        f"Do other values of {len(tuner.space)} settings give {tuner.spec.tracker} less {goals} than "
+        f"{summary.baseline}? Trials: {trials}. Runs: {sizes}.{constraints}"
+    )
 
 
 def _size(instances: Sequence[ProblemInstance]) -> str:
     return f"{len(instances)} runs, {len(scenes(instances))} scenes" if instances else "none"
 
 
-def _plots(tuner: Tuner, important: list[str]) -> str:
-    """Optuna's own plots of the study, in one HTML text that works offline; ratios in place of logarithms."""
+def _plots(tuner: Tuner, summary: StudySummary) -> list[Block]:
+    """Optuna's own plots of the study; ratios in place of logarithms."""
     from optuna import visualization
 
     names = [f"ratio of {objective.what} to the baseline" for objective in tuner.objectives]
     target: dict[str, Any] = {"target": lambda trial: math.exp(trial.values[0]), "target_name": names[0]}
+    important = list(summary.importances)
     params = important or [parameter.name for parameter in tuner.space]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # experimental; of trials that pruning never saw
-        figures = [
-            visualization.plot_optimization_history(tuner.study, **target),
-            visualization.plot_parallel_coordinate(tuner.study, **target),
-            visualization.plot_slice(tuner.study, **target),
-            visualization.plot_contour(tuner.study, params=params[:_CONTOURS], **target),
-        ]
+        figures = {
+            "History": visualization.plot_optimization_history(tuner.study, **target),
+            "Parallel coordinates": visualization.plot_parallel_coordinate(tuner.study, **target),
+            "Slices": visualization.plot_slice(tuner.study, **target),
+            "Contours": visualization.plot_contour(tuner.study, params=params[:_CONTOURS], **target),
+        }
         if important:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-            figures.append(visualization.plot_param_importances(tuner.study, evaluator=evaluator, **target))
+            figures["Importances"] = visualization.plot_param_importances(tuner.study, evaluator=evaluator, **target)
         if len(names) == 1:
-            figures.append(visualization.plot_intermediate_values(tuner.study))
+            figures["Intermediate values"] = visualization.plot_intermediate_values(tuner.study)
         elif len(names) < 4:
-            figures.append(
-                visualization.plot_pareto_front(
-                    tuner.study, targets=lambda trial: list(map(math.exp, trial.values)), target_names=names
-                )
+            figures["Pareto front"] = visualization.plot_pareto_front(
+                tuner.study, targets=lambda trial: list(map(math.exp, trial.values)), target_names=names
             )
-    return "\n".join(str(figure.to_html(full_html=False, include_plotlyjs=figure is figures[0])) for figure in figures)
+    blocks = []
+    for title, figure in figures.items():
+        figure.update_layout(title=None, template={}, height=figure.layout.height or 450)
+        blocks += figure_blocks(figure, f"{title}, as Optuna draws it.", title)
+    return blocks
 
 
 def _preset(tuner: Tuner, summary: StudySummary, settings: Table) -> list[Block]:
@@ -161,45 +170,51 @@ def _importance_note(summary: StudySummary) -> str:
     return f"Importances (PED-ANOVA) and their 95 % intervals: {shares}. They add up to 100 % even where none matters."
 
 
-def _ratio_figure(summary: StudySummary) -> dict[str, Any] | None:
-    """Each candidate's ratio with its interval on every split."""
-    traces: list[dict[str, Any]] = []
-    styles = (("confirm", "#1f6fb4", "circle"), ("held_out", "#d9542b", "square"), ("recorded", "#3a8f5c", "diamond"))
-    for split, colour, symbol in styles:
-        points: list[tuple[str, Ratio]] = [
-            (f"trial {candidate.trial}", ratio)
-            for candidate in summary.candidates
-            if (ratio := getattr(candidate, split)) is not None
-        ]
-        if not points:
-            continue
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "name": split.replace("_", "-"),
-                "error_x": {
-                    "type": "data",
-                    "symmetric": False,
-                    "color": colour,
-                    "array": [0.0 if ratio.high is None else ratio.high - ratio.ratio for _, ratio in points],
-                    "arrayminus": [0.0 if ratio.low is None else ratio.ratio - ratio.low for _, ratio in points],
-                },
-                "x": [ratio.ratio for _, ratio in points],
-                "y": [label for label, _ in points],
-                "marker": {"size": 11, "color": colour, "symbol": symbol},
-            }
-        )
-    if not traces:
+def _funnel_figure(tuner: Tuner, summary: StudySummary) -> go.Figure | None:
+    """Ratios of all trials, of the confirmed candidates, and of the choice where it is judged; None for no trial."""
+    tried = [
+        (trial.number, math.exp(trial.values[0]))
+        for trial in tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    ]
+    if not tried:
         return None
-    layout = layout_of(
-        height=160 + 50 * len(summary.candidates),
-        shapes=[guide(x=1.0)],
-        margin={"l": 90, "r": 20, "t": 30, "b": 60},
-        xaxis=axis("ratio to the baseline (left is better)"),
-        yaxis={"autorange": "reversed", "gridcolor": GRID},
-    )
-    return {"data": traces, "layout": layout}
+    spread = 0.5 * (np.random.default_rng(0).random(len(tried)) - 0.5)
+    stages = [f"tried: {len(tried)} whole trials"]
+    traces = [
+        go.Scatter(
+            x=spread, y=[ratio for _, ratio in tried], mode="markers", name="trials",
+            text=[f"trial {trial}" for trial, _ in tried], marker={"color": NEUTRAL, "opacity": 0.7, "size": 7},
+            hovertemplate="%{text}: %{y:.3f}<extra></extra>",
+        )
+    ]  # fmt: skip
+    splits = {"confirm": "confirmed", "held_out": "held out", "recorded": "recordings"}
+    for (split, words), colour in zip(splits.items(), COLOURS, strict=False):
+        judged: list[tuple[Candidate, Ratio]] = [
+            (candidate, ratio) for candidate in summary.candidates if (ratio := getattr(candidate, split)) is not None
+        ]
+        if not judged:
+            continue
+        at = len(stages) + 0.5 * (np.linspace(0, 1, len(judged) + 2)[1:-1] - 0.5)
+        stages.append(f"{words}: {len(judged)}")
+        symbols = ["star" if candidate is summary.best and candidate.chosen else "circle" for candidate, _ in judged]
+        bars = {
+            "type": "data",
+            "symmetric": False,
+            "array": [0.0 if ratio.high is None else ratio.high - ratio.ratio for _, ratio in judged],
+            "arrayminus": [0.0 if ratio.low is None else ratio.ratio - ratio.low for _, ratio in judged],
+        }
+        traces.append(
+            go.Scatter(
+                x=at, y=[ratio.ratio for _, ratio in judged], mode="markers", name=words, error_y=bars,
+                text=[f"trial {candidate.trial}" for candidate, _ in judged],
+                marker={"color": colour, "symbol": symbols, "size": 12},
+                hovertemplate="%{text}: %{y:.3f}<extra></extra>",
+            )
+        )  # fmt: skip
+    axis = {"tickvals": list(range(len(stages))), "ticktext": stages, "range": [-0.5, len(stages) - 0.5]}
+    figure = figure_of(traces, 420, showlegend=False, xaxis=axis, yaxis={"title": "ratio to the baseline"})
+    guide(figure, y=1.0)
+    return figure
 
 
 def fewer_starts(design: Design) -> str:

@@ -103,7 +103,6 @@ def publish(
     ] = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     remark: Annotated[str, typer.Option(help="What a reader should know, for the first page.")] = "",
-    picture_seconds: Annotated[float, typer.Option(min=0, help="Time for drawing pictures of frames.")] = 60,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
@@ -112,8 +111,7 @@ def publish(
 
     with progress("site") as advance:
         site = publish_site(
-            results, output, study=study, title=title, note=remark, picture_seconds=picture_seconds,
-            protocol=protocol, on_progress=advance,
+            results, output, study=study, title=title, note=remark, protocol=protocol, on_progress=advance,
         )  # fmt: skip
     present(site, f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")
 
@@ -122,18 +120,22 @@ def publish(
 def compare(
     a: Annotated[Path, typer.Argument(help="Results folder, or folder of a report.")],
     b: Annotated[Path, typer.Argument(help="The other one.")],
+    output: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--output", help="Folder of the page that shows it; default compare in the folder B."),
+    ] = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
 ) -> None:
     """Compare two results folders on the sequences that both have, with the same settings or with others."""
     from dynslam_bench.reports import compare as compare_results
 
-    result = compare_results(a, b, protocol=protocol)
+    result = compare_results(a, b, protocol=protocol, output=output or (b if b.is_dir() else b.parent) / "compare")
     facts = {"differences": result.differences, "only_a": result.only_a, "only_b": result.only_b}
     lines = [result.table.title, report_table(result.table), "", wrapped(result.table.caption)]
     if result.only_a or result.only_b:
         lines.append(f"\nonly in {a}: {result.only_a} runs; only in {b}: {result.only_b} runs")
-    present({"overall": result.overall} | facts, *lines)
+    present({"overall": result.overall, "html": result.page} | facts, *lines, str(result.page))
 
 
 @app.command("audit-paper")

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
 from dynslam_bench.core.errors import RunError, TrackerError
 from dynslam_bench.core.reading import read_npz
-from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image
+from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
@@ -32,7 +33,10 @@ SPREAD = 24
 MOST_FRAMES = 1000
 """Of a file that is read."""
 WORST = 6
-"""Frames that are kept besides, those with the largest frame-to-frame error."""
+"""Frames that are kept besides: those with the largest frame-to-frame error, and as many on which tracking was lost."""
+PICTURE = "frame_{:06d}.webp"
+"""Name of the picture of a frame, as its tracker saw it, in the folder of its run."""
+_PICTURE_WIDTH, _PICTURE_QUALITY = 400, 55
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +69,9 @@ def spread(frames: int, count: int = SPREAD) -> list[int]:
 
 
 class SnapshotWriter:
-    """Collects snapshots while a run goes on; nothing is written for trackers that show neither features nor masks.
+    """Keeps frames while a run goes on: pictures, and snapshots of trackers that show features or masks.
+
+    Pictures of the worst frames are written at the end, all others at once: a run that is killed leaves them.
 
     Args:
         folder: The run's.
@@ -73,31 +79,48 @@ class SnapshotWriter:
     """
 
     def __init__(self, folder: Path, frames: int) -> None:
-        self._path, self._spread = folder / SNAPSHOTS_FILE, set(spread(frames))
+        self._folder, self._spread = folder, set(spread(frames))
         self._even: list[Snapshot] = []
-        self._worst: list[tuple[float, Snapshot]] = []
+        self._worst: list[tuple[float, Snapshot | None, int, Image]] = []
         self._size = (0, 0)
+        self._state, self._losses = "", 0
 
-    def add(self, outcome: FrameOutcome, shape: tuple[int, ...], result: TrackResult) -> None:
-        """Keep the frame if it is one of those spread over the run, or among the worst so far."""
-        if result.keypoints_xy is None and result.dynamic_mask is None:
-            return
-        self._size = (shape[0], shape[1])
+    def add(self, outcome: FrameOutcome, rgb: Image, result: TrackResult) -> None:
+        """Keep the frame if it is one of those spread over the run, of the worst so far, or the first of a loss."""
         error = None if outcome.error is None else outcome.error.frame_trans_m
-        if outcome.index in self._spread:
-            self._even.append(snapshot_of(outcome.index, result))
-        elif error is not None and (len(self._worst) < WORST or error > self._worst[-1][0]):
-            self._worst.append((error, snapshot_of(outcome.index, result)))
-            self._worst = sorted(self._worst, key=lambda pair: -pair[0])[:WORST]
+        lost, self._state = outcome.state == "lost" and self._state == "ok", outcome.state
+        self._losses += lost
+        kept = outcome.index in self._spread or (lost and self._losses <= WORST)
+        bad = error is not None and (len(self._worst) < WORST or error > self._worst[-1][0])
+        if not kept and not bad:
+            return
+        shows = result.keypoints_xy is not None or result.dynamic_mask is not None
+        shot = snapshot_of(outcome.index, result) if shows else None
+        self._size = (rgb.shape[0], rgb.shape[1])
+        picture = annotated(rgb, result, _PICTURE_WIDTH)
+        if kept:
+            self._even += [] if shot is None else [shot]
+            self._write_picture(outcome.index, picture)
+        elif error is not None:
+            self._worst.append((error, shot, outcome.index, picture))
+            self._worst = sorted(self._worst, key=lambda entry: -entry[0])[:WORST]
+
+    def _write_picture(self, index: int, picture: Image) -> None:
+        options = (cv2.IMWRITE_WEBP_QUALITY, _PICTURE_QUALITY)
+        _, data = cv2.imencode(".webp", np.ascontiguousarray(picture[:, :, ::-1]), options)
+        (self._folder / PICTURE.format(index)).write_bytes(data.tobytes())
 
     def write(self) -> None:
         """Write what was kept."""
-        shots = sorted([*self._even, *(shot for _, shot in self._worst)], key=lambda shot: shot.index)
+        for _, _, index, picture in self._worst:
+            self._write_picture(index, picture)
+        worst = [shot for _, shot, *_ in self._worst if shot is not None]
+        shots = sorted([*self._even, *worst], key=lambda shot: shot.index)
         if not shots:
             return
         empty = np.zeros((self._size[0], -(-self._size[1] // 8)), np.uint8)
         np.savez_compressed(
-            self._path,
+            self._folder / SNAPSHOTS_FILE,
             index=np.array([shot.index for shot in shots], np.int32),
             count=np.array([len(shot.points) for shot in shots], np.int32),
             points=np.concatenate([shot.points for shot in shots]),
@@ -270,8 +293,6 @@ class VideoWriter:
         Raises:
             RunError: This OpenCV cannot write such a video.
         """
-        import cv2
-
         image = self._env.render()
         assert image is not None
         if self._writer is None:

@@ -148,7 +148,7 @@ class _Recorder:
         self._log.flush()
         self._logged = len(outcomes)
         outcome = outcomes[-1]
-        self._snapshots.add(outcome, env.frame.rgb.shape, result)
+        self._snapshots.add(outcome, env.frame.rgb, result)
         if self._video is not None:
             self._video.add()
         if self._sheet is not None:

@@ -1,30 +1,26 @@
-"""The HTML pages: sections of tables and figures; style and scripts in the page, large data in side files."""
+"""The HTML pages: templates, the files that all pages share, and the data that they load on demand."""
 
 from __future__ import annotations
 
-import base64
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
+import plotly.graph_objects as go
 from jinja2 import Environment, FunctionLoader
 from markupsafe import Markup, escape
-from numpy.typing import ArrayLike
+from plotly.offline import get_plotlyjs
 
 from dynslam_bench.core.files import write_atomic
-from dynslam_bench.reports.figures import Figure
+from dynslam_bench.reports.figures import THEMES
 from dynslam_bench.reports.tables.table import Table
 
-_STYLES = ("report.css", "figures.css")
-_CHARTS = ("scales.js", "traces.js", "chart.js", "hover.js", "store.js", "page.js")
-_EXPLORE = ("explore.js", "explore_figures.js", "tracks.js")
-_RUN = ("run.js", "run_figures.js", "view3d.js", "annotations.js")
+ASSETS, FOLDER = "assets", "data"
+_SCRIPTS = ("page.js", "board.js", "errors.js", "run.js", "compare.js")
 
 
 @dataclass
@@ -35,42 +31,36 @@ class Block:
         kind: Which of the other attributes count.
         title: Heading above it, or what is seen of it when it is closed.
         table: For ``table``.
-        figure: Id of the figure, for ``figure``.
-        chart: Its specification.
-        caption: Below the figure, or behind the title of ``tracks``.
+        figure: For ``figure``.
+        caption: Below the figure.
         text: For ``code``.
         entries: For ``list``.
-        tracks: For ``tracks``: the runs to draw, each with its name and colour and whether it is shown at first.
-        folded: Whether a table, a list or tracks are closed at first, behind their title.
+        folded: Whether it is closed at first, behind its title.
     """
 
-    kind: Literal["table", "figure", "code", "list", "caption", "tracks", "explore"]
+    kind: Literal["table", "figure", "code", "list"]
     title: str = ""
     table: Table | None = None
-    figure: str = ""
-    chart: Figure = field(default_factory=dict)
+    figure: go.Figure | None = None
     caption: str = ""
     text: str = ""
     entries: list[str] = field(default_factory=list)
-    tracks: list[dict[str, Any]] = field(default_factory=list)
     folded: bool = False
 
 
 @dataclass
 class Section:
-    """A section of the page.
+    """A section of a page.
 
     Attributes:
         id: For links.
         title: Heading.
-        short: In the list of contents.
         notes: Set off above everything else.
         blocks: Its content.
     """
 
     id: str
     title: str
-    short: str
     notes: list[str] = field(default_factory=list)
     blocks: list[Block] = field(default_factory=list)
 
@@ -80,51 +70,21 @@ def table_blocks(*tables: Table | None, folded: bool = False) -> list[Block]:
     return [Block("table", t.title if folded else "", t, folded=folded) for t in tables if t is not None]
 
 
-def figure_blocks(name: str, chart: Figure | None, caption: str = "") -> list[Block]:
+def figure_blocks(figure: go.Figure | None, caption: str = "", title: str = "") -> list[Block]:
     """A block that shows a figure; none for no figure."""
-    return [] if chart is None else [Block("figure", figure=name, chart=chart, caption=caption)]
+    return [] if figure is None else [Block("figure", title, figure=figure, caption=caption)]
 
 
-def render(
-    sections: Sequence[Section],
-    *,
-    title: str,
-    protocol: str,
-    facts: Sequence[tuple[str, str]],
-    footer: str,
-) -> str:
-    """The page as one HTML text that fetches nothing but the side files beside it.
+def render(template: str, **values: Any) -> str:
+    """A page as one HTML text that fetches nothing but files beside it.
 
     Args:
-        sections: What to show, in order.
-        title: Heading.
-        protocol: One line below it.
-        facts: Numbers and what they count.
-        footer: Last line.
+        template: Name of the template.
+        **values: What it shows; all pages need ``title``.
     """
-    blocks = [block for section in sections for block in section.blocks]
-    explores = any(block.kind == "explore" for block in blocks)
-    figures = {block.figure: block.chart for block in blocks if block.figure}
-    return _render(
-        "report.html.j2", _EXPLORE if explores else (), title=title, protocol=protocol, facts=facts, sections=sections,
-        footer=footer, figures=Markup(to_script(figures)), explores=explores,
-    )  # fmt: skip
-
-
-def render_run_page(title: str) -> str:
-    """The page that shows whichever run its address names, from the side files beside it.
-
-    Args:
-        title: Title of the report that it belongs to.
-    """
-    return _render("run.html.j2", _RUN, title=title)
-
-
-def _render(template: str, scripts: tuple[str, ...], **values: Any) -> str:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(resource))
-    environment.filters["breakable"] = _breakable
-    css, javascript = (Markup("\n".join(map(resource, names))) for names in (_STYLES, _CHARTS + scripts))
-    return environment.get_template(template).render(css=css, javascript=javascript, **values)
+    environment.filters |= {"breakable": _breakable, "script": to_script, "figure": figure_json}
+    return environment.get_template(template).render(**values)
 
 
 def _breakable(name: str) -> Markup:
@@ -138,13 +98,44 @@ def resource(name: str) -> str:
     return (files("dynslam_bench.reports.html") / "templates" / name).read_text(encoding="utf-8")
 
 
-FOLDER = "data"
-_MISSING = 65535
+@cache
+def _assets() -> dict[str, str]:
+    """The files that all pages share: plotly, DataTables, our style and scripts."""
+    bundle = files("itables") / "html"
+    tables = (bundle / "dt_bundle.js").read_text(encoding="utf-8")
+    exported = re.search(r"export\s*\{[^}]*?([\w$]+) as default[^}]*\};?", tables)
+    assert exported is not None, "the DataTables bundle of itables exports its class"
+    tables = tables.replace(exported[0], f"globalThis.DataTable={exported[1]};")  # a page in a folder loads no modules
+    return {
+        "plotly.min.js": get_plotlyjs(),
+        "datatables.js": f"(()=>{{{tables}\n}})();",
+        "datatables.css": (bundle / "dt_bundle.css").read_text(encoding="utf-8"),
+        "page.css": resource("page.css"),
+        **{name: resource(name) for name in _SCRIPTS},
+        "themes.js": f"const THEMES = {to_script(THEMES)};\n",
+    }
 
 
-def to_script(value: Any) -> str:
+def write_assets(output: Path) -> None:
+    """Write what all pages of a folder share into ``assets/``.
+
+    Raises:
+        DynslamError: The folder cannot be written.
+    """
+    for name, text in _assets().items():
+        path = output / ASSETS / name
+        if not path.is_file() or path.stat().st_size != len(text.encode()):
+            write_atomic(path, text)
+
+
+def to_script(value: Any) -> Markup:
     """A value as JSON that may stand inside a script element."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
+
+
+def figure_json(figure: go.Figure) -> Markup:
+    """A figure as JSON that may stand inside a script element."""
+    return Markup(str(figure.to_json()).replace("<", "\\u003c"))
 
 
 def write_side(output: Path, name: str, value: Any) -> None:
@@ -162,26 +153,3 @@ def write_side(output: Path, name: str, value: Any) -> None:
     content = f"keep({json.dumps(name)},{to_script(value)});\n".encode()
     if not path.is_file() or path.read_bytes() != content:  # to replace a file takes longer than to read it
         write_atomic(path, content)
-
-
-def packed_rows(rows: ArrayLike) -> list[list[float | str]]:
-    """Series of numbers in 16 bits each between their smallest and their largest; what is no number stays missing.
-
-    Args:
-        rows: Numbers ``[K, N]``.
-
-    Returns:
-        Of each series its smallest value, the step, and the counts of steps in base64; a page shows them to a 65 000th
-        of their range.
-    """
-    array = np.atleast_2d(np.asarray(rows, dtype=np.float64))
-    finite = np.isfinite(array)
-    low = np.min(array, axis=1, where=finite, initial=np.inf)
-    high = np.max(array, axis=1, where=finite, initial=-np.inf)
-    low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, 0.0)
-    step = np.where(high > low, (high - low) / (_MISSING - 1), 1.0)
-    counts = np.where(finite, (array - low[:, None]) / step[:, None], _MISSING).round().astype("<u2")
-    return [
-        [float(f"{first:.9g}"), float(f"{width:.9g}"), base64.b64encode(row.tobytes()).decode()]
-        for first, width, row in zip(low, step, counts, strict=True)
-    ]

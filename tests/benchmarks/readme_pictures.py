@@ -54,7 +54,7 @@ def main() -> None:
         browser.settle()
         framed(browser, "#leaderboard", options.output / "leaderboard.webp", most=760)
         store = RunStore(options.results)
-        report = build_report(store, Path(folder) / "report", picture_seconds=60)
+        report = build_report(store, Path(folder) / "report")
         browser.open(report.run, 1100, anchor=f"#{store.ids()[0]}")
         browser.until("one('.thumb canvas')", tries=200)
         browser.run(f"slide(all('#annotations input[type=range]')[0], {options.frame})") if options.frame >= 0 else None

@@ -23,6 +23,10 @@ globalThis.slide = (input, value) => { input.value = value; input.dispatchEvent(
 needs_browser = pytest.mark.skipif(EXECUTABLE is None, reason=f"no browser is installed: {', '.join(NAMES)}")
 
 
+OF_THE_DRIVER = ("GL Driver Message", "willReadFrequently", "WebGL")
+"""Warnings of software that draws in place of a graphics card."""
+
+
 class Browser:
     """One page of a headless browser.
 
@@ -37,6 +41,7 @@ class Browser:
         command = [
             *(EXECUTABLE, "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"),
             *("--remote-debugging-pipe", f"--user-data-dir={folder}", "--no-first-run", "--disable-extensions"),
+            "--enable-unsafe-swiftshader",  # figures in space, without a graphics card
             *("--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage"),
         ]
         script = 'exec 3<&"$1" 4>&"$2"; shift 2; exec "$@"'
@@ -95,7 +100,8 @@ class Browser:
         elif kind == "Runtime.consoleAPICalled" and given["type"] in ("error", "warning"):
             self.faults.append(str(given["args"]))
         elif kind == "Log.entryAdded" and given["entry"]["level"] in ("error", "warning"):
-            self.faults.append(given["entry"]["text"] + " " + given["entry"].get("url", ""))
+            if not any(word in given["entry"]["text"] for word in OF_THE_DRIVER):
+                self.faults.append(given["entry"]["text"] + " " + given["entry"].get("url", ""))
         elif kind == "Network.requestWillBeSent":
             self.fetched.append(given["request"]["url"])
         elif kind == "Network.loadingFailed":
@@ -111,6 +117,7 @@ class Browser:
         self.call("Page.navigate", url=path.absolute().as_uri() + anchor)
         while "Page.loadEventFired" not in self._events:
             self._next()
+        self.until("location.protocol === 'file:' && document.readyState === 'complete'", tries=200)
         self.run(HELPERS)
         self.settle()
 

@@ -167,7 +167,9 @@ def add_frames(
         mask = np.zeros(size, bool)
         mask[:, : int(size[1] * share)] = True
         kept = np.arange(features) >= 0.4 * features
-        writer.add(outcome, (*size, 3), TrackResult(np.eye(4), "ok", numbers, times, mask, points, kept))
+        writer.add(
+            outcome, np.full((*size, 3), 90, np.uint8), TrackResult(np.eye(4), "ok", numbers, times, mask, points, kept)
+        )
     writer.write()
     write_csv(folder / "frames.csv", rows)
 

@@ -1,22 +1,24 @@
-"""The report in a real browser: nothing is fetched, nothing faults, everything fits and can be read."""
+"""The pages in a real browser: nothing is fetched, nothing faults, everything fits, can be read, and is linked."""
 
+import json
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from reports_browser import Browser, needs_browser
 from reports_fake_store import add_frames, add_run, fill
 from reports_rows import page_data
 
 from dynslam_bench.envs.arguments import open_frames
-from dynslam_bench.reports import build_report
+from dynslam_bench.reports import build_report, compare
 from dynslam_bench.sequences.view import part_of
 
 sys.path.append(str(Path(__file__).parents[1] / "envs"))
 from envs_toys import write_folder
 
 pytestmark = needs_browser
-WIDTHS = (1400, 768, 360)
+NAME = "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} \N{HEBREW LETTER ALEF} $x_1$"
 
 
 @pytest.fixture(scope="module")
@@ -26,13 +28,13 @@ def report(tmp_path_factory):
     store = fill(root / "results", seeds=(0, 1))
     place = write_folder(root / "toy", 40)
     held = part_of(open_frames(str(place), None, None, (0, None), 1), 0).content
-    for name, label in (("ours", "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN}"), ("orb-slam2", "ORB-SLAM2 (our back end)")):
+    for name, label in (("ours", NAME), ("orb-slam2", "ORB-SLAM2 (our back end)")):
         settings = {"features.options": "one long word after the other " * 40, "features.levels": 8}
         run_id = add_run(
             store, name, "toy", n=40, label=label, place=str(place), content=held, lost=(20,), tags=("static",),
             final_error=0.004, settings=settings,
         )  # fmt: skip
-        add_frames(store.folder(run_id), 40)
+        add_frames(store.folder(run_id), 40, stats=("keypoints", "inliers"))
     add_run(store, "elsewhere", "synthetic/walking_xyz", kind="imported", label="Elsewhere", frame_s=None)
     return build_report(store, root / "report")
 
@@ -44,42 +46,53 @@ def browser(tmp_path_factory):
     page.close()
 
 
+def numbers_of(report, label, sequence):
+    """Numbers of a tracker and of a sequence on the pages."""
+    board = page_data(report.html.parent, "board")
+    tracker = next(at for at, each in enumerate(board["trackers"]) if each["label"].startswith(label))
+    return tracker, next(at for at, each in enumerate(board["sequences"]) if each["name"].startswith(sequence))
+
+
 def run_of(report, label, sequence):
-    explore = page_data(report.html.parent, "explore")
-    tracker = next(at for at, each in enumerate(explore["trackers"]) if each["label"].startswith(label))
-    column = next(at for at, each in enumerate(explore["sequences"]) if each["name"].startswith(sequence))
-    return next(run[0] for run in explore["runs"] if run[1:3] == [tracker, column])
+    """Id of the first run of a tracker on a sequence."""
+    place = list(numbers_of(report, label, sequence))
+    return next(run[0] for run in page_data(report.html.parent, "board")["runs"] if run[1:3] == place)
 
 
-def see_everything(browser):
-    browser.run("all('main details:not(.toolbar details)').forEach((fold) => { fold.open = true; })")
-    browser.run("all('.figure').forEach(draw)")
+READY = {
+    "index": "one('.dt-search input') && one('#speed .main-svg')",
+    "errors": "one('#explore-table tbody tr')",
+    "run": "one('#time .main-svg') && one('#picture img').complete",
+    "compare": "one('#difference .main-svg')",
+    "diagnostics": "one('.figure .main-svg')",
+    "paper": "one('h2')",
+    "reproduce": "one('pre')",
+}
+
+
+def open_page(browser, report, page, width=1440, anchor=""):
+    if page == "run" and not anchor:
+        anchor = f"#{run_of(report, 'Ours', 'toy')}"
+    if page == "compare" and not anchor:
+        (a, toy), (b, _) = numbers_of(report, "ORB-SLAM2", "toy"), numbers_of(report, "Ours", "toy")
+        anchor = f"#a={a}&b={b}&sequence={toy}"
+    browser.open(report.html.parent / f"{page}.html", width, anchor=anchor)
+    browser.run("all('details').forEach((fold) => { fold.open = true; })")
+    browser.run("all('.figure').forEach((figure) => figure.scrollIntoView())")
+    browser.until(READY[page], tries=200)
     browser.settle()
 
 
-PAGES = ("report", "run")
-
-
-def open_page(browser, report, page, width):
-    if page == "report":
-        browser.open(report.html, width)
-        browser.until("one('#explore-table tbody tr')")
-    else:
-        browser.open(report.run, width, anchor="#" + run_of(report, "Ours", "toy"))
-        browser.until("one('.thumb canvas')")
-    see_everything(browser)
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report, page):
-    for width in WIDTHS:
-        open_page(browser, report, page, width)
-        assert browser.faults == []
-        folder = report.html.parent.absolute().as_uri()
-        assert browser.fetched and all(url.startswith((folder, "data:")) for url in browser.fetched)
-        assert browser.run("document.documentElement.scrollWidth") == width
-        figures = browser.run("[...all('.chart svg')].map((each) => each.getBoundingClientRect().right)")
-        assert len(figures) >= 4 and max(figures) <= width
+@pytest.mark.parametrize("page", READY)
+@pytest.mark.parametrize("width", [1440, 390])
+def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report, page, width):
+    open_page(browser, report, page, width)
+    assert browser.faults == []
+    folder = report.html.parent.absolute().as_uri()
+    assert browser.fetched and all(url.startswith((folder, "data:", "blob:")) for url in browser.fetched)
+    assert browser.run("document.documentElement.scrollWidth") == width
+    right = browser.run("all('.figure').map((each) => each.getBoundingClientRect().right)")
+    assert max(right, default=0) <= width
 
 
 CONTRAST = (Path(__file__).parent / "contrast.js").read_text().partition("\n")[2]
@@ -88,35 +101,244 @@ CONTRAST = (Path(__file__).parent / "contrast.js").read_text().partition("\n")[2
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_everything_that_is_written_can_be_read(browser, report, scheme):
     browser.prefer(scheme)
-    for page in PAGES:
-        open_page(browser, report, page, 1400)
+    for page in READY:
+        open_page(browser, report, page)
         seen, bad = browser.run(CONTRAST.replace("DARK", "true" if scheme == "dark" else "false"))
-        assert seen > 100 and bad == []
+        assert seen > 10 and bad == [], page
+    browser.prefer("light")
+
+
+def test_the_board_fits_four_screens(browser, report):
+    browser.open(report.html, 1440)
+    browser.until(READY["index"], tries=200)
+    assert browser.run("document.documentElement.scrollHeight") <= 4 * 900
 
 
 def test_the_theme_can_be_chosen_and_stays(browser, report):
-    browser.prefer("light")
     browser.open(report.html)
     ground = "getComputedStyle(document.body).backgroundColor"
     light = browser.run(ground)
     for label in ("Light", "Dark"):
-        browser.run("one('.theme').click()")
-        assert label in browser.run("one('.theme').textContent")
+        browser.run("byId('theme').click()")
+        assert label in browser.run("byId('theme').textContent")
     dark = browser.run(ground)
     assert dark != light
     browser.open(report.run)
     assert browser.run(ground) == dark
-    browser.run("one('.theme').click()")
+    browser.run("byId('theme').click()")
     assert browser.run(ground) == light
 
 
-def test_tables_sort_with_what_is_missing_last(browser, report):
+# -- the board
+
+ROWS = "select('[data-panel]:not([hidden]) tbody tr').map((row) => row.querySelector('.name a').textContent)"
+HEAD = "select('[data-panel]:not([hidden]) thead th').find((head) => head.textContent.trim().startsWith('{}'))"
+
+
+def sort(browser, column):
+    browser.run(f"{HEAD.format(column)}.querySelector('.dt-column-order').click()")
+    browser.settle()
+
+
+def test_the_board_sorts_within_its_groups_and_back(browser, report):
     browser.open(report.html)
-    ratios = "[...all('#leaderboard tbody tr')].map((row) => row.cells[3].dataset.v ?? null)"
-    before = browser.run(ratios)
-    for up in (True, False):
-        browser.run("all('#leaderboard thead tr:last-child button')[3].click()")
-        found = browser.run(ratios)
-        numbers = [float(value) for value in found if value is not None]
-        assert numbers == sorted(numbers, reverse=not up) and len(numbers) >= 6
-        assert sorted(map(str, found)) == sorted(map(str, before)) and None not in found[: len(numbers)]
+    at_first = browser.run(ROWS)
+    assert at_first[-1] == "constant velocity" and len(at_first) == 7
+    ratio = "select('[data-panel]:not([hidden]) tbody tr.group-0 td.n[data-order]').map((cell) => +cell.dataset.order)"
+    orders = []
+    for _ in range(3):
+        sort(browser, "ratio")
+        orders.append((browser.run(ROWS), browser.run("location.hash")))
+    assert [address for _, address in orders] == ["#sort=4.asc", "#sort=4.desc", ""]
+    ranked = len(browser.run("select('[data-panel]:not([hidden]) tbody tr.group-0')"))
+    assert orders[1][0][:ranked] == orders[0][0][:ranked][::-1] and orders[1][0][-1] == "constant velocity"
+    assert orders[2][0] == at_first and browser.run(ratio)
+
+
+def test_the_view_of_the_board_is_in_the_address(browser, report):
+    browser.open(report.html)
+    browser.run("all('[data-tab]').find((tab) => tab.textContent === 'high dynamic').click()")
+    browser.run("all('[data-panel]:not([hidden]) input[type=checkbox]').slice(0, 2).forEach((box) => box.click())")
+    browser.run("""(() => { const search = one('[data-panel]:not([hidden]) .dt-search input');
+        search.value = 'slam'; search.dispatchEvent(new Event('input', {bubbles: true})); })()""")
+    sort(browser, "tracker")
+    address, rows = browser.run("location.hash"), browser.run(ROWS)
+    assert all(part in address for part in ("tab=high+dynamic", "select=", "q=slam", "sort=3.asc"))
+    assert rows == sorted(rows) and all("slam" in name.lower() for name in rows)
+    browser.open(report.html, anchor=address)
+    assert browser.run(ROWS) == rows and browser.run("all('.headline')[0].textContent").count("high dynamic") == 1
+    assert browser.run("byId('compare').disabled") is False
+    browser.run("byId('compare').click()")
+    ready = "typeof byId === 'function' && byId('sentence') && byId('sentence').textContent.includes('against')"
+    browser.until(ready, tries=200)
+    assert browser.faults == []
+
+
+# -- errors by sequence
+
+
+def choose(browser, place, text):
+    browser.run(f"""(() => {{ const list = byId('{place}');
+        list.value = [...list.options].find((option) => option.textContent.startsWith({json.dumps(text)})).value;
+        list.dispatchEvent(new Event('change')); }})()""")
+
+
+def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
+    """ATE, relative and rotational errors, absolute and as ratios: each against the CSV of the runs."""
+    runs = pd.read_csv(report.csv["runs"])
+    mine = runs[(runs["label"] == "Mask R-CNN (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
+    base = runs[(runs["label"] == "ORB-SLAM2 (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
+    open_page(browser, report, "errors")
+    cell = """(() => { const heads = select('#explore-table thead th');
+        const at = heads.findIndex((head) => head.textContent.trim().endsWith('walking_xyz'));
+        const row = select('#explore-table tbody tr').find((each) => each.cells[0].textContent.startsWith('Mask'));
+        return +row.cells[at].dataset.order; })()"""
+    columns = {
+        "ATE, online": ("score_m", 1000),
+        "RPE over 1 s (TUM pairs), online": ("rpe_1s_trans_rmse_m", 1000),
+        "RPE over 1 s (TUM pairs), rotation, online": ("rpe_1s_rot_rmse_deg", 1),
+        "absolute rotation, online": ("ape_rot_rmse_deg", 1),
+    }
+    for name, (column, factor) in columns.items():
+        choose(browser, "metric", name)
+        choose(browser, "scale", "absolute")
+        assert browser.run(cell) == pytest.approx(factor * mine[column].median(), rel=1e-3)
+        choose(browser, "scale", "ratio")
+        assert browser.run(cell) == pytest.approx(mine[column].median() / base[column].median(), rel=1e-3)
+    assert "scale=ratio" in browser.run("location.hash")
+    choose(browser, "kind", "static")
+    assert browser.run("select('#explore-table thead th').length") == 2
+    browser.run("byId('ranked').click()")
+    ranked = browser.run("select('#explore-table tbody tr').length")
+    browser.run("byId('reset').click()")
+    assert ranked < browser.run("select('#explore-table tbody tr').length") == 7
+    failed = browser.run("select('#explore-table small').map((each) => each.textContent.trim())")
+    assert failed == ["✕1"]
+
+
+# -- the page of a run
+
+
+def test_picture_track_and_time_move_together(browser, report):
+    open_page(browser, report, "run")
+    assert NAME in browser.run("one('h1').textContent") and "amber" in browser.run("byId('verdict').className")
+    assert "Lost" not in browser.run("byId('verdict').textContent") and "39 of 40" in browser.run(
+        "one('main').innerText"
+    )
+    state = """[one('#picture img').src.split('/').at(-1), +byId('frame').value,
+        byId('time').layout.shapes.at(-1).x0, byId('track').data.at(-1).x[0]]"""
+    at_first = browser.run(state)
+    browser.run("(byId('frame').value = 3, byId('frame').oninput())")
+    browser.settle()
+    moved = browser.run(state)
+    assert moved[1] == 3 and all(a != b for a, b in zip(at_first, moved, strict=True))
+    assert moved[2] == pytest.approx(3 / 30, abs=1e-3) and "frame=3" in browser.run("location.hash")
+    for key, expected in (("ArrowRight", 4), ("ArrowLeft", 3)):
+        browser.run(f"document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}}))")
+        assert browser.run("+byId('frame').value") == expected
+    browser.run("byId('time').emit('plotly_click', {points: [{x: 1.0}]})")
+    assert browser.run("+byId('frame').value") == 30
+    browser.run("void Plotly.relayout(byId('time'), {[`shapes[${byId('time').layout.shapes.length - 1}].x0`]: 0.5})")
+    browser.settle()
+    assert browser.run("+byId('frame').value") == 15, "as by dragging the cursor"
+    browser.run("one('#worst button').click()")
+    assert browser.run("+byId('frame').value") == 39
+    browser.run("(byId('second').selectedIndex = 1, byId('second').onchange({target: byId('second')}))")
+    browser.until("byId('track').data.length === 4")
+    text = browser.run("(all('details').forEach((fold) => { fold.open = true; }), one('main').innerText)")
+    assert "dynslam-bench run ours" in text and "a log" in text and "features.levels" in text
+    browser.until("one('#poses .main-svg') && one('#stages .main-svg')")
+    assert browser.faults == []
+
+
+def test_a_failed_run_explains_itself(browser, report):
+    browser.open(report.run, anchor=f"#{run_of(report, 'DS-SLAM', 'synthetic/walking_rpy')}")
+    browser.until("byId('run-choice').children.length === 3", tries=100)
+    browser.run("(byId('run-choice').children[2].selectedIndex = 1)")
+    browser.run("byId('run-choice').children[2].dispatchEvent(new Event('change'))")
+    browser.until("byId('verdict').classList.contains('red')", tries=100)
+    assert browser.run("byId('verdict').textContent") == "Crashed at 30/120 frames: RuntimeError: the map is empty"
+    browser.until("byId('time').layout", tries=100)
+    shaded = browser.run("byId('time').layout.shapes[0]")
+    assert shaded["x0"] == pytest.approx(29 / 30, abs=0.05) and shaded["x1"] == pytest.approx(4.0)
+
+
+def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
+    victim = report.html.parent / "data" / f"run-{run_of(report, 'constant', 'synthetic/sitting_xyz')}.js"
+    victim.rename(victim.with_suffix(".away"))
+    for run_id, said in (
+        ("0" * 16, f"There is no run {'0' * 16} in this report."),
+        (victim.stem.removeprefix("run-"), "is missing beside this page"),
+    ):
+        browser.open(report.run, anchor=f"#{run_id}")
+        browser.until("one('#verdict.red')")
+        assert said in browser.run("byId('verdict').textContent")
+    victim.with_suffix(".away").rename(victim)
+
+
+def test_angles_that_only_the_alignment_made_are_not_drawn(store, tmp_path, monkeypatch):
+    run_id = add_run(store, "ours", "s/a")
+    drawn = {}
+    for least in (10.0, -1.0):  # no uncertainty is as small as the second
+        monkeypatch.setattr("dynslam_bench.reports.model.row.RELIABLE_DEG", least)
+        run = page_data(build_report(store, tmp_path / str(least)).html.parent, f"run-{run_id}")
+        titles = [axis["title"]["text"] for name, axis in run["figures"]["poses"]["layout"].items() if "yaxis" in name]
+        drawn[least] = "yaw (°)" in titles, any("No angles are drawn" in note for note in run["notes"])
+    assert drawn == {10.0: (True, False), -1.0: (False, True)}
+
+
+def test_of_too_many_runs_some_have_no_page_and_that_is_said(browser, tmp_path):
+    store = fill(tmp_path / "results", sequences=["synthetic/walking_xyz"], seeds=(0, 1))
+    paths = build_report(store, tmp_path / "report", most_pages=6)
+    pages = {path.stem.removeprefix("run-") for path in (tmp_path / "report" / "data").glob("run-*.js")}
+    text = paths.markdown.read_text()
+    assert len(pages) == 6 < len(store.ids()) and f"{len(store.ids()) - 6} of {len(store.ids())} runs have no" in text
+    assert "--most-pages 6" in (tmp_path / "report" / "reproduce.html").read_text()
+    linked = {cell[6] for cell in page_data(tmp_path / "report", "board")["cells"]}
+    assert linked and linked <= pages  # the typical run of every cell comes first
+    (pageless, *_) = sorted(set(store.ids()) - pages)
+    browser.open(paths.run, anchor=f"#{pageless}")
+    browser.until("one('#verdict.red')")
+    said = browser.run("byId('verdict').textContent")
+    assert f"Run {pageless} has no page here" in said and "--most-pages" in said
+
+
+# -- two trackers, and two results folders
+
+
+def test_two_trackers_are_compared_as_in_the_tables(browser, report):
+    a, b = (numbers_of(report, name, "toy")[0] for name in ("ORB-SLAM2", "Mask R-CNN"))
+    browser.open(report.html.parent / "compare.html", anchor=f"#a={a}&b={b}")
+    browser.until("byId('sentence').textContent.includes('against')", tries=200)
+    errors = pd.read_csv(report.csv["per_sequence"], index_col="tracker").filter(like="synthetic")
+    ratios = errors.loc["Mask R-CNN (our back end)"].astype(float) / errors.loc["ORB-SLAM2 (our back end)"].astype(
+        float
+    )
+    said = browser.run("byId('sentence').textContent")
+    gain = 100 * (1 - ratios.prod() ** (1 / len(ratios)))
+    assert f"{gain:.2g} % better on 4 sequences, too few scenes to tell." in said
+    open_page(browser, report, "compare")
+    assert browser.run("byId('pair-title').textContent") == "toy" and browser.run("all('#divided img').length") == 2
+    browser.run("byId('divider').oninput({target: {value: 80}})")
+    assert "80%" in browser.run("all('#divided img')[1].style.clipPath")
+    assert browser.run("byId('difference').data.length") == 3 and browser.faults == []
+
+
+def test_two_results_folders_are_a_page(browser, tmp_path):
+    before, after = (fill(tmp_path / name, {"orb-slam2": 0.1, "mask-rcnn": error}, seeds=(0,))
+                     for name, error in (("a", 0.02), ("b", 0.01)))  # fmt: skip
+    found = compare(before, after, output=tmp_path / "page")
+    assert found.page == tmp_path / "page" / "index.html"
+    browser.open(found.page)
+    browser.until("one('#dumbbells .main-svg')", tries=200)
+    assert browser.run("all('#choice option').length") == 3, "two trackers and the control"
+    browser.run("byId('dumbbells').emit('plotly_click', {points: [{y: byId('dumbbells').data[1].y[0]}]})")
+    browser.until("one('#difference .main-svg')", tries=200)
+    assert browser.faults == []
+
+
+def test_print_shows_all(browser, report, tmp_path):
+    open_page(browser, report, "errors")
+    browser.pdf(tmp_path / "report.pdf")
+    data = (tmp_path / "report.pdf").read_bytes()
+    assert data.startswith(b"%PDF") and len(data) > 50_000

@@ -6,39 +6,68 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
+import plotly.graph_objects as go
 import pytest
 from reports_fake_store import add_run
 from reports_rows import page_data, rows_of
 
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.reports import ReportData, build_report, compare
-from dynslam_bench.reports.html.explore import broken
+from dynslam_bench.reports.html.run_pages import broken
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import check_one_protocol
 from dynslam_bench.runs.store import RunStore
 
+PAGES = ("index", "errors", "compare", "paper", "diagnostics", "reproduce", "run")
 
-def test_the_page_is_complete_in_itself(made):
-    _, paths = made
-    text = paths.html.read_text()
-    assert re.findall(r"<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)=", text) == []
-    ids = re.findall(r'<[^<>]*\bid="([^"]+)"', re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL))
-    assert len(ids) == len(set(ids)) > 20
-    assert len(text) < 1e6
-    assert "default-src 'none'" in text and "default-src 'none'" in paths.run.read_text()
-    figures = json.loads(re.search(r"const FIGURES = (\{.*?\});\n", text, re.DOTALL)[1])
-    assert {"ratio", "speed", "masks"} <= set(figures) <= set(ids)
-    assert all(figure["data"] and figure["layout"]["height"] > 100 for figure in figures.values())
+
+def test_every_page_loads_nothing_but_what_lies_beside_it(made):
+    folder = made[1].html.parent
+    for name in PAGES:
+        text = (folder / f"{name}.html").read_text()
+        loaded = re.findall(r"<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)=\"?([^\">]+)", text)
+        assert {"assets/plotly.min.js", "assets/page.css"} <= set(loaded)
+        assert all((folder / path).is_file() for path in loaded)
+        ids = re.findall(r'<[^<>]*\bid="([^"]+)"', re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL))
+        assert len(ids) == len(set(ids)) > 0 and "default-src 'none'" in text
+        links = set(re.findall(r'href="([a-z]+\.html)[#"]', text))
+        assert links <= {f"{page}.html" for page in PAGES}
+
+
+def test_the_first_page_is_small_before_plotly(made):
+    folder = made[1].html.parent
+    text = made[1].html.read_text()
+    files = [path for path in re.findall(r'(?:src|href)="(assets/[^"]+)"', text) if "plotly" not in path]
+    assert len(files) >= 5 and len(text.encode()) + sum((folder / path).stat().st_size for path in files) < 1e6
+
+
+def test_figures_are_plotly_figures(made):
+    folder, found = made[1].html.parent, 0
+    for name in PAGES:
+        text = re.search(r"const FIGURES = (\{.*?\});</script>", (folder / f"{name}.html").read_text(), re.DOTALL)[1]
+        for figure in json.loads(text).values():
+            assert go.Figure(figure).data and figure["layout"]["height"] > 100
+            found += 1
+    assert found >= 7  # ratio, speed, masks, and four of the paper
+    for path in (folder / "data").glob("run-*.js"):
+        run = page_data(folder, path.stem)
+        for figure in run["figures"].values():
+            made_of = json.dumps(figure)
+            assert set(re.findall(r'"@(\w+)"', made_of)) <= set(run["series"])
+            filled = json.loads(re.sub(r'"@\w+"', "[1, 2]", made_of))
+            assert go.Figure(filled).data
 
 
 def test_every_run_has_its_side_file_and_a_cell_that_leads_to_it(made):
     store, paths = made
     ids = set(store.ids())
     assert {path.stem.removeprefix("run-") for path in (paths.html.parent / "data").glob("run-*.js")} == ids
-    linked = set(re.findall(r"run\.html#([0-9a-f]{16})", paths.html.read_text()))
-    assert linked <= ids and len(linked) == 22  # 5 trackers on 4 sequences, an import, and the run that failed
-    explore = page_data(paths.html.parent, "explore")
-    assert {run[0] for run in explore["runs"]} == ids and len(explore["runs"]) == len(ids)
+    errors = (paths.html.parent / "errors.html").read_text()
+    linked = set(re.findall(r"run\.html#([0-9a-f]{16})", errors))
+    assert linked <= ids and len(linked) == 21  # 5 trackers on 4 sequences, and an import
+    board = page_data(paths.html.parent, "board")
+    assert {run[0] for run in board["runs"]} == ids and len(board["runs"]) == len(ids)
+    assert {cell[6] for cell in board["cells"]} == linked
 
 
 def test_the_leaderboard_orders_and_compares(made):
@@ -59,8 +88,9 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     assert (failed["ended"], failed["reason"]) == ("crashed at 30/120", "RuntimeError: the map is empty")
     (row,) = (row for row in rows_of(paths.csv["runs"]) if row["run_id"] == failed["run"])
     assert float(row["score_m"]) == float(row["static_camera_ate_rmse_m"]) != float(row["ate_rmse_m"])
-    assert f'href="run.html#{failed["run"]}"' in paths.html.read_text()
+    assert f'href="run.html#{failed["run"]}"' in (paths.html.parent / "diagnostics.html").read_text()
     page = page_data(paths.html.parent, f"run-{failed['run']}")
+    assert (page["level"], page["verdict"]) == ("red", "Crashed at 30/120 frames: RuntimeError: the map is empty")
     assert page["log"] == (store.folder(failed["run"]) / "log.txt").read_text() == "a log\n"
     markdown = paths.markdown.read_text()
     assert "2/3 succeeded" in markdown and "counts as a static camera, or worse (1 of 61 runs)" in markdown
@@ -69,7 +99,7 @@ def test_failures_are_rows_and_count_as_not_moving(made):
 def test_a_report_can_be_made_again_under_another_protocol(made, tmp_path):
     store, paths = made
     other = build_report(store, tmp_path / "other", protocol="vslam-lab")
-    assert "Sim(3)-aligned" in other.html.read_text()
+    assert "Sim(3)-aligned" in other.html.read_text() and "SE(3)-aligned" in paths.html.read_text()
     first, second = ReportData.read(paths.data), ReportData.read(other.data)
     assert {row.protocol_digest for row in first.rows}.isdisjoint({row.protocol_digest for row in second.rows})
     assert not any(name.startswith("rpe_") for name in other.csv)
@@ -145,7 +175,7 @@ def test_published_numbers_stand_apart_and_never_compete(store, tmp_path):
     records = {name for name in names if name.endswith(" record")}
     assert records == {"lowest error found in print, real time on a CPU record"}
     assert {row["tracker"] for row in rows_of(paths.csv["leaderboard"])} == {"orb-slam2", "dynaslam"}
-    assert "Rows marked &#39;reported&#39; are published numbers" in paths.html.read_text()
+    assert "Rows marked &#39;reported&#39; are published numbers" in (paths.html.parent / "errors.html").read_text()
 
 
 # -- pieces

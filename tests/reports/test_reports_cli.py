@@ -43,7 +43,7 @@ def test_the_sequences_to_rank_on_are_a_switch(store, cli, tmp_path):
     assert "| 1–2 | 2/2 | orb-slam2 |" in common
     assert "Not ranked, since they lack sequences: orb-slam2." in everything
     assert "| – | 2/2 | orb-slam2 |" in everything
-    assert "--on all" in (tmp_path / "all" / "index.html").read_text()
+    assert "--on all" in (tmp_path / "all" / "reproduce.html").read_text()
     code, _, error = cli("report", "results", "--on", "some")
     assert (code, error) == (1, "error: --on is 'common' or 'all', got 'some'\n")
 
@@ -57,8 +57,8 @@ def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
     with pytest.raises(ReportError, match="--trials"):
         build_report(only, tmp_path / "none")
     for trials in (False, True):
-        paths = build_report(store, tmp_path / str(trials), picture_seconds=0, trials=trials)
-        text, page = paths.markdown.read_text(), paths.html.read_text()
+        paths = build_report(store, tmp_path / str(trials), trials=trials)
+        text, page = paths.markdown.read_text(), (paths.html.parent / "reproduce.html").read_text()
         assert paths.trials == (not trials) and ("Left out: 1 runs that studies made" in text) == (not trials)
         commands = page.split("The commands that")[1]
         shown = "features=500" in text, "--trials" in commands, "trial of the study &#39;mine&#39;" in page

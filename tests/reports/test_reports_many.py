@@ -9,9 +9,8 @@ from dynslam_bench.core import reading
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports import ReportData, build_report, figures
-from dynslam_bench.reports.build_report import masks_section
-from dynslam_bench.reports.html import explore
-from dynslam_bench.reports.html.explore import FEWER_PAGES, MOST_PAGES, pages_for
+from dynslam_bench.reports.build_report import FEWER_PAGES, MOST_PAGES, masks_section, pages_for
+from dynslam_bench.reports.html import board_page
 from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
@@ -36,7 +35,7 @@ def test_fifty_known_runs_cost_no_file_each(store, tmp_path, opened):
     assert opened.count("run.json") == 50
     opened.clear()
     assert len(load_runs([store], PROTOCOL).rows) == 50 and opened == []
-    build_report(store, tmp_path / "report", most_pages=7, picture_seconds=0)
+    build_report(store, tmp_path / "report", most_pages=7)
     assert opened.count("run.json") == 7  # those that have a page, and every one once
 
 
@@ -49,10 +48,10 @@ def test_of_very_many_runs_few_have_a_page():
 def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
     store = fill(tmp_path / "results", sequences=["synthetic/walking_xyz"])
     add_run(store, "dies", "synthetic/walking_xyz", status="crashed", reason="RuntimeError: no")
-    build_report(store, tmp_path / "whole", picture_seconds=0)
-    monkeypatch.setattr(explore, "MOST_LISTED", 3)
-    build_report(store, tmp_path / "short", most_pages=2, picture_seconds=0)
-    whole, short = page_data(tmp_path / "whole", "explore"), page_data(tmp_path / "short", "explore")
+    build_report(store, tmp_path / "whole")
+    monkeypatch.setattr(board_page, "MOST_LISTED", 3)
+    build_report(store, tmp_path / "short", most_pages=2)
+    whole, short = page_data(tmp_path / "whole", "board"), page_data(tmp_path / "short", "board")
     assert len(whole["runs"]) == len(store.ids()) == len(short["runs"]) + short["unlisted"] and short["unlisted"] > 5
     assert short["cells"] == whole["cells"] and whole["unlisted"] == 0
     assert {(run[1], run[2]) for run in short["runs"]} == {(cell[0], cell[1]) for cell in whole["cells"]}
@@ -70,8 +69,8 @@ def test_the_figure_of_masks_thins_many_points_and_keeps_the_best(tmp_path, monk
     whole = figures.mask_figure(board)
     monkeypatch.setattr(figures, "MOST_POINTS", 3)
     thin = figures.mask_figure(board)
-    assert {len(trace["x"]) for trace in thin["data"]} <= {2, 3} and "more than 3 runs" in str(masks_section(board))
-    assert [min(trace["y"]) for trace in thin["data"]] == [min(trace["y"]) for trace in whole["data"]]
+    assert {len(trace.x) for trace in thin.data} <= {2, 3} and "more than 3 runs" in str(masks_section(board))
+    assert [min(trace.y) for trace in thin.data] == [min(trace.y) for trace in whole.data]
 
 
 def test_csv_of_every_kind_of_column():

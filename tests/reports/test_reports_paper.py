@@ -56,10 +56,10 @@ def test_accuracy_is_what_is_left_of_not_moving(store):
 
 @pytest.mark.parametrize("statistic", FIGURES)
 def test_one_bar_a_tracker_and_sequence(store, statistic):
-    traces = {trace["name"]: trace for trace in bar_figure(load_board(store), statistic)["data"]}
-    assert all(trace["x"] == ["a", "b"] and min(trace["y"]) > 0 for trace in traces.values())
-    assert {name: trace["text"] for name, trace in traces.items()} == {
-        "ours": ["", ""], "ORB": ["", ""], "Loser": [LOST_MARK] * 2,
+    traces = {trace.name: trace for trace in bar_figure(load_board(store), statistic).data}
+    assert all(trace.x == ("a", "b") and min(trace.y) > 0 for trace in traces.values())
+    assert {name: trace.text for name, trace in traces.items()} == {
+        "ours": ("", ""), "ORB": ("", ""), "Loser": (LOST_MARK,) * 2,
     }  # fmt: skip
 
 
@@ -74,7 +74,9 @@ def test_nothing_but_failures_has_no_such_tables(tmp_path):
 def test_a_site_needs_nothing_outside_of_it(store, tmp_path, capsys):
     study = tmp_path / "study"
     (study / "csv").mkdir(parents=True)
-    (study / "index.html").write_text("<p>the study")
+    (study / "index.html").write_text('<script src="assets/page.js"></script><p>the study')
+    (study / "assets").mkdir()
+    (study / "assets" / "page.js").write_text("")
     (study / "csv" / "trials.csv").write_text("a\n1\n")
     (study / "journal.log").write_text("not for others")
     output = tmp_path / "docs" / "example"
@@ -90,6 +92,8 @@ def test_a_site_needs_nothing_outside_of_it(store, tmp_path, capsys):
     places = {str(path.relative_to(output)) for path in output.rglob("*") if path.is_file()}
     assert {"index.html", ".nojekyll", "mine.txt", "leaderboard/index.html", "study/index.html"} <= places
     assert "study/csv/trials.csv" in places and "study/journal.log" not in places
+    assert not any(place.startswith("study/assets") for place in places), "those of the report are used"
+    assert 'src="../leaderboard/assets/page.js"' in (output / "study" / "index.html").read_text()
     assert site.files == len(places) and 0 < site.size_mb < 8
     page = (output / "index.html").read_text()
     assert "A &lt;b&gt; title" in page

@@ -9,7 +9,7 @@ from reports_fake_store import add_frames, add_run
 from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
 
 from dynslam_bench.reports import build_report, load_frame
-from dynslam_bench.reports.html.explore import RunPage, error_by_share
+from dynslam_bench.reports.html.run_pages import RunPage, error_by_share
 from dynslam_bench.reports.model.board import make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.published import is_excerpt
@@ -229,13 +229,14 @@ def test_the_page_of_a_run_stacks_stages_alone_and_claims_no_share_of_people_whe
         run_id = add_run(store, name, f"s/{name}", n=40)
         add_frames(store.folder(run_id), 40, **known)
         shown[name] = run_id
-    data = build_report(store, tmp_path / "report", picture_seconds=0).html.parent / "data"
+    data = build_report(store, tmp_path / "report").html.parent / "data"
     pages = {name: (data / f"run-{run_id}.js").read_text() for name, run_id in shown.items()}
-    frames = {name: json.loads(text.partition(",")[2].removesuffix(");\n"))["frames"] for name, text in pages.items()}
-    assert {name: set(found["stages"]) for name, found in frames.items()} == {name: {"features"} for name in shown}
-    sources = {"exact": "exact masks", "own": "the tracker's own masks", "none": ""}
-    assert {name: found["share_source"] for name, found in frames.items()} == sources
-    assert {name for name, found in frames.items() if "share" in found} == {"exact", "own"}
+    runs = {name: json.loads(text.partition(",")[2].removesuffix(");\n")) for name, text in pages.items()}
+    stacked = {name: [trace["name"] for trace in run["figures"]["stages"]["data"]] for name, run in runs.items()}
+    assert stacked == {name: ["features"] for name in shown}
+    drawn = {name: [trace["name"] for trace in run["figures"]["time"]["data"]] for name, run in runs.items()}
+    people = {"exact": "exact masks", "own": "the tracker's own masks"}
+    assert {name: traces[-1] for name, traces in drawn.items() if traces[-1] in people.values()} == people
 
 
 def test_numbers_have_three_digits_and_no_more():
@@ -294,7 +295,7 @@ def test_the_frame_holds_all_runs_with_types_and_units(store, tmp_path):
 def test_who_follows_people_on_few_frames_is_not_shown_as_the_better_one():
     """The exploring page's error by the share of dynamic pixels; the follower is best on most frames."""
     share, errors_mm = np.full(100, 0.35), np.r_[np.full(90, 0.9), np.full(10, 40.0)]
-    (rmse_mm,) = (mm for mm, _ in error_by_share([RunPage("", "", False, [], share, 1e-3 * errors_mm)]) if mm)
+    (rmse_mm,) = (mm for mm, _ in error_by_share([RunPage("", "", share, 1e-3 * errors_mm)]) if mm)
     assert rmse_mm == pytest.approx(np.sqrt(np.mean(errors_mm**2)), rel=1e-3)
 
 

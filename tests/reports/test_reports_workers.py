@@ -14,7 +14,9 @@ from dynslam_bench.reports.model import load
 
 def contents(folder):
     """Every file of a report but those that hold the time when it was made."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.name not in ("index.html", "report.md")]
+    files = [
+        path for path in folder.rglob("*") if path.is_file() and path.suffix != ".html" and path.name != "report.md"
+    ]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 

@@ -6,8 +6,10 @@ import json
 import os
 import shutil
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,7 +22,7 @@ from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunStore, load_frames, score
 from dynslam_bench.runs import store as store_module
-from dynslam_bench.runs.artifacts import SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
+from dynslam_bench.runs.artifacts import PICTURE, SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
 from dynslam_bench.runs.store import FIELDS, list_runs, rescore, run_row
 
@@ -269,9 +271,10 @@ def test_trials_of_studies_are_left_out_unless_asked_for(store: RunStore) -> Non
 
 
 SHAPE = (48, 65, 3)
+IMAGE = np.full(SHAPE, 90, np.uint8)
 
 
-def outcome(index: int, error_m: float) -> FrameOutcome:
+def outcome(index: int, error_m: float | None) -> FrameOutcome:
     sample = OnlineSample(trans_m=0.0, rot_deg=0.0, frame_trans_m=error_m, frame_rot_deg=0.0)
     return FrameOutcome(index, float(index), "ok", np.eye(4), {}, {}, sample, 0.0)
 
@@ -288,7 +291,7 @@ def test_the_spread_and_the_worst_frames_come_back_as_they_were(tmp_path: Path) 
     bad = [11, 50, 51, 99, 150, 151, 152, 198]
     writer = SnapshotWriter(tmp_path, 200)
     for index in range(200):
-        writer.add(outcome(index, 1.0 + index if index in bad else 0.01), SHAPE, result(index))
+        writer.add(outcome(index, 1.0 + index if index in bad else 0.01), IMAGE, result(index))
     writer.write()
     size, shots = read_snapshots(tmp_path)
     assert size == SHAPE[:2]
@@ -301,12 +304,32 @@ def test_the_spread_and_the_worst_frames_come_back_as_they_were(tmp_path: Path) 
         assert (shot.mask is None) == (true.dynamic_mask is None)
         assert shot.mask is None or np.array_equal(shot.mask, np.asarray(true.dynamic_mask))
     assert any(shot.mask is None for shot in shots) and any(shot.mask is not None for shot in shots)
+    assert sorted(tmp_path.glob("*.webp")) == [tmp_path / PICTURE.format(shot.index) for shot in shots]
+
+
+def test_pictures_show_features_and_mask_and_the_frame_on_which_tracking_was_lost(tmp_path: Path) -> None:
+    writer = SnapshotWriter(tmp_path, 300)
+    seen = TrackResult(
+        np.eye(4), "ok", dynamic_mask=np.arange(65) < np.full((48, 1), 30),
+        keypoints_xy=np.array([[50, 20], [10, 20]], np.float32), keypoints_keep=np.array([True, False]),
+    )  # fmt: skip
+    for index in range(300):
+        state = "lost" if 100 <= index < 110 else "ok"
+        writer.add(replace(outcome(index, None if state == "lost" else 0.01), state=state), IMAGE, seen)
+    assert (tmp_path / PICTURE.format(100)).is_file(), "written at once"
+    assert not (tmp_path / PICTURE.format(101)).is_file()
+    picture = np.asarray(cv2.imread(str(tmp_path / PICTURE.format(100))), dtype=float)[:, :, ::-1]
+    yellow, plain = picture[200, 60:120].mean(axis=0), picture[250, 350:].mean(axis=0)
+    assert yellow[:2].min() > yellow[2] + 30 and np.ptp(plain) < 10
+    static, dynamic = (picture[115:131, x - 8 : x + 8].reshape(-1, 3) for x in (308, 62))
+    assert (static[:, 2] - static[:, 0]).max() > 40, "blue"
+    assert (dynamic[:, 0] - dynamic[:, 1]).max() > 40, "red"
 
 
 def test_trackers_that_show_nothing_leave_no_file(tmp_path: Path) -> None:
     writer = SnapshotWriter(tmp_path, 2)
     for index in range(2):
-        writer.add(outcome(index, 0.1), SHAPE, TrackResult(np.eye(4), "ok"))
+        writer.add(outcome(index, 0.1), IMAGE, TrackResult(np.eye(4), "ok"))
     writer.write()
     assert not (tmp_path / SNAPSHOTS_FILE).exists()
     assert read_snapshots(tmp_path) == ((0, 0), [])

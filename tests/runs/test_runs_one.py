@@ -26,7 +26,8 @@ def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=3, settings={"noise.clip": 3.0}), store)
     assert (record.status, record.reason, record.n_frames, record.n_tracked, record.coverage) == ("ok", "", 60, 60, 1.0)
     folder = store.folder(record.run_id)
-    assert sorted(path.name for path in folder.iterdir()) == [
+    assert len(list(folder.glob("frame_*.webp"))) >= 24
+    assert sorted(path.name for path in folder.iterdir() if path.suffix != ".webp") == [
         "frames.csv",
         "log.txt",
         "run.json",

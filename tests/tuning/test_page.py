@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import optuna
 import pytest
+import simulated
+from optuna.trial import TrialState
+from reports_browser import Browser, needs_browser
 
 from dynslam_bench.core.settings import Parameter
-from dynslam_bench.tuning import Tuner
+from dynslam_bench.tuning import Tuner, finish, write_page
 from dynslam_bench.tuning.instances import ProblemInstance
 from dynslam_bench.tuning.page import fewer_starts, settings_table, warnings_of
 from dynslam_bench.tuning.splits import Design, with_more_starts
@@ -57,3 +61,28 @@ def test_the_table_holds_default_chosen_and_range() -> None:
     assert [column.name for column in table.columns] == ["setting", "baseline", "best trial", "range", "unit"]
     unproven = settings_table(SPACE, default, {}, False)
     assert unproven.rows[0][2].text == "–" and "keep the baseline" in unproven.caption
+
+
+@needs_browser
+def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None:
+    tuner = simulated.SimulatedTuner(simulated.make_spec(trials=12), tmp_path)
+    tuner.run()
+    summary = finish(tuner)
+    browser = Browser(tmp_path / "profile")
+    try:
+        for width in (1440, 390):
+            browser.open(write_page(tuner, summary), width)
+            browser.run("all('.figure').forEach((figure) => figure.scrollIntoView())")
+            browser.until("all('.figure').every((figure) => figure.querySelector('.main-svg'))", tries=200)
+            assert browser.faults == [] and browser.run("document.documentElement.scrollWidth") == width
+        assert browser.run("one('.verdict').textContent") == summary.conclusion
+        stages = browser.run("byId('result-1').layout.xaxis.ticktext")
+        confirmed, held_out = (
+            sum(getattr(candidate, split) is not None for candidate in summary.candidates)
+            for split in ("confirm", "held_out")
+        )
+        complete = len(tuner.study.get_trials(states=(TrialState.COMPLETE,)))
+        assert stages == [f"tried: {complete} whole trials", f"confirmed: {confirmed}", f"held out: {held_out}"]
+        assert len(browser.run("all('.figure').map((figure) => figure.id)")) >= 6
+    finally:
+        browser.close()

@@ -1,108 +1,94 @@
-// What every page has: theme, the view in the address, figures drawn when they come into sight, tables that sort.
-const make = (tag, properties = {}, ...children) => {
+// What all pages share: the theme, figures, sortable tables, data beside the page, the view in the address.
+"use strict";
+const byId = (id) => document.getElementById(id);
+const select = (selector, from = document) => [...from.querySelectorAll(selector)];
+
+function make(tag, properties = {}, ...children) {
   const element = Object.assign(document.createElement(tag), properties);
   element.append(...children);
   return element;
-};
+}
 
-/** A name that may be broken behind its dots, underlines and slashes. */
-const breakable = (name) => name.split(/(?<=[/_.])/).flatMap((piece, at) => (at ? [make("wbr"), piece] : [piece]));
-
-/** The address behind #: an anchor, and the view as name=value pairs. */
+// -- the view in the address: #anchor&name=value
 const address = {
-  read() {
-    const [anchor, ...rest] = location.hash.slice(1).split("&");
-    return { anchor: anchor.includes("=") ? "" : anchor, view: new URLSearchParams(anchor.includes("=") ? location.hash.slice(1) : rest.join("&")) };
-  },
-  write(view, anchor = this.read().anchor) {
-    const kept = new URLSearchParams([...view].filter(([, value]) => value !== ""));
-    history.replaceState(null, "", `#${[anchor, kept.toString()].filter(Boolean).join("&")}`);
+  read() { return new URLSearchParams(location.hash.slice(1)); },
+  write(changes) {
+    const view = address.read();
+    for (const [name, value] of Object.entries(changes)) value === "" || value === null ? view.delete(name) : view.set(name, value);
+    history.replaceState(null, "", `#${view.toString().replace(/=(?=&|$)/g, "")}`);
   },
 };
 
-function useTheme() {
-  const root = document.documentElement, button = document.querySelector(".theme");
-  const themes = ["auto", "light", "dark"];
-  const stored = () => { try { return localStorage.getItem("dynslam-theme"); } catch { return null; } };
-  const set = (theme) => {
-    if (theme === "auto") delete root.dataset.theme; else root.dataset.theme = theme;
-    button.textContent = { auto: "◐ Auto", light: "☀ Light", dark: "☾ Dark" }[theme];
-    dispatchEvent(new Event("themechange"));
-  };
-  let now = themes.includes(stored()) ? stored() : "auto";
-  set(now);
-  button.addEventListener("click", () => {
-    now = themes[(themes.indexOf(now) + 1) % themes.length];
-    try { localStorage.setItem("dynslam-theme", now); } catch { button.title = "This browser keeps nothing for pages of a folder"; }
-    set(now);
+// -- data that lie beside the page: a page in a folder may load scripts, but no JSON
+const loading = {}, loaded = {};
+function keep(name, value) { loaded[name](value); }
+function side(name) {
+  loading[name] ??= new Promise((done, fail) => {
+    loaded[name] = done;
+    document.head.append(make("script", { src: `data/${name}.js`, onerror: () => fail(new Error(`data/${name}.js is missing beside this page.`)) }));
   });
+  return loading[name];
 }
 
-function draw(element) {
-  if (element.dataset.drawn) return;
-  const figure = FIGURES[element.id];
-  if (!figure) return;
-  element.dataset.drawn = "1";
-  drawChart(element, figure);
+// -- figures in the page's theme
+const drawn = new Map();
+const scheme = () => document.documentElement.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+
+async function draw(element, figure) {
+  drawn.set(element, figure);
+  const layout = { ...figure.layout, template: THEMES[scheme()], autosize: true };
+  if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: -0.3, yanchor: "top", ...layout.legend };
+  const options = { format: "png", scale: 2, filename: element.id };
+  await Plotly.react(element, figure.data, layout, { responsive: true, displaylogo: false, toImageButtonOptions: options });
 }
 
-const inSight = new IntersectionObserver((entries) => {
-  for (const entry of entries) if (entry.isIntersecting) { draw(entry.target); inSight.unobserve(entry.target); }
-}, { rootMargin: "500px" });
+/** The figures of the page, each when it comes into sight. */
+function drawFigures() {
+  const sight = new IntersectionObserver((entries) => entries.filter((entry) => entry.isIntersecting).forEach(({ target }) => {
+    sight.unobserve(target);
+    draw(target, FIGURES[target.id]);
+  }), { rootMargin: "300px" });
+  select(".figure").filter((element) => FIGURES[element.id]).forEach((element) => sight.observe(element));
+  for (const place of select(".save")) {
+    for (const format of ["png", "svg"]) {
+      const save = () => Plotly.downloadImage(byId(place.dataset.figure), { format, scale: 2, filename: place.dataset.figure });
+      place.append(make("button", { type: "button", textContent: format.toUpperCase(), onclick: save }));
+    }
+  }
+}
 
-function sortBy(table, column, header) {
-  const body = table.tBodies[0], up = header.getAttribute("aria-sort") !== "ascending";
-  table.querySelectorAll("th").forEach((th) => th.removeAttribute("aria-sort"));
-  header.setAttribute("aria-sort", up ? "ascending" : "descending");
-  const key = (row) => {
-    const cell = row.cells[column];
-    if (cell.dataset.v !== undefined) return Number(cell.dataset.v);
-    const text = cell.textContent.trim();
-    return text === "" || text === "–" ? null : text;
+function startTheme() {
+  const button = byId("theme"), themes = ["", "light", "dark"], names = { "": "◐ Auto", light: "☀ Light", dark: "☾ Dark" };
+  const show = (theme) => {
+    document.documentElement.dataset.theme = theme;
+    document.documentElement.classList.toggle("dark", scheme() === "dark"); // DataTables' own switch
+    button.textContent = names[theme];
+    drawn.forEach((figure, element) => element.isConnected && draw(element, figure));
   };
-  const rows = [...body.rows];
-  rows.sort((a, b) => {
-    const x = key(a), y = key(b);
-    if (x === null || y === null) return (x === null) - (y === null);
-    const order = typeof x === "number" && typeof y === "number" ? x - y : String(x).localeCompare(String(y), "en", { numeric: true });
-    return up ? order : -order;
-  });
-  rows.forEach((row) => { row.classList.remove("line"); body.append(row); });
+  let theme = "";
+  try { theme = localStorage.getItem("theme") ?? ""; } catch { /* a browser may refuse */ }
+  button.onclick = () => {
+    theme = themes[(themes.indexOf(theme) + 1) % 3];
+    try { localStorage.setItem("theme", theme); } catch { /* a browser may refuse */ }
+    show(theme);
+  };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => show(theme));
+  show(theme);
 }
 
-function makeSortable(table) {
-  const heads = [...table.tHead.rows].at(-1).cells;
-  [...heads].forEach((head, column) => head.querySelector("button")?.addEventListener("click", () => sortBy(table, column, head)));
-}
+// -- tables: what is missing stays last, a third click restores the order
+const last = (way) => (a, b) => (a === "" || b === "" ? (a === "") - (b === "") : way * (a - b));
+Object.assign(DataTable.ext.type.order, { "number-asc": last(1), "number-desc": last(-1) });
+const TABLE = { paging: false, info: false, autoWidth: false, order: [], layout: { topStart: null, topEnd: null, bottomStart: null, bottomEnd: null } };
 
-/** Everything is drawn and unfolded for print; tables that are too wide for the sheet are made smaller. */
-function preparePrint() {
-  document.querySelectorAll("main details:not(.toolbar details, .tracks)").forEach((fold) => { if (!fold.open) { fold.open = true; fold.dataset.shut = "1"; } });
-  document.querySelectorAll(".figure").forEach(draw);
-  const room = 1045;  // the inner width of A4 across, in CSS pixels
-  for (const table of document.querySelectorAll("main table")) table.style.zoom = String(Math.min(1, room / Math.max(table.scrollWidth, 1)));
+function sortable(table, options = {}) {
+  return new DataTable(table, { ...TABLE, columnDefs: [{ targets: ".n", type: "number", className: "n" }], ...options });
 }
 
 function startPage() {
-  useTheme();
-  document.querySelectorAll(".figure").forEach((element) => inSight.observe(element));
-  document.querySelectorAll("main table").forEach(makeSortable);
-  addEventListener("beforeprint", preparePrint);
-  addEventListener("afterprint", () => {
-    document.querySelectorAll("main table").forEach((table) => { table.style.zoom = ""; });
-    document.querySelectorAll("details[data-shut]").forEach((fold) => { fold.open = false; delete fold.dataset.shut; });
-  });
-  const links = [...document.querySelectorAll("nav a[href^='#']")];
-  for (const link of links)
-    link.addEventListener("click", (event) => {
-      event.preventDefault();
-      address.write(address.read().view, link.hash.slice(1));
-      document.getElementById(link.hash.slice(1))?.scrollIntoView();
-    });
-  const wanted = document.getElementById(address.read().anchor);
-  if (wanted) wanted.scrollIntoView();
-  const seen = new IntersectionObserver((entries) => entries.forEach((entry) => {
-    if (entry.isIntersecting) links.forEach((link) => link.classList.toggle("here", link.hash === `#${entry.target.id}`));
-  }), { rootMargin: "-20% 0px -70%" });
-  links.forEach((link) => { const part = document.getElementById(link.hash.slice(1)); if (part) seen.observe(part); });
+  startTheme();
+  select("table.sorts").forEach((table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {}));
+  addEventListener("DOMContentLoaded", drawFigures);
+  addEventListener("beforeprint", () => select("details").forEach((fold) => { fold.open = true; }));
 }
+startPage();

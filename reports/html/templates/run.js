@@ -1,123 +1,176 @@
-// The page of one run: whichever its address names.
-const $ = (id) => document.getElementById(id);
-const section = (id, title, ...children) => make("section", { id }, make("h2", { textContent: title }), ...children);
-const figure = (id, caption) => {
-  const place = make("div", { id, className: "figure" });
-  place.dataset.label = caption;
-  return make("figure", {}, place, make("figcaption", { textContent: caption }));
+// The page of a run: picture, track and time move together.
+"use strict";
+const NUMBERS = { f4: Float32Array, i4: Int32Array };
+function decode({ dtype, bdata }) {
+  return new NUMBERS[dtype](Uint8Array.from(atob(bdata), (character) => character.charCodeAt(0)).buffer);
+}
+
+/** A figure whose "@name" are the run's series. */
+function filled(value, series) {
+  if (typeof value === "string" && value[0] === "@") return series[value.slice(1)];
+  if (Array.isArray(value)) return value.map((each) => filled(each, series));
+  if (value === null || typeof value !== "object") return value;
+  return Object.fromEntries(Object.entries(value).map(([name, each]) => [name, filled(each, series)]));
+}
+
+async function loadRun(id) {
+  const run = await side(`run-${id}`);
+  if (!run.read) {
+    run.series = Object.fromEntries(Object.entries(run.series).map(([name, packed]) => [name, decode(packed)]));
+    run.figures = filled(run.figures, run.series);
+    run.read = true;
+  }
+  return run;
+}
+
+const nearest = (values, value) => values.reduce((best, each, at) => (Math.abs(each - value) < Math.abs(values[best] - value) ? at : best), 0);
+const pictureOf = (id, frame) => `frames/${id}/frame_${String(frame).padStart(6, "0")}.webp`;
+
+/** The position on the track at a time; nothing far from any pose. */
+function marker(run, t) {
+  const { track_t: times, track_x: x, track_y: y, track_z: z } = run.series;
+  const at = times ? nearest(times, t) : -1;
+  return { type: "scatter3d", mode: "markers", x: at < 0 ? [] : [x[at]], y: at < 0 ? [] : [y[at]], z: at < 0 ? [] : [z[at]], marker: { size: 6, color: "#e69f00", line: { width: 1, color: "#000" } }, showlegend: false, hoverinfo: "skip" };
+}
+
+const chooser = (name, options, value, onchange) => {
+  const list = make("select", { ariaLabel: name, onchange: ({ target }) => onchange(target.value) }, ...options.map(([key, text]) => make("option", { value: key, textContent: text })));
+  list.value = value;
+  return list;
 };
-const show = (id, specification) => { FIGURES[id] = specification; inSight.observe($(id)); };
-const table = (heads, rows, kind = "n") => {
-  const made = make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((name, at) => make("th", { className: at ? kind : "", scope: "col", textContent: name })))),
-    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((value, at) => make("td", { className: at ? kind : "sticky" }, ...(at ? [value] : breakable(value))))))));
-  return make("div", { className: "scroll", tabIndex: 0 }, made);
-};
+const rowsOf = (heads, rows) => make("div", { className: "scroll" }, make("table", { className: "plain-table" }, make("thead", {}, make("tr", {}, ...heads.map((text) => make("th", { textContent: text })))), make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((text) => make("td", { textContent: text ?? "" })))))));
+const fold = (title, ...parts) => make("details", { className: "fold" }, make("summary", { textContent: title }), ...parts);
 
-/** Choices that lead to the other runs of this tracker and this sequence, and to the same cell of others. */
-function addChoices(all, id) {
-  const here = all.runs.find((run) => run[0] === id);
-  if (!here) return null;
-  const [, tracker, sequence] = here, paged = all.runs.filter((run) => run === here || !(run[5] & 4));
-  const nearest = (fits) => paged.filter(fits).sort((a, b) => (b[3] === here[3]) - (a[3] === here[3]))[0];
-  const choice = (name, entries, chosen) => {
-    const select = make("select", { ariaLabel: name }, ...entries.map(([value, text]) => make("option", { value, textContent: text, selected: value === chosen })));
-    select.addEventListener("change", () => { location.hash = select.value; });
-    return make("label", { className: "check" }, `${name} `, select);
-  };
-  const trackers = all.trackers.flatMap((entry, at) => { const run = nearest((r) => r[1] === at && r[2] === sequence); return run ? [[run[0], entry.label]] : []; });
-  const sequences = all.sequences.flatMap((entry, at) => { const run = nearest((r) => r[2] === at && r[1] === tracker); return run ? [[run[0], entry.name]] : []; });
-  const repeats = paged.filter((run) => run[1] === tracker && run[2] === sequence).map((run) => [run[0], run[3] + (run[4] ? ` (${run[4]})` : "")]);
-  const own = (entries, at) => entries.find(([value]) => all.runs.find((run) => run[0] === value)[at] === here[at])?.[0];
-  $("run-choice").replaceChildren(choice("Tracker", trackers, own(trackers, 1)), choice("Sequence", sequences, own(sequences, 2)), choice("Repeat", repeats, id));
-  return { label: all.trackers[tracker].label, colour: all.trackers[tracker].colour, sequence: all.sequences[sequence].name, repeat: here[3], pictured: here[5] & 2, paged: !(here[5] & 4) };
+class RunView {
+  constructor(board, run, where) {
+    Object.assign(this, { board, run, where });
+    this.frames = run.series.index ?? run.series.track_t ?? [];
+    this.times = run.series.t ?? run.series.track_t ?? [];
+    this.second = null;
+  }
+
+  async show() {
+    const { run } = this, slider = byId("frame");
+    slider.max = Math.max(this.times.length - 1, 0);
+    slider.oninput = () => this.move(+slider.value);
+    byId("back").onclick = () => this.move(this.at - 1);
+    byId("on").onclick = () => this.move(this.at + 1);
+    document.onkeydown = (event) => {
+      if (event.target.matches("input, select") || !["ArrowLeft", "ArrowRight"].includes(event.key)) return;
+      event.preventDefault();
+      this.move(this.at + (event.key === "ArrowRight" ? 1 : -1));
+    };
+    byId("worst").replaceChildren(...(run.worst.length ? ["worst frames: "] : []), ...run.worst.map(([frame, error]) => make("button", { type: "button", textContent: `${frame} (${error} mm)`, onclick: () => this.move(nearest(this.frames, frame)) })));
+    byId("picture").hidden = !run.pictures.length;
+    for (const name of ["track", "time"]) byId(name).hidden = !run.figures[name];
+    const wanted = address.read().get("frame");
+    this.at = wanted ? nearest(this.frames, +wanted) : run.worst.length ? nearest(this.frames, run.worst[0][0]) : 0;
+    await this.drawTrack();
+    if (run.figures.time) {
+      await draw(byId("time"), { ...run.figures.time, layout: { ...run.figures.time.layout, shapes: [...run.figures.time.layout.shapes, this.cursor()] } });
+      byId("time").removeAllListeners?.("plotly_click");
+      byId("time").on("plotly_click", ({ points }) => this.move(nearest(this.times, points[0].x)));
+      byId("time").on("plotly_relayout", (change) => {
+        const moved = Object.entries(change).find(([name]) => name === `shapes[${run.figures.time.layout.shapes.length}].x0`);
+        if (moved) this.move(nearest(this.times, moved[1]));
+      });
+    }
+    this.move(this.at, false);
+  }
+
+  cursor() {
+    const t = this.times[this.at] ?? 0;
+    return { type: "line", x0: t, x1: t, y0: 0, y1: 1, yref: "paper", line: { color: "#e69f00", width: 3 }, editable: true };
+  }
+
+  async drawTrack() {
+    const { figures } = this.run;
+    if (!figures.track) return;
+    const other = this.second?.figures.track?.data.filter(({ name }) => name === "estimate").map((trace) => ({ ...trace, name: this.second.label.replace(/</g, "&lt;"), showlegend: true, line: { color: "#cc79a7", width: 4 } })) ?? [];
+    await draw(byId("track"), { data: [...figures.track.data, ...other, marker(this.run, this.times[this.at] ?? 0)], layout: figures.track.layout });
+  }
+
+  move(at, write = true) {
+    if (!this.times.length) return;
+    const { run } = this;
+    this.at = Math.max(0, Math.min(this.times.length - 1, at));
+    byId("frame").value = this.at;
+    const t = this.times[this.at], frame = run.series.index?.[this.at];
+    if (run.pictures.length) {
+      const shown = run.pictures[nearest(run.pictures, frame ?? 0)], image = document.querySelector("#picture img");
+      image.src = pictureOf(run.id, shown);
+      image.alt = `Frame ${shown} as the tracker saw it`;
+      document.querySelector("#picture figcaption").textContent = `Frame ${frame} at ${t.toFixed(2)} s${shown === frame ? "" : `; the nearest picture is of frame ${shown}`}`;
+    }
+    if (run.figures.time && byId("time").layout) {
+      const place = `shapes[${run.figures.time.layout.shapes.length}]`;
+      if (byId("time").layout.shapes[run.figures.time.layout.shapes.length].x0 !== t) Plotly.relayout(byId("time"), { [`${place}.x0`]: t, [`${place}.x1`]: t });
+    }
+    if (run.figures.track) {
+      const last = byId("track").data.length - 1, { x, y, z } = marker(run, t);
+      Plotly.restyle(byId("track"), { x: [x], y: [y], z: [z] }, [last]);
+    }
+    if (write && frame !== undefined) address.write({ frame });
+  }
 }
 
-function factsOf(run) {
-  const cards = run.facts.map(([name, value, unit]) => make("div", { className: "card" }, make("b", { textContent: `${Number.isInteger(value) ? value : digits(value)}${unit && ` ${unit}`}` }), make("span", { textContent: name })));
-  const parts = [make("div", { className: "cards" }, ...cards)];
-  if (run.reason || run.ending) parts.unshift(make("p", { className: "note", textContent: [run.ending, run.reason].filter(Boolean).join(": ") }));
-  if (run.command) parts.push(make("h3", { textContent: "Make it again" }), make("pre", { tabIndex: 0, textContent: run.command }));
-  if (run.notes.length) parts.push(make("ul", { className: "plain" }, ...run.notes.map((note) => make("li", { textContent: note }))));
-  return section("s-facts", "Numbers", ...parts);
+function showFolds(run) {
+  const figure = (name) => make("div", { className: "figure", id: name });
+  const times = run.stages.map(([name, ...values]) => [name, ...values.map((value) => value?.toPrecision(3))]);
+  const parts = [
+    fold("Make it again", make("pre", { tabIndex: 0, textContent: run.command || "It was imported." }), make("p", { className: "caption", textContent: `Started ${run.started}. ${run.machine}. ${run.asked ? `Asked for by: ${run.asked}` : ""}` })),
+    fold(`Settings (${run.settings.filter(([, , changed]) => changed).length} changed)`, rowsOf(["setting", "value", ""], run.settings.map(([name, value, changed]) => [name, String(value), changed ? "changed" : ""]))),
+    fold("More numbers and diagnostics", rowsOf(["number", "value"], run.more), make("ul", { className: "plain" }, ...run.notes.map((note) => make("li", { textContent: note }))), make("p", { className: "caption", textContent: run.protocol })),
+    ...(run.figures.poses ? [fold("Position and rotation", figure("poses"))] : []),
+    ...(times.length ? [fold("Time by stage", ...(run.figures.stages ? [figure("stages")] : []), rowsOf(["stage", "median ms", "p95 ms", "mean ms"], times))] : []),
+    fold("Log", make("pre", { tabIndex: 0, textContent: run.log || "The run wrote nothing." })),
+    ...(run.files.length ? [make("p", { className: "caption" }, "Files: ", ...run.files.flatMap(([name, href]) => [make("a", { href, textContent: name }), " "]))] : []),
+  ];
+  byId("folds").replaceChildren(...parts);
+  for (const name of ["poses", "stages"]) byId(name)?.closest("details").addEventListener("toggle", ({ target }) => target.open && draw(byId(name), run.figures[name]), { once: true });
 }
 
-function settingsOf(run) {
-  const asked = new Set(run.overrides);
-  const rows = Object.entries(run.settings).map(([name, value]) => [name + (asked.has(name) ? " *" : ""), String(value)]);
-  if (!rows.length) return section("s-settings", "Settings", make("p", { className: "waiting", textContent: "None are recorded." }));
-  return section("s-settings", "Settings", table(["setting", "value"], rows, "words"), make("p", { className: "caption", textContent: "* asked for in place of the default." }));
-}
-
-const logOf = (run) => section("s-log", "Log", make("pre", { tabIndex: 0, textContent: run.log || "The run wrote nothing." }),
-  make("p", { className: "caption", textContent: [`Started ${run.started}`, run.machine, run.asked && `asked for by: ${run.asked}`].filter(Boolean).join(". ") }));
-
-function stagesOf(run) {
-  if (!run.stages.length) return [];
-  const rows = run.stages.map(([name, ...times]) => [name, ...times.map((time) => digits(time))]);
-  const parts = [table(["stage", "median ms", "p95 ms", "mean ms"], rows), make("p", { className: "caption", textContent: "total is the frame time: segmentation included, read (decoding) excluded; processor is what all its threads took." })];
-  if (run.frames.stages) parts.unshift(figure("stage-stack", "Time of every frame, stage above stage; the first frames, which load and compile, may rise above the figure."));
-  return [section("s-stages", "Time by stage", ...parts)];
-}
-
-function timeOf(run) {
-  if (!run.frames.t && !run.track.t) return [];
-  const share = run.frames.share ? `, and the share of the image that shows people (${run.frames.share_source})` : "";
-  return [section("s-time", "Over time", figure("over-time", `Errors frame by frame${share}; features and matches where the tracker tells them. Lines have gaps where frames were lost.`),
-    ...(run.track.xyz ? [figure("poses", `Position, and rotation from the first true pose; the truth in grey.${run.track.doubt ? ` ${run.track.doubt}` : ""}`)] : []))];
-}
-
-function spreadOf(run) {
-  return run.track.error_mm ? [section("s-spread", "How the error is spread", figure("spread", "Absolute error of the tracked frames: how many frames have it, and the share of frames below it."))] : [];
-}
-
-function trackOf(run) {
-  if (!run.track.xyz) return [section("s-track", "Track", make("p", { className: "waiting", textContent: run.track.reason ?? "Nothing was tracked." }))];
-  const canvas = make("canvas", { className: "view3d", tabIndex: 0, ariaLabel: "The track in a 3-D view, coloured by its error; arrow keys turn it" });
-  canvas.setAttribute("role", "img");
-  const most = run.track.error_mm ? Math.max(quantile(run.track.error_mm.filter((value) => value !== null).sort((a, b) => a - b), 0.98), 1e-3) : 0;
-  const ramp = make("span", { className: "ramp" });
-  ramp.style.background = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(rampColour).join(", ")})`;
-  const keys = run.track.error_mm ? [make("div", { className: "keys" }, "0", ramp, `${digits(most)} mm and more`, make("span", {}, "grey: true path"))] : [];
-  return [section("s-track", "Track", make("div", { className: "grid-2" },
-    make("div", {}, canvas, ...keys, make("p", { className: "caption", textContent: `Drag or use the arrow keys to turn it. ${run.track.alignment ? `Aligned (${run.track.alignment}).` : "No ground truth: as the tracker gave it."}` })),
-    make("div", { id: "annotations" })))];
-}
-
-async function render(id) {
-  const main = $("run");
+async function showRun(id) {
+  const verdict = byId("verdict");
   try {
-    const all = await side("explore"), where = addChoices(all, id);
-    if (!where && id && all.unlisted) throw new Error(`Run ${id} has no page here, if it is in this report at all. ${all.pageless}`);
-    if (!where) throw new Error(id ? `There is no run ${id} in this report.` : "No run is named behind # in the address.");
-    if (!where.paged) throw new Error(`Run ${id} has no page here. ${all.pageless}`);
-    const run = unpacked(await side(`run-${id}`));
-    document.title = `${where.label} on ${where.sequence}`;
-    $("run-title").textContent = document.title;
-    const tag = make("span", { className: `tag ${run.status === "ok" ? "here" : "bad"}`, textContent: run.ending || run.status });
-    $("run-line").replaceChildren(tag, ` ${where.repeat} · run ${id} · ${run.protocol}`);
-    main.replaceChildren(factsOf(run), ...trackOf(run), ...timeOf(run), ...spreadOf(run), ...stagesOf(run),
-      section("s-frames", "Frames", make("div", { id: "frames" })), settingsOf(run), logOf(run));
-    drawRunFigures(run, where);
-    main.querySelectorAll("table").forEach((each) => each.classList.add("plain-table"));
-    await showAnnotations(id, run, where, startView3D(run));
-    document.querySelectorAll("nav a").forEach((link) => { link.hidden = !document.querySelector(link.getAttribute("href")); });
-  } catch (error) { main.replaceChildren(make("p", { className: "note", textContent: error.message })); }
-}
-
-function startView3D(run) {
-  const canvas = document.querySelector(".view3d");
-  if (!canvas) return null;
-  const errors = run.track.error_mm ?? null;
-  const view3d = new View3D(canvas, run.track.xyz, run.track.true_xyz ?? null, errors, errors ? Math.max(quantile(errors.filter((value) => value !== null).sort((a, b) => a - b), 0.98), 1e-3) : 1);
-  view3d.draw();
-  return view3d;
+    const board = await side("board"), own = board.runs.find((run) => run[0] === id);
+    if (!own) throw new Error(board.unlisted ? `Run ${id} has no page here, if it is in this report at all. ${board.pageless}` : id ? `There is no run ${id} in this report.` : "No run is named behind # in the address.");
+    if (!(own[5] & 1)) throw new Error(`Run ${id} has no page here. ${board.pageless}`);
+    const [, tracker, sequence, repeat, ending] = own, run = await loadRun(id);
+    const go = (to) => { location.hash = to; };
+    const first = (test) => board.runs.find((each) => each[5] & 1 && test(each))?.[0];
+    const options = (at, names, test) => [...new Set(board.runs.filter((each) => each[5] & 1 && test(each)).map((each) => each[at]))].map((key) => [key, names[key]]);
+    const labels = board.trackers.map(({ label }) => label), names = board.sequences.map(({ name }) => name);
+    const same = board.runs.filter((each) => each[1] === tracker && each[2] === sequence && each[5] & 1);
+    document.title = `${labels[tracker]} on ${names[sequence]}`;
+    byId("run-title").textContent = document.title;
+    byId("run-choice").replaceChildren(
+      chooser("Tracker", options(1, labels, (each) => each[2] === sequence), tracker, (key) => go(first((each) => each[1] === +key && each[2] === sequence))),
+      chooser("Sequence", options(2, names, (each) => each[1] === tracker), sequence, (key) => go(first((each) => each[1] === tracker && each[2] === +key))),
+      chooser("Repeat", same.map((each) => [each[0], `${each[3]}${each[4] ? `: ${each[4]}` : ""}`]), id, go));
+    verdict.className = `verdict ${run.level}`;
+    verdict.textContent = run.verdict;
+    byId("run").hidden = false;
+    byId("numbers").replaceChildren(...run.numbers.map(([name, value]) => make("div", { className: "card" }, make("b", { textContent: value }), make("span", { textContent: name }))));
+    const view = new RunView(board, run, { repeat, ending });
+    const others = board.cells.filter((cell) => cell[1] === sequence && cell[0] !== tracker && board.runs.some((each) => each[0] === cell[6] && each[5] & 1));
+    byId("second").replaceWith(Object.assign(chooser("Second tracker", [["", "none"], ...others.map((cell) => [cell[6], labels[cell[0]]])], "", async (other) => {
+      view.second = other ? { ...(await loadRun(other)), label: labels[others.find((cell) => cell[6] === other)[0]] } : null;
+      view.drawTrack();
+    }), { id: "second" }));
+    showFolds(run);
+    await view.show();
+  } catch (error) {
+    verdict.className = "verdict red";
+    verdict.textContent = error.message;
+    byId("run").hidden = true;
+  }
 }
 
 function startRun() {
-  const now = () => address.read().anchor;
-  const known = (id) => /^[0-9a-f]{16}$/.test(id);
-  let shown = known(now()) ? now() : "";
-  document.querySelectorAll("nav a").forEach((link) => link.addEventListener("click", () => history.replaceState(null, "", `#${shown}`)));
-  addEventListener("hashchange", () => { if (known(now()) && now() !== shown) { shown = now(); render(shown); } });
-  render(shown);
+  const wanted = () => [...address.read().keys()].find((key) => /^[0-9a-f]{16}$/.test(key)) ?? "";
+  let shown = wanted();
+  addEventListener("hashchange", () => { if (wanted() !== shown) showRun((shown = wanted())); });
+  addEventListener("DOMContentLoaded", () => showRun(shown));
 }
+if (byId("run")) startRun();

@@ -1,0 +1,306 @@
+"""The first page of a report: the ranking by category, and what the pages of errors, runs and comparisons read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy
+from markupsafe import Markup
+
+from dynslam_bench.core.toml import setting_text
+from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.reports.figures import significant
+from dynslam_bench.reports.model.board import Board, Cell
+from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
+from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
+from dynslam_bench.reports.tables.leaderboard import leaderboard, middle, rank_cell, run_link, timed
+from dynslam_bench.reports.tables.table import TableCell, number
+
+MOST_LISTED = 5000
+"""Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of the board.
+
+    Attributes:
+        at: Number of the tracker on all pages.
+        group: 0 for ranked trackers, 1 for others, 2 for controls (bounds), which stand below the line.
+        name: Name; leads to its run with the median error on the first sequence that it has.
+        kind: How it was made, in a word or two.
+        rank: Ranks that the data leave open.
+        ratio: Error as a ratio to the reference, with its interval.
+        bar: The same drawn.
+        verdict: Whether it is better than the reference.
+        success: Runs that succeeded of all.
+        coverage: Share of tracked frames.
+        time: Milliseconds of a frame.
+        memory: Peak memory in MB.
+        by_category: Its ratio in each category, drawn.
+    """
+
+    at: int
+    group: int
+    name: TableCell
+    kind: TableCell
+    rank: TableCell
+    ratio: TableCell
+    bar: Markup
+    verdict: TableCell
+    success: TableCell
+    coverage: TableCell
+    time: TableCell
+    memory: TableCell
+    by_category: Markup
+
+
+def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol: Protocol) -> list[Entry]:
+    """The rows of one category.
+
+    Args:
+        board: Of the category.
+        whole: Of all sequences: the numbers of trackers.
+        boards: Of all categories, for the column that shows them side by side.
+        protocol: How errors were computed.
+    """
+    keys = [*whole.trackers, *whole.final_only]
+    standings = {standing.key: standing for standing in board.standings}
+    limits = _limits([s.ratio for s in board.standings])
+    table = leaderboard(board, protocol)
+    names = [column.name for column in table.columns]
+    entries = []
+    for key, row in zip(board.trackers, table.rows, strict=True):
+        standing, cells, runs = standings.get(key), dict(zip(names, row, strict=True)), board.cells[key]
+        first = board.first(key)
+        start = next((runs[name].typical for name in board.sequences if name in runs), first)
+        kind = TableCell("imported") if first.imported else cells["provenance"]
+        ended = [run for run in board.runs(key) if not run.failed]
+        entries.append(
+            Entry(
+                at=keys.index(key),
+                group=2 if first.tracker.provenance == "control" else int(key not in board.ranked),
+                name=replace(cells["tracker"], link=run_link(start)),
+                kind=kind,
+                rank=TableCell("–") if standing is None else rank_cell(standing),
+                ratio=_ratio_cell(board, key, standing),
+                bar=Markup("") if standing is None else interval_bar(standing.ratio, limits),
+                verdict=cells["better?"]
+                if key not in board.no_better
+                else TableCell("no", "no better than a static camera"),
+                success=cells["success"],
+                coverage=cells["coverage"],
+                time=number(middle(run.frame_ms for run in timed(ended)), ".1f"),
+                memory=cells["MB"],
+                by_category=_by_category(key, boards),
+            )
+        )
+    return sorted(entries, key=lambda entry: entry.group)
+
+
+def _ratio_cell(board: Board, key: str, standing: Standing | None) -> TableCell:
+    if key in board.hopeless:
+        return TableCell("nothing succeeded", emphasis="failed")
+    if standing is None or not math.isfinite(standing.ratio.value):
+        return TableCell()
+    ratio = standing.ratio
+    tip = f"95 % interval {ratio.low:.2f} to {ratio.high:.2f}" if math.isfinite(ratio.low) else ""
+    missing = standing.sequences < len(board.common)
+    small = f"{standing.sequences} of {len(board.common)} sequences" if missing else ""
+    return TableCell(f"{ratio.value:.2f}", small, ratio.value, tip=tip)
+
+
+def _limits(ratios: Sequence[Interval]) -> tuple[float, float]:
+    """Ends of the axis of interval bars, in logarithms; 1 lies between them."""
+    ends = [end for ratio in ratios for end in (ratio.value, ratio.low, ratio.high) if math.isfinite(end) and end > 0]
+    low, high = min([0.8, *ends]), max([1.25, *ends])
+    return math.log(max(low, 0.02)), math.log(min(high, 20.0))
+
+
+def interval_bar(ratio: Interval, limits: tuple[float, float]) -> Markup:
+    """A ratio with its interval on a logarithmic axis, and a line at 1."""
+    if not math.isfinite(ratio.value):
+        return Markup("")
+
+    def x(value: float) -> str:
+        share = (math.log(max(value, FLOOR_M)) - limits[0]) / (limits[1] - limits[0])
+        return f"{4 + 112 * min(max(share, 0.0), 1.0):.1f}"
+
+    better = "worse" if ratio.value >= 1 else "better"
+    line = ""
+    if math.isfinite(ratio.low):
+        line = f'<line x1="{x(ratio.low)}" x2="{x(ratio.high)}" y1="8" y2="8" class="{better}"/>'
+    dot = f'<circle cx="{x(ratio.value)}" cy="8" r="3.6" class="{better}"/>'
+    one = f'<line x1="{x(1.0)}" x2="{x(1.0)}" y1="0" y2="16" class="one"/>'
+    return Markup(f'<svg class="bar" viewBox="0 0 120 16" aria-hidden="true">{one}{line}{dot}</svg>')
+
+
+def _by_category(key: str, boards: Mapping[str, Board]) -> Markup:
+    """A dot a category: its height is the ratio there, the line in the middle is 1; empty for a single category."""
+    ratios = [
+        (name, standing.ratio.value)
+        for name, board in list(boards.items())[1:]
+        for standing in board.standings
+        if standing.key == key and math.isfinite(standing.ratio.value)
+    ]
+    if not ratios:
+        return Markup("")
+    words = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios)
+    dots = []
+    for at, (_, ratio) in enumerate(ratios):
+        y = 12 + 9 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0)
+        kind = "worse" if ratio >= 1 else "better"
+        dots.append(f'<circle cx="{8 + 14 * at}" cy="{24 - y:.1f}" r="3.6" class="{kind}"/>')
+    width = 14 * len(ratios) + 4
+    one = f'<line x1="0" x2="{width}" y1="12" y2="12" class="one"/>'
+    shape = f'<svg class="spark" viewBox="0 0 {width} 24" style="width: {width}px" role="img"'
+    title = Markup("<title>{}</title>").format(words)
+    return Markup(f"{shape}>{title}{one}{''.join(dots)}</svg>")
+
+
+# -- what the pages of errors, runs and comparisons read
+
+
+def side_content(
+    board: Board, boards: Mapping[str, Board], protocol: Protocol, paged: set[str], pictured: set[str], pageless: str
+) -> dict[str, Any]:
+    """What ``data/board.js`` holds: trackers, sequences, cells and runs.
+
+    Args:
+        board: The board.
+        boards: Of its categories.
+        protocol: How errors were computed.
+        paged: Ids of the runs that have a page.
+        pictured: Ids of those whose pictures lie beside it.
+        pageless: Which runs have no page, in words.
+    """
+    keys, names = [*board.trackers, *board.final_only], [*board.sequences, *board.unscored]
+    place, column = ({name: at for at, name in enumerate(items)} for items in (keys, names))
+    metrics = _metrics(protocol)
+    first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
+    all_listed = len(board.rows) <= MOST_LISTED  # a page of a hundred thousand would open slowly
+    listed = [row for row in board.rows if all_listed or row.run_id in paged or row.run_id in first]
+    ordered = sorted(listed, key=lambda row: (place[row.variant_key], column[board.sequence(row)], row.repeat_key))
+    tags = {
+        name: {tag for row in rows for tag in row.sequence.tags}
+        for name, rows in grouped(board.rows, board.sequence).items()
+    }
+    categories = {category: {column[name] for name in some.sequences} for category, some in list(boards.items())[1:]}
+    return {
+        "protocol": protocol.describe(),
+        "seen": SEEN,
+        "pageless": pageless,
+        "reference": board.reference_name,
+        "referenceAt": None if board.reference is None else place[board.reference],
+        "metrics": metrics,
+        "trackers": [_tracker(board, key) for key in keys],
+        "sequences": [
+            {"name": name, "short": board.short.get(name, name), "tags": sorted(tags[name]),
+             "static": significant(board.static_camera.get(name))}
+            for name in names
+        ],
+        "categories": {category: sorted(members) for category, members in categories.items()},
+        "cells": [
+            _cell(cell, place[key], column[name], metrics, board.rank_seen)
+            for key in keys
+            for name, cell in board.cells[key].items()
+        ],
+        "runs": [
+            [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat, row.ending,
+             (row.run_id in paged) + 2 * (row.run_id in pictured)]
+            for row in ordered
+        ],
+        "unlisted": len(board.rows) - len(listed),
+    } | _quantiles(len(names))  # fmt: skip
+
+
+def _cell(cell: Cell, tracker: int, sequence: int, metrics: Sequence[Mapping[str, str]], rank_seen: bool) -> list[Any]:
+    """Place, runs, failures, what speaks against it, the median of every number, typical run, the error's quartiles."""
+    doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.in_training and not rank_seen)
+    medians = [significant(middle(_value(row, metric) for row in cell.kept)) for metric in metrics]
+    quartiles = np.percentile(cell.scores, [25, 75]).tolist() if len(cell.scores) > 1 else []
+    place = [tracker, sequence, len(cell.rows), cell.failed, doubt]
+    return [*place, medians, cell.typical.run_id, [significant(value) for value in quartiles]]
+
+
+def _tracker(board: Board, key: str) -> dict[str, Any]:
+    first = board.first(key)
+    return {
+        "label": board.labels[key],
+        "id": first.tracker.id,
+        "ranked": key in board.ranked,
+        "imported": first.imported,
+        "control": first.tracker.provenance == "control",
+        "settings": {name: setting_text(value) for name, value in first.variant.items()},
+    }
+
+
+def _metrics(protocol: Protocol) -> list[dict[str, str]]:
+    """The numbers to choose from: of the online and of the final trajectory."""
+    numbers = [("ATE", "m", "ate_rmse_m")]
+    for spec in protocol.rpe:
+        numbers.append((f"RPE over {spec.describe()}", "m/s" if spec.rate else "m", spec.metric("trans")))
+    for spec in protocol.rpe:
+        numbers.append((f"RPE over {spec.describe()}, rotation", "deg/s" if spec.rate else "deg", spec.metric("rot")))
+    numbers.append(("absolute rotation", "deg", "ape_rot_rmse_deg"))
+    return [
+        {"name": name, "unit": unit, "key": key, "which": which}
+        for which in ("online", "final")
+        for name, unit, key in numbers
+    ]
+
+
+def _value(row: RunRow, metric: Mapping[str, str]) -> float | None:
+    """A run's number; only the ATE that ranks counts failures."""
+    if metric["which"] != row.trajectory:
+        return None if row.failed else row.final_metrics.get(metric["key"])
+    if metric["key"] == "ate_rmse_m":
+        return row.score_m
+    return None if row.failed else row.metrics.get(metric["key"])
+
+
+def pairs_content(
+    compared: Mapping[str, Sequence[tuple[str, Cell, Cell]]], protocol: str, paged: set[str]
+) -> dict[str, Any]:
+    """What ``data/board.js`` of two results folders side by side holds: two trackers for every one that is compared.
+
+    Args:
+        compared: Tracker to its sequences with the runs of both sides.
+        protocol: How errors were computed, in words.
+        paged: Ids of the runs that have a page.
+    """
+    names = sorted({name for pairs in compared.values() for name, *_ in pairs})
+    trackers: list[dict[str, Any]] = []
+    cells, runs = [], []
+    metric = {"name": "ATE", "unit": "m", "key": "ate_rmse_m", "which": "online"}
+    for label, pairs in compared.items():
+        for side, letter in enumerate("AB"):
+            first = pairs[0][1:][side].rows[0]
+            settings = {name: setting_text(value) for name, value in first.variant.items()}
+            for name, *sides in pairs:
+                cell, place = sides[side], (len(trackers), names.index(name))
+                cells.append(_cell(cell, *place, [metric | {"which": cell.rows[0].trajectory}], True))
+                row = cell.typical
+                runs.append([row.run_id, *place, row.repeat, row.ending, 3 * (row.run_id in paged)])
+            trackers.append({"label": f"{letter}: {label}", "id": first.tracker.id, "settings": settings})
+    return {
+        "protocol": protocol,
+        "pageless": "",
+        "unlisted": 0,
+        "pairs": [[at, at + 1] for at in range(0, len(trackers), 2)],
+        "trackers": trackers,
+        "sequences": [{"name": name, "short": name, "tags": []} for name in names],
+        "cells": cells,
+        "runs": runs,
+    } | _quantiles(len(names))
+
+
+def _quantiles(sequences: int) -> dict[str, Any]:
+    """Student's quantiles for intervals over up to so many sequences, and how many an interval needs."""
+    freedom = np.maximum(np.arange(sequences + 1) - 1, 1)
+    quantiles = np.asarray(scipy.stats.t.ppf(0.975, freedom))
+    return {"fewest": FEWEST, "quantiles": [significant(quantile) for quantile in quantiles.tolist()]}

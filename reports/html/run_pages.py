@@ -1,0 +1,640 @@
+"""Pages of runs: what a page shows of a run is written beside it, one script and one folder of pictures a run."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
+from dynslam_bench.evaluation.evaluate import pose_errors
+from dynslam_bench.evaluation.protocol import Protocol, RPESpec
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
+from dynslam_bench.reports.html.page import write_side
+from dynslam_bench.reports.model.load import JOB, run_jobs
+from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
+from dynslam_bench.reports.tables.table import mm, significant_text
+from dynslam_bench.runs.artifacts import VIDEO_FILE
+from dynslam_bench.runs.exchange.recording import RECORDING_FILE
+from dynslam_bench.runs.frames import CSV_FILE
+from dynslam_bench.runs.record import RunRecord
+
+Array = NDArray[np.float64]
+
+RUN_PAGE = "run.html"
+SHARE_EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 1.0)
+"""Bins of the share of dynamic pixels."""
+FEWEST_FRAMES = 5
+"""Frames below which a bin shows nothing."""
+MOST_FRAMES = 400
+"""About how many frames of a run its page shows."""
+WORST = 6
+"""Frames that a page offers to jump to, those with the largest frame-to-frame error."""
+_LOG_BYTES = 20_000
+_WHOLE = ("total_s", "processor_s", "read_s")
+"""Times of a frame that are no stage of it: the figure stacks stages."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunPage:
+    """What the report needs of a run whose page was written.
+
+    Attributes:
+        run_id: The run.
+        variant_key: Its tracker and settings.
+        share: Share of dynamic pixels ``[N]`` of its frames, of a successful run where exact masks tell it.
+        errors_m: Frame-to-frame translational errors ``[N]`` of these frames.
+    """
+
+    run_id: str
+    variant_key: str
+    share: Array
+    errors_m: Array
+
+
+def write_run_pages(
+    rows: Sequence[RunRow],
+    pictured: Collection[str],
+    protocol: Protocol,
+    output: Path,
+    pool: Executor | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[RunPage]:
+    """Write what the pages of some runs show: ``data/run-<id>.js``, and their pictures.
+
+    Args:
+        rows: The runs.
+        pictured: Ids of the runs whose pictures are copied.
+        protocol: How errors are computed.
+        output: Folder of the report.
+        pool: Workers that write the pages; None to write them here.
+        progress: Called with the runs that are done, and all.
+
+    Raises:
+        DynslamError: The folder cannot be written, or a run's files are damaged.
+    """
+    newest = sorted(sorted(rows, key=lambda row: row.started, reverse=True), key=lambda row: row.offset)
+    shares = {column: exact_shares(runs) for column, runs in grouped(newest, lambda row: row.column_id).items()}
+    jobs = []
+    for column, runs in grouped(rows, lambda row: row.column_id).items():
+        for first in range(0, len(runs), JOB):
+            jobs.append((runs[first : first + JOB], pictured, shares[column], protocol, output))
+    pages: list[RunPage] = []
+    for written in run_jobs(pool, _write_pages, jobs):
+        pages += written
+        progress(len(pages), len(rows))
+    return pages
+
+
+def _write_pages(
+    rows: Sequence[RunRow], pictured: Collection[str], share: Mapping[int, float], protocol: Protocol, output: Path
+) -> list[RunPage]:
+    """Write the pages of some runs of one column, whose frames have these exact shares of dynamic pixels."""
+    pages = []
+    for row in rows:
+        record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
+        pictures = _copy_pictures(row, output) if row.run_id in pictured else []
+        content = run_content(row, record, frames, protocol, pictures)
+        write_side(output, f"run-{row.run_id}", content | {"files": _files(row, output)})
+        exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share)
+        exact &= (frames.share_source == EXACT) & (not row.failed)
+        pages.append(RunPage(row.run_id, row.variant_key, frames.share[exact], frames.errors_m[exact]))
+    return pages
+
+
+def _copy_pictures(row: RunRow, output: Path) -> list[int]:
+    """Copy the pictures of a run beside its page; returns their frames."""
+    frames = []
+    for source in sorted(row.folder.glob("frame_*.webp")):
+        target = output / "frames" / row.run_id / source.name
+        if not target.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, target)
+        frames.append(int(source.stem.removeprefix("frame_")))
+    return frames
+
+
+def _files(row: RunRow, output: Path) -> list[tuple[str, str]]:
+    """Name and relative path of the run's files, where the report lies in the results folder of the run."""
+    if not output.resolve().is_relative_to(row.store.root.resolve()):
+        return []
+    names = {
+        "trajectory": f"trajectory_{row.trajectory}.txt",
+        "video": VIDEO_FILE,
+        "rerun recording": RECORDING_FILE,
+        "frames.csv": CSV_FILE,
+    }
+    folder = Path(os.path.relpath(row.folder.resolve(), output.resolve())).as_posix()
+    return [(name, f"{folder}/{file}") for name, file in names.items() if (row.folder / file).is_file()]
+
+
+def error_by_share(pages: Sequence[RunPage]) -> list[list[float | None]]:
+    """RMSE in mm and number of frames of each bin between `SHARE_EDGES`, over some runs; empty for no frame.
+
+    Not the median: a tracker that follows people errs grossly on few frames, and best of all on most.
+    """
+    share = np.concatenate([np.zeros(0), *(page.share for page in pages)])
+    errors_m = np.concatenate([np.zeros(0), *(page.errors_m for page in pages)])
+    if not len(share):
+        return []
+    at = np.clip(np.searchsorted(SHARE_EDGES, share, side="right") - 1, 0, len(SHARE_EDGES) - 2)
+    bins: list[list[float | None]] = []
+    for number in range(len(SHARE_EDGES) - 1):
+        inside = errors_m[at == number]
+        rmse_mm = 1000 * float(np.sqrt(np.mean(inside**2))) if len(inside) >= FEWEST_FRAMES else None
+        bins.append([significant(rmse_mm, 4), len(inside)])
+    return bins
+
+
+# -- what the page of a run shows
+
+
+def run_content(
+    row: RunRow, record: RunRecord, frames: RunFrames, protocol: Protocol, pictures: Sequence[int] = ()
+) -> dict[str, Any]:
+    """Everything that the page of a run shows, as the page's script reads it.
+
+    Series of numbers stand once, under ``series``; the figures name them (``"@x"``).
+
+    Args:
+        row: The run.
+        record: Its whole record.
+        frames: Its frames.
+        protocol: How its errors are computed.
+        pictures: Frames that have a picture.
+    """
+    series, lost = _series(frames, pictures)
+    start = float(frames.columns["timestamp"][0]) if frames.columns else None
+    track, fault = _track(row, protocol, start)
+    level, verdict = verdict_of(row, frames)
+    settings = {name: value if isinstance(value, str | int | bool) else str(value)
+                for name, value in record.settings.items()}  # fmt: skip
+    changed = [name for name in settings if name in record.overrides]
+    figures = {
+        "time": _time_figure(row, frames, series, track, lost),
+        "track": _track_figure(track),
+        "poses": _poses_figure(row, track),
+        "stages": _stages_figure(series),
+    }
+    return {
+        "id": row.run_id,
+        "level": level,
+        "verdict": verdict,
+        "numbers": _numbers(row, protocol.rpe),
+        "more": _more_numbers(row, record),
+        "settings": [[name, settings[name], name in changed] for name in dict.fromkeys([*changed, *settings])],
+        "stages": [
+            [name, *(significant(1000 * value) for value in (time.median_s, time.p95_s, time.mean_s))]
+            for name, time in record.timings.items()
+        ],
+        "protocol": protocol.describe(),
+        "started": row.started,
+        "machine": row.machine_words,
+        "notes": [*row.notes, *filter(None, [frames.fault, fault, _rotation_doubt(row)])],
+        "command": run_command(row),
+        "asked": command_line(row.command),
+        "log": _log(row),
+        "pictures": list(pictures),
+        "worst": _worst(frames),
+        "series": {
+            name: packed(values, "i4" if name == "index" else "f4") for name, values in (series | track).items()
+        },
+        "figures": {name: figure for name, figure in figures.items() if figure},
+    }
+
+
+Level = Literal["red", "amber", "green"]
+
+
+def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
+    """How a run ended, and why, in one sentence, with its level: failed, something to know, or nothing."""
+    length = f"{row.sequence.duration_s:.1f} s"
+    if row.failed:
+        reason = f": {row.reason}" if row.reason else ""
+        if row.status == "lost":
+            return "red", f"{_loss(frames, length) or 'Lost'}. {row.ending.capitalize()}{reason}"
+        return "red", f"{row.ending.capitalize()} frames{reason}" if row.status != "ok" else f"Not evaluated{reason}"
+    score, static = row.score_m, row.static_camera_ate_rmse_m
+    error = "No ground truth" if score is None else f"ATE {mm(score)} mm"
+    if score is not None and static:
+        error += f", {significant_text(100 * score / static, 2)} % of a static camera's"
+    lost = row.n_frames - row.n_tracked
+    if score is not None and static and score >= static:
+        return "amber", f"No better than a static camera: {error}"
+    if row.coverage < 1:
+        loss = _loss(frames, length)
+        return "amber", f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}" + f". {loss}" * bool(loss)
+    if row.hints:
+        return "amber", f"{error}, but the trajectory is probably faulty: {row.hints[0]}"
+    return "green", f"All {row.n_frames} frames tracked: {error}" if not lost else f"Tracked: {error}"
+
+
+def _loss(frames: RunFrames, length: str) -> str:
+    """When tracking was lost first, and what the frame showed; empty where it was not."""
+    if not frames.columns:
+        return ""
+    states = frames.columns["state"]
+    lost = np.flatnonzero(states == "lost")
+    if not len(lost):
+        return ""
+    at = int(lost[0])
+    seconds = frames.columns["timestamp"][at] - frames.columns["timestamp"][0]
+    facts = []
+    inliers = frames.columns.get("stat_inliers")
+    if inliers is not None and np.isfinite(inliers[at]):
+        facts.append(f"{inliers[at]:.0f} inliers")
+    if np.isfinite(frames.share[at]):
+        who = "people fill" if frames.share_source == EXACT else "its masks cover"
+        facts.append(f"{who} {100 * frames.share[at]:.0f} %")
+    return f"Lost after {seconds:.1f} s of {length}" + (f": {' while '.join(facts)}" if facts else "")
+
+
+def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
+    """The six numbers of a run: name and text."""
+    score, static = row.score_m, row.static_camera_ate_rmse_m
+    relative = next(
+        ((spec, row.metrics[spec.metric("trans")]) for spec in rpe if spec.metric("trans") in row.metrics), None
+    )
+    numbers = {
+        "ATE, a failure's" if row.failed else "ATE, lost frames held": "" if score is None else f"{mm(score)} mm",
+        "of a static camera's": "" if score is None or not static else f"{significant_text(100 * score / static)} %",
+        f"RPE over {relative[0].describe()}" if relative else "RPE": (
+            "" if relative is None else f"{mm(relative[1])} mm{'/s' * relative[0].rate}"
+        ),
+        "coverage": f"{100 * row.coverage:.1f} %",
+        "time of a frame": "" if row.frame_ms is None else f"{significant_text(row.frame_ms)} ms",
+        "memory": "" if row.peak_memory_mb is None else f"{row.peak_memory_mb:.0f} MB",
+    }
+    return [[name, text or "–"] for name, text in numbers.items()]
+
+
+def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
+    """What else is known of a run."""
+    numbers = [
+        ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, " mm"),
+        ("ATE of the final trajectory", row.final_ate_m, 1000, " mm"),
+        ("real time", row.real_time_factor, 1, " ×"),
+        ("keyframes", record.keyframes, 1, ""),
+        ("map points", record.map_points, 1, ""),
+        ("overlap (IoU) of undilated masks", row.mask_iou, 1, ""),
+    ]
+    return [[name, f"{value * by:.4g}{unit}"] for name, value, by, unit in numbers if value is not None]
+
+
+def _log(row: RunRow) -> str:
+    path = row.folder / "log.txt"
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        skipped = max(file.seek(0, os.SEEK_END) - _LOG_BYTES, 0)
+        file.seek(skipped)
+        text = file.read(_LOG_BYTES)
+    return (f"... {skipped} bytes before\n" if skipped else "") + text.decode(errors="replace")
+
+
+def _worst(frames: RunFrames) -> list[list[float | None]]:
+    """Index and error in mm of the frames with the largest frame-to-frame error."""
+    errors = np.nan_to_num(frames.errors_m, nan=-1.0)
+    order = [at for at in np.argsort(-errors, kind="stable")[:WORST].tolist() if errors[at] >= 0]
+    return [[int(frames.columns["index"][at]), significant(1000 * errors[at], 3)] for at in order]
+
+
+def _rotation_doubt(row: RunRow) -> str:
+    """Why no angles are drawn; empty where they are."""
+    if row.rotation_reliable:
+        return ""
+    return (
+        "No angles are drawn: the path hardly determines the alignment's rotation (standard error "
+        f"{row.rotation_uncertainty_deg:.0f}°). Positions are not affected."
+    )
+
+
+# -- series and figures of a run
+
+Series = dict[str, Any]
+
+
+def _series(frames: RunFrames, pictures: Sequence[int]) -> tuple[Series, list[tuple[float, float]]]:
+    """The frames over time, thinned but for those with a picture; and the spans in which tracking was lost."""
+    columns = frames.columns
+    if not columns:
+        return {}, []
+    index, stamps = columns["index"], columns["timestamp"] - columns["timestamp"][0]
+    tracked = columns["state"] == "ok"
+    keep = (np.arange(len(index)) % -(-len(index) // MOST_FRAMES) == 0) | np.isin(index, pictures)
+    series = {
+        "index": index,
+        "t": stamps,
+        "frame_error": np.where(tracked, 1000 * frames.errors_m, np.nan),
+        "share": 100 * frames.share,
+    }
+    series |= {name: columns[f"stat_{name}"] for name in COUNTS if f"stat_{name}" in columns}
+    stages = [name for name in columns if name.endswith("_s") and name not in _WHOLE]
+    series |= {name: 1000 * columns[name] for name in stages if np.nanmax(columns[name], initial=0.0) > 0}
+    lost = np.flatnonzero(np.diff(np.concatenate([[0], np.isin(columns["state"], ("lost", "dropped")), [0]])))
+    ends = np.append(stamps, stamps[-1])
+    spans = [(float(stamps[first]), float(ends[last])) for first, last in lost.reshape(-1, 2).tolist()]
+    return {name: values[keep] for name, values in series.items()}, spans
+
+
+def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series, str]:
+    """The aligned track and the whole true path over the time since `start`, and why there is none.
+
+    Without ground truth the track is as the tracker gave it. Where the time between two poses exceeds twice the median
+    interval, all series have a gap.
+    """
+    truth, estimate = row.ground_truth(), row.estimate(row.trajectory)
+    longest = truth or estimate
+    first = start if start is not None else 0.0 if longest is None else float(longest.timestamps[0])
+    series: Series = {}
+    if truth is not None and len(truth) > 1:
+        columns = np.column_stack([truth.positions, _angles(truth, truth)])
+        series |= _along("true", truth.timestamps - first, columns)
+    if estimate is None or len(estimate) < 2:
+        return series, ""
+    error_mm = np.full(len(estimate), np.nan)
+    if truth is not None and row.metrics:
+        try:
+            estimate, _, errors = pose_errors(estimate, truth, protocol)
+        except DynslamError as error:
+            return series, str(error)
+        error_mm = 1000 * errors["trans_m"]
+    columns = np.column_stack([estimate.positions, _angles(estimate, truth or estimate), error_mm])
+    return series | _along("track", estimate.timestamps - first, columns), ""
+
+
+def _along(name: str, stamps: Array, columns: Array) -> Series:
+    """Time, position, angles and error along a track, thinned and broken at gaps."""
+    stamps, values = broken(stamps, columns, MOST_FRAMES)
+    names = ("x", "y", "z", "yaw", "pitch", "roll", "error")[: values.shape[1]]
+    return {f"{name}_t": stamps} | {f"{name}_{part}": values[:, at] for at, part in enumerate(names)}
+
+
+def _line(name: str, x: str, y: str, colour: str, axis: int, **more: Any) -> dict[str, Any]:
+    line = {"color": colour, "width": 1.8} | more.pop("line", {})
+    place = {"xaxis": "x", "yaxis": f"y{axis if axis > 1 else ''}"}
+    return {"type": "scatter", "mode": "lines", "name": name, "x": f"@{x}", "y": f"@{y}", "line": line} | place | more
+
+
+def _time_figure(
+    row: RunRow, frames: RunFrames, series: Series, track: Series, lost: Sequence[tuple[float, float]]
+) -> dict[str, Any]:
+    """Error, inliers and people's share on one time axis, lost spans shaded."""
+    unit = {"hovertemplate": "%{y:.3g} at %{x:.2f} s<extra>%{fullData.name}</extra>"}
+    panels: list[tuple[str, list[tuple[str, str, str, str, dict[str, Any]]]]] = [
+        ("error (mm)", [("absolute error", "track_t", "track_error", COLOURS[1], {}),
+                        ("frame-to-frame error", "t", "frame_error", COLOURS[0], {"line": {"dash": "dot"}})]),
+        ("features", [("inliers", "t", "inliers", COLOURS[2], {}),
+                      ("dynamic (culled)", "t", "culled", COLOURS[1], {"line": {"dash": "dash"}})]),
+        ("people (%)", [(frames.share_source, "t", "share", COLOURS[4], {"fill": "tozeroy"})]),
+    ]  # fmt: skip
+    columns = series | track
+    shown = [
+        (title, drawn)
+        for title, lines in panels
+        if (drawn := [line for line in lines if line[2] in columns and np.isfinite(columns[line[2]]).any()])
+    ]
+    if not shown:
+        return {}
+    traces = [
+        _line(name, x, y, colour, axis, **more, **unit)
+        for axis, (_, lines) in enumerate(shown, 1)
+        for name, x, y, colour, more in lines
+    ]
+    height = 1 / len(shown)
+    layout: dict[str, Any] = {
+        "height": 60 + 150 * len(shown),
+        "hovermode": "x",
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom"},
+        "xaxis": {"title": {"text": "time (s)"}, "anchor": f"y{len(shown) if len(shown) > 1 else ''}"},
+        "shapes": [_shade(*span) for span in lost],
+    }
+    for at, (title, _) in enumerate(shown):
+        domain = [1 - (at + 1) * height + 0.02, 1 - at * height - 0.02]
+        layout[f"yaxis{at + 1 if at else ''}"] = {"title": {"text": title}, "domain": domain, "rangemode": "tozero"}
+    times = columns.get("t", columns.get("track_t"))
+    if row.failed and times is not None and row.n_processed < row.n_frames:  # the rest was never seen
+        layout["shapes"].append(_shade(float(times[-1]), row.sequence.duration_s))
+    return {"data": traces, "layout": layout}
+
+
+def _shade(start: float, end: float) -> dict[str, Any]:
+    """A span of time that is shaded over all panels."""
+    span = {"x0": round(start, 4), "x1": round(end, 4), "y0": 0, "y1": 1, "yref": "paper"}
+    return {"type": "rect", "fillcolor": COLOURS[1], "opacity": 0.18, "line": {"width": 0}, "layer": "below"} | span
+
+
+HEAT = {
+    "colorscale": [[0, COLOURS[0]], [0.5, "#b9b3aa"], [1, COLOURS[1]]],
+    "cmin": 0,
+    "cmax": 3,
+    "colorbar": {"title": {"text": "error (mm)"}, "tickvals": [0, 1, 2, 3], "ticktext": ["1", "10", "100", "1000"],
+                 "thickness": 12, "len": 0.6},
+}  # fmt: skip
+"""Colours of an error along a track, by its logarithm: the same scale for all runs."""
+
+
+def _track_figure(track: Series) -> dict[str, Any]:
+    """The track in space, coloured by its error, beside the whole true path."""
+    data = []
+    if "true_t" in track:
+        data.append(_path("true path", "true", {"color": NEUTRAL, "width": 3}))
+    if "track_t" in track:
+        track["track_heat"] = np.log10(np.maximum(track["track_error"], 1e-3))
+        measured = bool(np.isfinite(track["track_error"]).any())
+        line: dict[str, Any] = HEAT | {"color": "@track_heat"} if measured else {"color": COLOURS[0]}
+        path = _path("estimate", "track", line | {"width": 6}, "%{customdata:.3g} mm<extra></extra>")
+        data.append(path | {"customdata": "@track_error", "showlegend": not measured})
+    axes = {f"{name}axis": {"title": {"text": f"{name} (m)"}} for name in "xyz"}
+    view = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.7, "y": -1.4, "z": -1.8}}
+    scene = axes | {"aspectmode": "data", "camera": view}
+    legend = {"orientation": "h", "y": 0, "x": 0}
+    layout = {"height": 430, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}, "scene": scene, "legend": legend}
+    return {"data": data, "layout": layout} if data else {}
+
+
+def _path(name: str, part: str, line: dict[str, Any], hover: str = "") -> dict[str, Any]:
+    place: dict[str, Any] = {axis: f"@{part}_{axis}" for axis in "xyz"}
+    extra: dict[str, Any] = {"hovertemplate": hover} if hover else {"hoverinfo": "skip"}
+    return {"type": "scatter3d", "mode": "lines", "name": name, "line": line} | place | extra
+
+
+def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
+    """Position and angles over time, beside the true ones; angles only where the alignment determines them."""
+    if "track_t" not in track:
+        return {}
+    parts = {"x": "x (m)", "y": "y (m)", "z": "z (m)"}
+    parts |= {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"} if row.rotation_reliable else {}
+    data, layout = [], {"height": 130 * len(parts), "xaxis": {"title": {"text": "time (s)"}}, "showlegend": False}
+    for at, (part, title) in enumerate(parts.items(), 1):
+        if "true_t" in track:
+            data.append(_line("truth", "true_t", f"true_{part}", NEUTRAL, at, line={"dash": "dash"}))
+        data.append(_line("estimate", "track_t", f"track_{part}", COLOURS[0], at))
+        domain = [1 - at / len(parts) + 0.01, 1 - (at - 1) / len(parts) - 0.01]
+        layout[f"yaxis{at if at > 1 else ''}"] = {"title": {"text": title}, "domain": domain}
+    layout["xaxis"] |= {"anchor": f"y{len(parts)}"}
+    return {"data": data, "layout": layout}
+
+
+def _stages_figure(series: Series) -> dict[str, Any]:
+    """Time of every frame, stage upon stage."""
+    stages = [name for name in series if name.endswith("_s")]
+    data = [
+        _line(
+            name.removesuffix("_s"), "t", name, COLOURS[at % len(COLOURS)], 1, stackgroup="stages", line={"width": 0.5}
+        )
+        for at, name in enumerate(stages)
+    ]
+    if not data:
+        return {}
+    total = np.nansum([series[name] for name in stages], axis=0)
+    top = min(float(total.max()), 2.5 * float(np.quantile(total, 0.8))) or 1.0
+    axes = {"xaxis": {"title": {"text": "time (s)"}}, "yaxis": {"title": {"text": "ms"}, "range": [0, 1.05 * top]}}
+    return {"data": data, "layout": {"height": 360} | axes}
+
+
+def broken(stamps: Array, values: Array, most: int) -> tuple[Array, Array]:
+    """Thin a series and put NaN where the time between two poses exceeds twice the median interval.
+
+    Args:
+        stamps: Seconds ``[N]``.
+        values: ``[N, K]``.
+        most: About how many points to keep.
+
+    Returns:
+        Stamps ``[M]`` and values ``[M, K]`` with NaN rows in the gaps.
+    """
+    if len(stamps) < 3:
+        return stamps, values
+    intervals = np.diff(stamps)
+    piece = np.concatenate([[0], np.cumsum(intervals > 2 * np.median(intervals))])
+    keep = np.arange(len(stamps)) % max(1, -(-len(stamps) // most)) == 0
+    edge = np.diff(piece) > 0
+    keep |= np.append(edge, True) | np.append(True, edge)  # the ends of every piece stay
+    kept = np.flatnonzero(keep)
+    breaks = np.flatnonzero(np.diff(piece[kept]) > 0) + 1
+    middle = (stamps[kept][breaks - 1] + stamps[kept][breaks]) / 2
+    return (
+        np.insert(stamps[kept], breaks, middle),
+        np.insert(values[kept], breaks, np.nan, axis=0),
+    )
+
+
+def _angles(track: Trajectory, true: Trajectory) -> Array:
+    """Yaw, pitch and roll (about the camera's y, x and z) from the first true pose, in degrees ``[N, 3]``."""
+    turned = true.T_world_cam[0, :3, :3].T @ track.T_world_cam[:, :3, :3]
+    return np.asarray(np.degrees(np.unwrap(Rotation.from_matrix(turned).as_euler("YXZ"), axis=0)))
+
+
+# -- the frames of a run, from its ``frames.csv``
+
+Columns = dict[str, NDArray[Any]]
+
+COUNTS = ("culled", "inliers")
+_STATS = {f"stat_{name}" for name in (*COUNTS, "mask_fraction")}
+_NEEDED = {"index", "timestamp", "state", "frame_error_trans_m"}
+EXACT = "exact masks"
+_ASKED = 5
+"""Runs of a column that are asked for the exact shares of its frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunFrames:
+    """The frames of a run.
+
+    Attributes:
+        columns: What the page shows of ``frames.csv``, a name to values ``[N]``; empty for an imported trajectory.
+        errors_m: Frame-to-frame translational errors ``[N]`` in metres, nan where there is none.
+        share: Share of the pixels that show people ``[N]``, nan where it is not known.
+        share_source: Where that comes from, in words; empty where nothing is known.
+        fault: Why there are no frames though there is a table; empty otherwise.
+    """
+
+    columns: Columns
+    errors_m: Array
+    share: Array
+    share_source: str = ""
+    fault: str = ""
+
+
+def read_frames(row: RunRow, exact: Mapping[int, float]) -> RunFrames:
+    """The frames of a run with the share of dynamic pixels: the exact one if it is known, else by its own masks.
+
+    Args:
+        row: The run.
+        exact: Frame in the numbering of the run's part without offset to the exact share.
+    """
+    try:
+        columns = read_table(row.folder / CSV_FILE, _is_shown) or {}
+    except RunError as error:
+        return RunFrames({}, np.zeros(0), np.zeros(0), fault=str(error))
+    if not columns:
+        return RunFrames({}, np.zeros(0), np.zeros(0))
+    errors_m, own = columns["frame_error_trans_m"], columns.get("stat_mask_fraction")
+    if exact:
+        return RunFrames(
+            columns,
+            errors_m,
+            np.array([exact.get(index + row.offset, np.nan) for index in columns["index"].tolist()]),
+            EXACT,
+        )
+    if own is not None and own.any():  # else it may have no masks
+        return RunFrames(columns, errors_m, own, "the tracker's own masks")
+    return RunFrames(columns, errors_m, np.full(len(errors_m), np.nan))
+
+
+def exact_shares(rows: Sequence[RunRow]) -> dict[int, float]:
+    """Frame (before the offset) to its exact share of dynamic pixels, from those of the first runs that know it."""
+    shares: dict[int, float] = {}
+    for row in rows[:_ASKED]:
+        try:
+            columns = read_table(row.folder / CSV_FILE, {"index", "dynamic_share"}.__contains__)
+        except RunError:  # is named on the page of that run
+            continue
+        if columns is not None and "dynamic_share" in columns:
+            finite = np.isfinite(columns["dynamic_share"])
+            indices = (columns["index"][finite] + row.offset).tolist()
+            shares |= dict(zip(indices, columns["dynamic_share"][finite].tolist(), strict=True))
+    return shares
+
+
+def read_table(path: Path, wanted: Callable[[str], bool]) -> Columns | None:
+    """Columns of a ``frames.csv``, a name to values ``[N]``: numbers, and the state in words; None for no table.
+
+    Raises:
+        RunError: It holds no frames, or something else than numbers.
+    """
+    kinds: dict[str, Any] = defaultdict(lambda: np.float64, index=np.int64, state=str)
+    try:
+        if not path.is_file() or not path.stat().st_size:
+            return None
+        table = pd.read_csv(
+            io.BytesIO(read_bytes(path, limit=TABLE_BYTES)), usecols=wanted, dtype=kinds, low_memory=False
+        )
+    except (DynslamError, ValueError, OverflowError, OSError) as error:
+        raise RunError(f"{CSV_FILE} is damaged: {error}") from error
+    if not isinstance(table.index, pd.RangeIndex):
+        raise RunError(f"{CSV_FILE} is damaged: its lines have more cells than its heading")
+    if not set(filter(wanted, _NEEDED)) <= set(table) or table.empty:
+        raise RunError(f"{CSV_FILE} holds no frames")
+    if "timestamp" in table and not np.isfinite(table["timestamp"]).all():
+        raise RunError(f"{CSV_FILE} is damaged: not every frame has a stamp")
+    return {str(name): table[name].to_numpy() for name in table}
+
+
+def _is_shown(name: str) -> bool:
+    """Whether the page shows a column of ``frames.csv``."""
+    return name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
