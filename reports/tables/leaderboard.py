@@ -15,7 +15,7 @@ from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, Cell, mean_skipped, pair_frame, rank
-from dynslam_bench.reports.model.published import ReportedCell
+from dynslam_bench.reports.model.published import ReportedCell, lines_of
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (
@@ -258,7 +258,7 @@ def pair_table(board: Board) -> Table | None:
     """Every ranked tracker against every other; None below `FEWEST` sequences or for fewer than three trackers."""
     if len(board.common) < FEWEST or len(board.ranked) < 3:
         return None
-    pairs = {(line.tracker, line.other): line for line in pair_frame(board).itertuples()}
+    pairs = {(line.tracker, line.other): line for line in lines_of(pair_frame(board))}
     rows = []
     for key in board.ranked:
         label = board.labels[key]

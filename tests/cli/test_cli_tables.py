@@ -55,13 +55,14 @@ def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
         assert ("of the tracked frames alone" in capsys.readouterr().out) == (coverage < 1)
 
 
-def test_report_prints_five_lines_and_its_place(cli, walk, tmp_path):
+def test_report_prints_its_message_the_leaderboard_and_its_place(cli, walk, tmp_path):
     trackers = ("never-move", "constant-velocity")
     (tmp_path / "mine.toml").write_text(f"trackers = {list(trackers)}\nsequences = ['{walk}']\n")
     assert cli("bench", "mine.toml")[0] == 0
     code, out, _ = cli("report")
     lines = out.splitlines()
-    assert code == 0 and lines[0].split()[:2] == ["#", "tracker"] and len(lines) == 5
+    assert code == 0 and lines[0] == "No tracker can be ranked." and len(lines) == 6
+    assert lines[1].split()[:2] == ["#", "tracker"]
     assert lines[-2].startswith("Geometric mean of the ATE over that of")
     assert lines[-1].endswith("results/report/index.html")
     code, out, err = cli("report", "--reference", "orb-slam2")

@@ -50,6 +50,7 @@ from dynslam_bench.sequences.synthetic.rooms import (
     trolley,
 )
 from dynslam_bench.sequences.synthetic.scene import Actor, Array, Body, Optics, Placement, Variant, World
+from dynslam_bench.sequences.tags import Tag
 
 # Replicas of TUM's fr3 dynamic sequences: two people who walk or sit in an office, four camera motions.
 
@@ -83,9 +84,10 @@ def _roll(keys: tuple[Key, ...], period: float, time: float) -> tuple[Array, Arr
     return turn(angle_between(a.facing, b.facing, e) + 180.0), place
 
 
+_PEOPLE: dict[str, Tag] = {"walking": "high-dynamic", "sitting": "low-dynamic"}
 REPLICAS = {
     f"{people}_{motion}": Variant(partial(build_replica, people, motion), tag, version=0)
-    for people, tag in (("walking", "high-dynamic"), ("sitting", "low-dynamic"))
+    for people, tag in _PEOPLE.items()
     for motion in MOTIONS
 }
 
@@ -209,9 +211,11 @@ _CHANGES: dict[str, Change] = {
     "outdoor": lambda world, _: replace(world, optics=SUNLIGHT),
 }
 CONDITIONS = {
-    f"{name}_{kind}": Variant(partial(build_condition, change, kind == "walking"), tag)
+    f"{name}_{kind}": Variant(
+        partial(build_condition, change, kind == "walking"), "high-dynamic" if kind == "walking" else "static"
+    )
     for name, change in _CHANGES.items()
-    for kind, tag in (("empty", "static"), ("walking", "high-dynamic"))
+    for kind in ("empty", "walking")
 }
 
 
