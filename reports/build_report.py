@@ -359,7 +359,7 @@ def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
     return [
         (str(len(names)), "sequence" + "s" * (len(names) != 1), sequences),
         (str(len(board.labels)), "tracker" + "s" * (len(board.labels) != 1), []),
-        (several, "repeats a cell", []),
+        (several, "run a cell" if several == "1" else "runs a cell", []),
         (str(len(board.rows)), "run" + "s" * (len(board.rows) != 1), []),
         (str(len(failed)), "failed", first_of(endings, _MOST_NOTES, "and {} more, see Diagnostics")),
         (protocol.id, "protocol", [protocol.describe()]),
@@ -593,8 +593,9 @@ def publish(
         shared = f"../leaderboard/{ASSETS}/"
         page.write_text(page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', f'="{shared}'), encoding="utf-8")
         pages.append((f"study/{STUDY_PAGE}", "Study", "What tuning the settings gained, and how sure that is."))
-    site = render("site.html.j2", title=title, pages=pages, note=note, version=dynslam_bench.__version__)
-    write_atomic(output / "index.html", site)
+    made = f"Made by dynslam-bench report publish, version {dynslam_bench.__version__}."
+    site = sections_page([], title=title, pages=pages, protocol=note, footer=made)
+    write_atomic(output / "index.html", site.replace(f'="{ASSETS}/', f'="leaderboard/{ASSETS}/'))
     write_atomic(output / ".nojekyll", "")
     sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
     return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)

@@ -36,7 +36,7 @@ def _theme(ink: str, grid: str, paper: str) -> dict[str, Any]:
             "paper_bgcolor": "rgba(0,0,0,0)",
             "plot_bgcolor": "rgba(0,0,0,0)",
             "colorway": COLOURS,
-            "margin": {"l": 60, "r": 16, "t": 16, "b": 48},
+            "margin": {"l": 60, "r": 16, "t": 30, "b": 48},
             "hoverlabel": {"bgcolor": paper, "font": {"color": ink}},
             "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": NEUTRAL, "activecolor": COLOURS[0]},
             "xaxis": line,

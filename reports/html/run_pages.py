@@ -224,6 +224,8 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
     length = f"{row.sequence.duration_s:.1f} s"
     if row.failed:
         reason = f": {row.reason}" if row.reason else ""
+        if not row.n_tracked and row.status == "lost":
+            return "red", f"Never tracked: not one of {row.n_frames} frames"
         if row.status == "lost":
             return "red", f"{_loss(frames, length) or 'Lost'}. {row.ending.capitalize()}{reason}"
         return "red", f"{row.ending.capitalize()} frames{reason}" if row.status != "ok" else f"Not evaluated{reason}"
@@ -269,7 +271,7 @@ def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
         ((spec, row.metrics[spec.metric("trans")]) for spec in rpe if spec.metric("trans") in row.metrics), None
     )
     numbers = {
-        "ATE, a failure's" if row.failed else "ATE, lost frames held": "" if score is None else f"{mm(score)} mm",
+        "ATE, as it counts" if row.failed else "ATE, lost frames held": "" if score is None else f"{mm(score)} mm",
         "of a static camera's": "" if score is None or not static else f"{significant_text(100 * score / static)} %",
         f"RPE over {relative[0].describe()}" if relative else "RPE": (
             "" if relative is None else f"{mm(relative[1])} mm{'/s' * relative[0].rate}"
@@ -344,7 +346,7 @@ def _series(frames: RunFrames, pictures: Sequence[int]) -> tuple[Series, list[tu
     series |= {name: columns[f"stat_{name}"] for name in COUNTS if f"stat_{name}" in columns}
     stages = [name for name in columns if name.endswith("_s") and name not in _WHOLE]
     series |= {name: 1000 * columns[name] for name in stages if np.nanmax(columns[name], initial=0.0) > 0}
-    lost = np.flatnonzero(np.diff(np.concatenate([[0], np.isin(columns["state"], ("lost", "dropped")), [0]])))
+    lost = np.flatnonzero(np.diff(np.concatenate([[0], columns["state"] != "ok", [0]])))
     ends = np.append(stamps, stamps[-1])
     spans = [(float(stamps[first]), float(ends[last])) for first, last in lost.reshape(-1, 2).tolist()]
     return {name: values[keep] for name, values in series.items()}, spans

@@ -519,7 +519,7 @@ def missing_note(board: Board) -> str:
             board.on == "common" and board.ranked and common < total
         ),
         f"Not ranked, since they {why}: {left}.": left,
-        f"Missing cells: {'; '.join(cells)}. The commands that fill them stand at the end of this section.": True,
+        f"Missing cells: {'; '.join(cells)}. The page Reproduce has the commands that fill them.": True,
     }
     return " ".join(sentence for sentence, holds in sentences.items() if holds)
 

@@ -470,8 +470,8 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
         "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
         "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a static "
-        "camera, or worse; a cell with a failure takes no part in bold and green, and is hatched where "
-        f"nothing succeeded. Colour: ratio to {board.reference_name}, from green (a quarter or less) to red (four "
+        "camera, or worse; a cell with a failure is neither bold nor blue, and is marked where "
+        f"nothing succeeded. Colour: ratio to {board.reference_name}, from blue (a quarter or less) to orange (four "
         f"times or more). Bold best, italic second among ranked trackers. {names}{protocol.describe()}."
     )
     if reported:

@@ -1,5 +1,4 @@
 // The board: categories, selection, search, sort and columns, all in the address.
-"use strict";
 function startBoard() {
   const tables = new Map();
   const view = address.read();
@@ -9,30 +8,20 @@ function startBoard() {
   /** The table of a category, made when it is first shown. */
   function tableOf(place) {
     if (tables.has(place)) return tables.get(place);
-    const element = place.querySelector("table");
-    const made = sortable(element, {
+    const made = sortable(place.querySelector("table"), {
       orderFixed: [0, "asc"],
       layout: { ...TABLE.layout, topStart: { buttons: [{ extend: "colvis", text: "Columns", columns: ":gt(1)" }] }, topEnd: "search" },
       columnDefs: [{ targets: 0, visible: false }, { targets: [".n", 2], type: "number" }],
       search: { search: view.get("q") ?? "" },
     });
-    const hidden = (view.get("hide") ?? "").split(".").filter(Boolean).map(Number);
-    made.columns(hidden).visible(false);
+    made.columns((view.get("hide") ?? "").split(".").filter(Boolean).map(Number)).visible(false);
     const [at, way] = (view.get("sort") ?? "").split(".");
     if (way) made.order([+at, way]).draw();
     made.on("search", () => address.write({ q: made.search() }));
     made.on("order", () => address.write({ sort: made.order().filter(([column, to]) => column && to).map(([column, to]) => `${column}.${to}`)[0] ?? "" }));
     made.on("column-visibility", () => address.write({ hide: made.columns().indexes().toArray().filter((column) => column && !made.column(column).visible()).join(".") }));
-    made.on("draw", lines);
     tables.set(place, made);
-    lines();
     return made;
-  }
-
-  /** A line above every group: ranked trackers, others, bounds. */
-  function lines() {
-    const rows = select("tbody tr", panel());
-    rows.forEach((row, at) => row.classList.toggle("line", at > 0 && row.className.match(/group-\d/)?.[0] !== rows[at - 1].className.match(/group-\d/)?.[0]));
   }
 
   function showTab(name) {
@@ -59,11 +48,7 @@ function startBoard() {
     ticks();
   });
   byId("compare").onclick = () => { const [a, b] = selected; location.href = `compare.html#a=${a}&b=${b}`; };
-  byId("copy-link").onclick = async ({ target }) => {
-    await navigator.clipboard?.writeText(location.href).catch(() => {});
-    target.textContent = "Copied";
-    setTimeout(() => { target.textContent = "Link to this view"; }, 1500);
-  };
+  byId("copy-link").onclick = ({ target }) => navigator.clipboard.writeText(location.href).then(() => { target.textContent = "Link copied"; });
   showTab(view.get("tab"));
 }
 startBoard();

@@ -1,8 +1,7 @@
 // Two trackers, or two sides of one: the change on every sequence, and both runs of a sequence on top of each other.
-"use strict";
 const SIDES = ["#0072b2", "#d55e00"];
 const safe = (text) => text.replace(/[&<>]/g, (character) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[character]); // plotly reads markup
-const percentText = (ratio) => `${Math.abs(100 * (ratio - 1)).toPrecision(2)} % ${ratio < 1 ? "better" : "worse"}`;
+const percentText = (ratio) => (ratio > 2 ? `${ratio.toPrecision(2)} times the error` : `${+Math.abs(100 * (ratio - 1)).toPrecision(2)} % ${ratio < 1 ? "better" : "worse"}`);
 
 function pairsOf(board, a, b) {
   const of = (tracker) => new Map(board.cells.filter((cell) => cell[0] === tracker && cell[5][0] !== null).map((cell) => [cell[1], cell]));
@@ -61,7 +60,7 @@ async function showPair(board, pair, names) {
   byId("divider").oninput = ({ target }) => { images[1].style.clipPath = `inset(0 0 0 ${target.value}%)`; };
   if (both.length) { slider.value = Math.floor(both.length / 2); move(); byId("divider").oninput({ target: byId("divider") }); }
   const truth = runs.flatMap(({ figures }) => figures.track?.data.filter(({ name }) => name === "true path") ?? []).slice(0, 1);
-  const tracks = runs.flatMap(({ figures }, side) => (figures.track?.data ?? []).filter(({ name }) => name === "estimate").map((trace) => ({ ...trace, name: safe(names[side]), line: { color: SIDES[side], width: 5 } })));
+  const tracks = runs.flatMap(({ figures }, side) => (figures.track?.data ?? []).filter(({ name }) => name === "estimate").map((trace) => ({ ...trace, name: safe(names[side]), showlegend: true, line: { color: SIDES[side], width: 5 } })));
   const layout = runs.map(({ figures }) => figures.track?.layout).find(Boolean);
   if (layout) await draw(byId("tracks"), { data: [...truth, ...tracks], layout });
   const lines = runs.map(({ series }, side) => ({ type: "scatter", mode: "lines", name: safe(names[side]), x: series.track_t, y: series.track_error, line: { color: SIDES[side], dash: ["solid", "dash"][side] } })).filter(({ x }) => x);
@@ -76,8 +75,7 @@ async function showPair(board, pair, names) {
 
 async function startCompare() {
   const board = await side("board"), view = address.read();
-  const sides = board.pairs ?? null;
-  const usual = sides ? sides[0] : [board.referenceAt ?? 0, board.trackers.findIndex((_, at) => at !== (board.referenceAt ?? 0))];
+  const sides = board.pairs, usual = sides ? sides[0] : [board.referenceAt ?? 0, board.trackers.findIndex((_, at) => at !== (board.referenceAt ?? 0))];
   const [a, b] = [+(view.get("a") ?? usual[0]), +(view.get("b") ?? usual[1])];
   const names = [board.trackers[a]?.label ?? "", board.trackers[b]?.label ?? ""];
   const go = (one, other) => { address.write({ a: one, b: other, sequence: "" }); startCompare(); };

@@ -1,5 +1,4 @@
 // All trackers on all sequences: which number, in which unit, of which sequences; a cell leads to its run.
-"use strict";
 async function startErrors() {
   const data = await side("board"), view = { number: "0", scale: "abs", kind: "", ranked: "", ...Object.fromEntries(address.read()) };
   const known = data.metrics.map((metric, at) => ({ ...metric, at })).filter(({ at }) => data.cells.some((cell) => cell[5][at] !== null));
@@ -47,9 +46,7 @@ async function startErrors() {
   }
 
   const set = (name, value) => { view[name] = value; address.write({ [name]: value === { number: "0", scale: "abs" }[name] ? "" : value }); render(); };
-  byId("metric").onchange = ({ target }) => set("number", target.value);
-  byId("scale").onchange = ({ target }) => set("scale", target.value);
-  byId("kind").onchange = ({ target }) => set("kind", target.value);
+  for (const [id, name] of [["metric", "number"], ["scale", "scale"], ["kind", "kind"]]) byId(id).onchange = ({ target }) => set(name, target.value);
   byId("ranked").onchange = ({ target }) => set("ranked", target.checked ? "1" : "");
   byId("reset").onclick = () => { Object.assign(view, { number: "0", scale: "abs", kind: "", ranked: "" }); history.replaceState(null, "", location.pathname + "#"); render(); };
   render();

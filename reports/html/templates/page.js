@@ -65,11 +65,10 @@ function startTheme() {
     button.textContent = names[theme];
     drawn.forEach((figure, element) => element.isConnected && draw(element, figure));
   };
-  let theme = "";
-  try { theme = localStorage.getItem("theme") ?? ""; } catch { /* a browser may refuse */ }
+  let theme = localStorage.getItem("theme") ?? "";
   button.onclick = () => {
     theme = themes[(themes.indexOf(theme) + 1) % 3];
-    try { localStorage.setItem("theme", theme); } catch { /* a browser may refuse */ }
+    localStorage.setItem("theme", theme);
     show(theme);
   };
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => show(theme));
@@ -85,10 +84,7 @@ function sortable(table, options = {}) {
   return new DataTable(table, { ...TABLE, columnDefs: [{ targets: ".n", type: "number", className: "n" }], ...options });
 }
 
-function startPage() {
-  startTheme();
-  select("table.sorts").forEach((table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {}));
-  addEventListener("DOMContentLoaded", drawFigures);
-  addEventListener("beforeprint", () => select("details").forEach((fold) => { fold.open = true; }));
-}
-startPage();
+startTheme();
+select("table.sorts").forEach((table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {}));
+addEventListener("DOMContentLoaded", drawFigures);
+addEventListener("beforeprint", () => select("details").forEach((fold) => { fold.open = true; }));

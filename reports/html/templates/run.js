@@ -1,5 +1,4 @@
 // The page of a run: picture, track and time move together.
-"use strict";
 const NUMBERS = { f4: Float32Array, i4: Int32Array };
 function decode({ dtype, bdata }) {
   return new NUMBERS[dtype](Uint8Array.from(atob(bdata), (character) => character.charCodeAt(0)).buffer);
@@ -7,10 +6,7 @@ function decode({ dtype, bdata }) {
 
 /** A figure whose "@name" are the run's series. */
 function filled(value, series) {
-  if (typeof value === "string" && value[0] === "@") return series[value.slice(1)];
-  if (Array.isArray(value)) return value.map((each) => filled(each, series));
-  if (value === null || typeof value !== "object") return value;
-  return Object.fromEntries(Object.entries(value).map(([name, each]) => [name, filled(each, series)]));
+  return JSON.parse(JSON.stringify(value), (_, each) => (typeof each === "string" && each[0] === "@" ? series[each.slice(1)] : each));
 }
 
 async function loadRun(id) {
@@ -42,8 +38,8 @@ const rowsOf = (heads, rows) => make("div", { className: "scroll" }, make("table
 const fold = (title, ...parts) => make("details", { className: "fold" }, make("summary", { textContent: title }), ...parts);
 
 class RunView {
-  constructor(board, run, where) {
-    Object.assign(this, { board, run, where });
+  constructor(run) {
+    this.run = run;
     this.frames = run.series.index ?? run.series.track_t ?? [];
     this.times = run.series.t ?? run.series.track_t ?? [];
     this.second = null;
@@ -53,16 +49,13 @@ class RunView {
     const { run } = this, slider = byId("frame");
     slider.max = Math.max(this.times.length - 1, 0);
     slider.oninput = () => this.move(+slider.value);
-    byId("back").onclick = () => this.move(this.at - 1);
-    byId("on").onclick = () => this.move(this.at + 1);
     document.onkeydown = (event) => {
       if (event.target.matches("input, select") || !["ArrowLeft", "ArrowRight"].includes(event.key)) return;
       event.preventDefault();
       this.move(this.at + (event.key === "ArrowRight" ? 1 : -1));
     };
     byId("worst").replaceChildren(...(run.worst.length ? ["worst frames: "] : []), ...run.worst.map(([frame, error]) => make("button", { type: "button", textContent: `${frame} (${error} mm)`, onclick: () => this.move(nearest(this.frames, frame)) })));
-    byId("picture").hidden = !run.pictures.length;
-    for (const name of ["track", "time"]) byId(name).hidden = !run.figures[name];
+    for (const [name, there] of [["picture", run.pictures.length], ["track", run.figures.track], ["time", run.figures.time]]) byId(name).hidden = !there;
     const wanted = address.read().get("frame");
     this.at = wanted ? nearest(this.frames, +wanted) : run.worst.length ? nearest(this.frames, run.worst[0][0]) : 0;
     await this.drawTrack();
@@ -136,7 +129,7 @@ async function showRun(id) {
     const board = await side("board"), own = board.runs.find((run) => run[0] === id);
     if (!own) throw new Error(board.unlisted ? `Run ${id} has no page here, if it is in this report at all. ${board.pageless}` : id ? `There is no run ${id} in this report.` : "No run is named behind # in the address.");
     if (!(own[5] & 1)) throw new Error(`Run ${id} has no page here. ${board.pageless}`);
-    const [, tracker, sequence, repeat, ending] = own, run = await loadRun(id);
+    const [, tracker, sequence] = own, run = await loadRun(id);
     const go = (to) => { location.hash = to; };
     const first = (test) => board.runs.find((each) => each[5] & 1 && test(each))?.[0];
     const options = (at, names, test) => [...new Set(board.runs.filter((each) => each[5] & 1 && test(each)).map((each) => each[at]))].map((key) => [key, names[key]]);
@@ -152,7 +145,7 @@ async function showRun(id) {
     verdict.textContent = run.verdict;
     byId("run").hidden = false;
     byId("numbers").replaceChildren(...run.numbers.map(([name, value]) => make("div", { className: "card" }, make("b", { textContent: value }), make("span", { textContent: name }))));
-    const view = new RunView(board, run, { repeat, ending });
+    const view = new RunView(run);
     const others = board.cells.filter((cell) => cell[1] === sequence && cell[0] !== tracker && board.runs.some((each) => each[0] === cell[6] && each[5] & 1));
     byId("second").replaceWith(Object.assign(chooser("Second tracker", [["", "none"], ...others.map((cell) => [cell[6], labels[cell[0]]])], "", async (other) => {
       view.second = other ? { ...(await loadRun(other)), label: labels[others.find((cell) => cell[6] === other)[0]] } : null;
