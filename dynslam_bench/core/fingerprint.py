@@ -245,7 +245,7 @@ _SETTLED_NS = 2_000_000_000
 """Digests of files that are younger are not stored: a change within the same tick of the clock would not show."""
 
 
-def contents_digest(files: Iterable[Path], root: Path | None = None, *, syntax: bool = True) -> str:
+def contents_digest(files: Iterable[str | Path], root: Path | None = None, *, syntax: bool = True) -> str:
     """SHA-256 of the contents of files.
 
     Args:
@@ -260,7 +260,7 @@ def contents_digest(files: Iterable[Path], root: Path | None = None, *, syntax: 
 
     def compute() -> str:
         whole = hashlib.sha256()
-        for file in ordered:
+        for file in map(Path, ordered):
             name = "" if root is None else f"{file.relative_to(root).as_posix()}\0"
             is_source = syntax and file.suffix == ".py"
             content = syntax_digest(file.read_bytes()) if is_source else file_sha256(file)
@@ -315,7 +315,7 @@ def _is_docstring(node: Any) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def _remembered(kind: str, files: list[Path], compute: Callable[[], str]) -> str:
+def _remembered(kind: str, files: Sequence[str | Path], compute: Callable[[], str]) -> str:
     state, newest = _files_state(files)
     key = hashlib.sha256(f"{kind}\0{state}".encode()).hexdigest()
     entry = digest_cache_folder() / key[:40]
@@ -330,22 +330,21 @@ def _remembered(kind: str, files: list[Path], compute: Callable[[], str]) -> str
     return value
 
 
-def _files_state(files: Iterable[Path]) -> tuple[str, int]:
+def _files_state(files: Iterable[str | Path]) -> tuple[str, int]:
     """Digest of path, size, times and inode of each file, and the newest of the times in nanoseconds.
 
     Raises:
         OSError: One is not there.
     """
-    whole, newest = hashlib.sha256(), 0
-    for file in files:
-        path = os.fspath(file)
-        if not os.path.isabs(path):  # noqa: PTH117 - thousands of files: pathlib takes several times as long
-            path = os.path.abspath(path)  # noqa: PTH100
+    texts, newest = [], 0
+    for path in map(os.fspath, files):
+        if not path.startswith(os.sep):
+            path = os.path.abspath(path)  # noqa: PTH100 - thousands of files: pathlib takes several times as long
         stat = os.stat(path)  # noqa: PTH116
-        newest = max(newest, stat.st_mtime_ns, stat.st_ctime_ns)
-        text = f"{path}\0{stat.st_size},{stat.st_mtime_ns},{stat.st_ctime_ns},{stat.st_ino}\n"
-        whole.update(text.encode(errors="surrogateescape"))
-    return whole.hexdigest(), newest
+        modified, changed = stat.st_mtime_ns, stat.st_ctime_ns
+        newest = max(newest, modified, changed)
+        texts.append(f"{path}\0{stat.st_size},{modified},{changed},{stat.st_ino}\n")
+    return hashlib.sha256("".join(texts).encode(errors="surrogateescape")).hexdigest(), newest
 
 
 # -- where and with what a run was made --------------------------------------------------------------------------------
