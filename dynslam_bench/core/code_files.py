@@ -124,10 +124,10 @@ def files_below(folder: Path) -> Iterator[Path]:
 def files_of_command(command: Sequence[str], folder: Path | None = None) -> list[Path]:
     """The files that decide what a command does.
 
-    These are its program with the libraries it is linked with, the files and folders among its arguments (also behind
-    ``=``), the code of ``python -m MODULE``, all code in the folder of a Python script and what it imports from
-    elsewhere but installed distributions, and what scripts and configuration files name. Files of the operating system
-    are left out.
+    These are its program with the libraries it is linked with, and the files and folders among its arguments (also
+    behind ``=``). The code of ``python -m MODULE`` counts, and so does what scripts and configuration files name. With
+    a Python script all code in its folder counts, and what it imports from elsewhere but installed distributions. Files
+    of the operating system are left out.
 
     Args:
         command: Program and arguments.

@@ -55,8 +55,8 @@ _FILE_PREFIXES = ("onnx", "weights", "recorded")
 def named_digests(settings: Settings) -> dict[str, str]:
     """Digest of the content of every file and folder that settings name and that is there, by the setting's name.
 
-    A setting counts that is declared to name a file (`core.settings.names`, or of type `Path`), that carries one of the
-    prefixes ``onnx:``, ``weights:`` and ``recorded:``, or that is written as the path of a file: with a separator. A
+    A setting counts that is declared to name a file (`core.settings.names`, or of type `Path`), and one with the prefix
+    ``onnx:``, ``weights:`` or ``recorded:``. So does one that is written as the path of a file: with a separator. A
     bare word is a word, whatever lies in the working folder.
 
     Raises:

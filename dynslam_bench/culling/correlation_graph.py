@@ -28,7 +28,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
     """Drops the points outside the largest rigid component of a Delaunay graph.
 
     An edge compares the vector between its two points now with that in the oldest frame, at most `window` frames ago,
-    in which both were observed; it is cut where the Mahalanobis distance of the difference exceeds the chi-square
+    in which both were observed. It is cut where the Mahalanobis distance of the difference exceeds the chi-square
     quantile. Vectors are compared in the world frame: only the rotations of the poses matter.
 
     Components are formed by settled points only, those observed over at least `settled` frames: a younger edge shows

@@ -126,8 +126,8 @@ def hidden(
 ) -> NDArray[np.bool_]:
     """Which points are hidden by a nearer object, robustly against small projection errors.
 
-    A point is compared with the depth in the window that is nearest to the expected depth, among those in front of it:
-    a point beside an object is not hidden, only one well inside its outline is.
+    A point is compared with the depth in the window that is nearest to the expected depth, among those in front of it.
+    So a point beside an object is not hidden, only one well inside its outline is.
 
     Args:
         depth: float32 ``[H, W]`` metres, 0 missing.

@@ -40,8 +40,8 @@ LAG_S = 0.04
 SCALE_FACTOR = 1.15
 """Scales closer to 1 than this factor are errors of a tracker."""
 COPY_SHARE, COPY_M, EXACT_M = 1e-3, 1e-4, 1e-6
-"""No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once; where the
-truth shows no noise of its own, as that of rendered images, as a thousandth of a millimetre."""
+"""No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once. Where the
+truth shows no noise of its own, as that of rendered images, it is a thousandth of a millimetre."""
 NOISE_M = 1e-5
 """A truth with less noise than this was not measured."""
 MEASURED_S = 1 / 60
@@ -386,7 +386,7 @@ ROTATES_DEG, MOVES_M = 1.5, 0.01
 """Motions smaller than this are not distinguished from noise."""
 EXPLAINED, UNEXPLAINED, CLEARLY = 0.4, 0.25, 4.0
 """Median error of the motions over the motions themselves: below the first they may be explained, above the second they
-may be not; an undone fault has to be better than the trajectory as it stands by the third, a factor."""
+may not. An undone fault has to be better than the trajectory as it stands by the third, a factor."""
 VARIES, TIE = 0.7, 0.1
 """Least correlation of motions that are explained, and the errors between which the path does not tell."""
 

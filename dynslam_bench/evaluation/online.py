@@ -43,7 +43,7 @@ class OnlineError:
     """Follows the pose error of a running tracker; what is known at a frame never changes later.
 
     A frame that is lost counts as not having moved: it stays at the last tracked pose, cumulatively and frame to frame,
-    as if the tracker had repeated that pose; the first tracked pose after it is a jump from there. Until a first pose
+    as if the tracker had repeated that pose. The first tracked pose after it is a jump from there. Until a first pose
     is tracked the camera counts as standing at the first true pose, and where it then is joins estimate and truth.
 
     Args:

@@ -1,6 +1,6 @@
 """ORB features that are spread evenly over the image and the scales.
 
-FAST corners (Rosten and Drummond, 2006) of each pyramid level are ranked by strength within the cells of a grid; the
+FAST corners (Rosten and Drummond, 2006) of each pyramid level are ranked by strength within the cells of a grid. The
 strongest of every cell come first, then the second strongest, until the level's share is full. Orientation is the
 intensity centroid and the descriptor the rotated BRIEF of Rublee et al. (2011).
 """

@@ -1,7 +1,7 @@
 """Trajectory files of the TUM RGB-D benchmark: ``timestamp tx ty tz qx qy qz qw``, one pose a line.
 
-Reading follows the benchmark's own tools: ``#`` begins a comment, commas and tabs separate like spaces, lines with NaN
-or with an all-zero quaternion are skipped, quaternions are normalised, lines may come in any order, and of several
+Reading follows the benchmark's own tools: ``#`` begins a comment, commas and tabs separate like spaces. Lines with NaN
+or with an all-zero quaternion are skipped; quaternions are normalised. Lines may come in any order, and of several
 lines with one stamp the last holds. Whatever is not taken as it stands is counted in `FileNotes`.
 """
 

@@ -285,10 +285,10 @@ def run_many(
     """Make the runs that are not stored yet, and score all of them.
 
     Everything is looked up before the first run begins. A stored run is made again if a video, a sheet or its map is
-    asked for that it lacks; one that is given another label gets that, and one that a study made is an ordinary run
-    once it is asked for without the study. A failure is a record and stops nothing; after an interrupt the call goes
-    on. A run whose sequence or files cannot be read stops no other, and nothing of it is stored. Several processes may
-    share a results folder (without `executor`): each run is made by one of them.
+    asked for that it lacks. One that is given another label gets that. One that a study made is an ordinary run once it
+    is asked for without the study. A failure is a record and stops nothing; after an interrupt the call goes on. A run
+    whose sequence or files cannot be read stops no other, and nothing of it is stored. Several processes may share a
+    results folder (without `executor`): each run is made by one of them.
 
     Args:
         specs: What to run; runs that are the same are made once.

@@ -1,10 +1,11 @@
 """What is often not known of an RGB-D camera, measured in a recording: readout time, delay of depth, depth factor.
 
 Keypoints are tracked through windows of consecutive frames, and each window is adjusted as a bundle whose camera moves
-continuously: every pixel belongs to the pose at its row's time, every depth to the pose at its image's time (Kerl,
-Stueckler and Cremers, Dense Continuous-Time Tracking and Mapping with Rolling Shutter RGB-D Cameras, ICCV 2015; points
-in place of their dense images). The readout time and the delay of the depth images are unknowns that all windows share.
-They show where the camera's velocity changes: under a constant velocity each row is late in all frames alike.
+continuously. Every pixel belongs to the pose at its row's time, every depth to the pose at its image's time. This is
+after Kerl, Stueckler and Cremers (Dense Continuous-Time Tracking and Mapping with Rolling Shutter RGB-D Cameras, ICCV
+2015), with points in place of their dense images. The readout time and the delay of the depth images are unknowns that
+all windows share. They show where the camera's velocity changes: under a constant velocity each row is late in all
+frames alike.
 
 The ground truth serves for the depth factor alone.
 """

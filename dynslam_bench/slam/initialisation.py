@@ -2,11 +2,11 @@
 
 As in ORB-SLAM (Mur-Artal, Montiel and Tardos 2015, Section IV) a homography and an essential matrix are fitted to the
 same matches, so that flat and deep scenes both give a motion. A motion is accepted if nearly all matches lie before
-both cameras, no other motion explains them as well, and the parallax is large enough. The best motion is not decided
-by the scores of the two models as there, but by the cost after bundle adjustment of each motion: on a scene
-with one large wall the essential matrix of most matches is a wrong one, while a homography's motion is right, and the
-points beside the wall tell which of them. Two views a few centimetres apart do not tell a translation from a rotation;
-all views between them do, so that those are adjusted together.
+both cameras, no other motion explains them as well, and the parallax is large enough. The best motion is not decided by
+the scores of the two models as there, but by its cost after bundle adjustment. On a scene with one large wall the
+essential matrix of most matches is wrong and a homography's motion right; the points beside the wall show which. Two
+views a few centimetres apart do not tell a translation from a rotation; all views between them do, so that those are
+adjusted together.
 """
 
 from __future__ import annotations

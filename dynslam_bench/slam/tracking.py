@@ -94,7 +94,7 @@ def observe(
 ) -> Observations:
     """Select and prepare the features of a frame.
 
-    The right coordinate ``u - b f / z`` carries the depth (ORB-SLAM2, Eq. for RGB-D); its variance is the pixel's plus
+    The right coordinate ``u - b f / z`` carries the depth (ORB-SLAM2, Eq. for RGB-D). Its variance is the pixel's plus
     that of the depth sensor, ``(b f / z^2 * c z^2)^2 = (b f c)^2``, constant in disparity.
 
     Args:

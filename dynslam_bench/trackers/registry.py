@@ -58,7 +58,7 @@ def tracker_groups() -> dict[str, list[list[TrackerSpec]]]:
 class TrackerRegistry(Registry[TrackerSpec]):
     """All trackers; an id may carry a parameter, as in ``replay:trajectory.txt``.
 
-    An exact id wins over ``id:value``, and that over ``module:Attr`` and ``file.py:Attr``: a name is read as
+    An exact id wins over ``id:value``, and that over ``module:Attr`` and ``file.py:Attr``. A name is read as
     ``id:value`` only if the part before its first colon is the id of a tracker that takes a parameter.
     """
 

@@ -30,9 +30,9 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
 def nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
     """Greedy non-maximum suppression.
 
-    The greedy rule "a box stays if no better box that stays overlaps it by more than `threshold`" is solved by
-    fixed-point iteration over the whole overlap matrix, which needs as many rounds as the longest chain of
-    suppressions, usually a handful; the result is exactly the greedy one.
+    The greedy rule is "a box stays if no better box that stays overlaps it by more than `threshold`". It is solved
+    exactly, by fixed-point iteration over the whole overlap matrix. That needs as many rounds as the longest chain of
+    suppressions, usually a handful.
 
     Args:
         boxes: ``[N, 4]``.

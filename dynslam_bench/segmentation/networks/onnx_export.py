@@ -69,8 +69,9 @@ def export_network(
 ) -> ExportedNetwork:
     """Write a Mask R-CNN checkpoint as an ONNX file that ``onnx:PATH`` takes.
 
-    The input ``image [1, 3, H, W]`` is RGB in [0, 1]; the outputs are those of torchvision's exports (boxes, labels,
-    scores, masks in the whole image) with as many rows as the network finds objects at most, unused ones of score 0.
+    The input ``image [1, 3, H, W]`` is RGB in [0, 1]. The outputs are those of torchvision's exports: boxes, labels,
+    scores, masks in the whole image. They have as many rows as the network finds objects at most, unused ones of score
+    0.
 
     Args:
         source: ``embedded``, ``coco`` (fetched if need be) or ``weights:PATH``.

@@ -1,8 +1,8 @@
 """OpenLORIS-Scene: ``color.txt``, ``aligned_depth.txt``, ``groundtruth.txt`` of the robot's base, and two YAML files.
 
 Intrinsics are in the order fx cx fy cy. The ground truth is that of ``base_link``; ``trans_matrix.yaml`` tells where on
-it the camera sits. Stamps are said to carry a deliberate random bias, other for every sequence: only those of one
-sequence may be compared, and a ground truth that shares no time with the images is refused with the measured gap.
+it the camera sits. Stamps are said to carry a deliberate random bias, another for every sequence, so only those of one
+sequence may be compared. A ground truth that shares no time with the images is refused with the measured gap.
 """
 
 from __future__ import annotations

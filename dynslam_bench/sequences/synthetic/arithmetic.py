@@ -1,9 +1,9 @@
 """Functions and products that give the same bits on every processor.
 
 They are made of additions, multiplications, divisions and square roots, which IEEE 754 defines to the bit. The last
-bits of others differ: numpy's `@` and `norm` call a BLAS with a kernel for each processor, numpy's functions have one
-for each width of SIMD vectors, and those of the C library depend on its version and on fused multiply-adds. The
-functions here differ from numpy's by one unit in the last place at most where the result is above 1, else by 2.3e-16.
+bits of others differ. Numpy's `@` and `norm` call a BLAS with a kernel for each processor, and its functions have one
+for each width of SIMD vectors. Those of the C library depend on its version and on fused multiply-adds. The functions
+here differ from numpy's by one unit in the last place at most where the result is above 1, else by 2.3e-16.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The rendered sequences, family by family: what stands and moves in each, and how its camera moves.
 
-Replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, conditions that sensors
-dislike, moving objects after Bonn's, long paths that return, a followed person, and the tempo of TUM's fr1.
+There are replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, and conditions that
+sensors dislike. Then moving objects after Bonn's, long paths that return, a followed person, and the tempo of TUM's
+fr1.
 """
 
 from __future__ import annotations

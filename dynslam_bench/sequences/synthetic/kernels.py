@@ -365,7 +365,7 @@ def flow_field(
 ) -> None:
     """Exact optical flow (float32 pixels) of rows.
 
-    ``motion`` [P, 12] takes a point in this camera's frame, fixed to primitive p, to the other camera's frame; where
+    ``motion`` [P, 12] takes a point in this camera's frame, fixed to primitive p, to the other camera's frame. Where
     nothing is hit or the point leaves the front of the camera, the flow is NaN.
     """
     fx, fy, cx, cy = intrinsics

@@ -1,6 +1,6 @@
 """Renders frames of a scene: geometry, colour, depth as measured, masks and flow.
 
-All rows of a frame see the scene from one pose, or each from its own under a rolling shutter: then the camera's pose is
+All rows of a frame see the scene from one pose, or each from its own under a rolling shutter. Then the camera's pose is
 exact for every row, while things and people are placed as they are when the middle of the image is exposed.
 """
 
