@@ -1,17 +1,20 @@
 """Faults at every file operation below a folder: a kill, a full disk, a read-only one, a folder that is removed.
 
 `survey` runs a piece of work once undisturbed; then, for every operation and every fault, once with the fault at that
-operation and once more to go on from there. What is disturbed is a fork of this process.
+operation and once more to go on from there. What is disturbed is a fork of this process, so `in_a_small_process` runs
+the tests: late in a session a fork of pytest's own process takes fifty times as long.
 """
 
 from __future__ import annotations
 
 import builtins
 import errno
+import functools
 import io
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import traceback
 from collections import Counter
@@ -28,6 +31,26 @@ DONE, TOLD, RAW = 0, 3, 9
 _CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate")
 _TAKES_SPACE = ("open", "os.mkdir", "os.symlink", "write")
 _open = io.open
+
+
+def in_a_small_process(test: Callable[..., None]) -> Callable[..., None]:
+    """Run a test, whose fixtures are texts and paths, in an interpreter that has imported its module and no more."""
+
+    @functools.wraps(test)
+    def run(**fixtures: Any) -> None:
+        arguments = {name: str(value) for name, value in fixtures.items()}
+        code = f"""
+import sys
+from pathlib import Path
+sys.path[:] = {sys.path}
+from {test.__module__} import {test.__name__} as test
+arguments = {arguments}
+test.__wrapped__(**arguments | {{"tmp_path": Path(arguments["tmp_path"])}})
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+
+    return run
 
 
 class Injector:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import survey, tree
+from faults import in_a_small_process, survey, tree
 
 from dynslam_bench.core.download import check_address, download
 from dynslam_bench.core.errors import DownloadError, DynslamError
@@ -47,6 +47,7 @@ def swept(root: Path) -> dict[str, bytes | str]:
     return tree(root)
 
 
+@in_a_small_process
 def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     root = tmp_path / "root"
     path = root / "deep" / "file.txt"
@@ -61,6 +62,7 @@ def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     assert found.ends["kill", -9] == found.operations and found.ends["full", 3] > 0 and found.ends["read-only", 3] > 0
 
 
+@in_a_small_process
 def test_a_folder_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     root = tmp_path / "root"
 
@@ -82,6 +84,7 @@ def test_a_folder_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     assert found.operations >= 8 and found.ends["kill", -9] == found.operations
 
 
+@in_a_small_process
 def test_the_cache_never_gives_half_an_entry(tmp_path: Path) -> None:
     root = tmp_path / "stages"
     cache, arrays = StageCache(root), {"a": np.arange(2000)}
@@ -99,6 +102,7 @@ def test_the_cache_never_gives_half_an_entry(tmp_path: Path) -> None:
     assert found.operations >= 4 and found.ends["kill", -9] == found.operations
 
 
+@in_a_small_process
 def test_a_download_goes_on_after_any_fault(here: str, tmp_path: Path) -> None:
     root = tmp_path / "data"
     found = survey(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from envs_toys import TARGET
-from faults import survey, tree
+from faults import in_a_small_process, survey, tree
 
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -176,6 +176,7 @@ def held(root: Path) -> dict[str, bytes | str]:
     return tree(root)
 
 
+@in_a_small_process
 def test_a_new_run_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     root = tmp_path / "results"
 
@@ -189,6 +190,7 @@ def test_a_new_run_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5 and found.ends.total() == 4 * found.operations
 
 
+@in_a_small_process
 def test_a_run_that_is_made_again_is_never_lost(tmp_path: Path) -> None:
     root = tmp_path / "results"
 
@@ -208,6 +210,7 @@ def test_a_run_that_is_made_again_is_never_lost(tmp_path: Path) -> None:
     assert found.operations > 15 and found.ends["kill", -9] == found.operations
 
 
+@in_a_small_process
 def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
     root = tmp_path / "results"
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import optuna
 import pytest
-from faults import survey
+from faults import in_a_small_process, survey
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning.samplers import RestrictedCmaEsSampler, restore_cma
@@ -38,6 +38,7 @@ def values(path: Path) -> list[float]:
     return [trial.value for trial in optuna.load_study(storage=storage, study_name="s").trials]
 
 
+@in_a_small_process
 def test_no_fault_spoils_a_journal(tmp_path: Path) -> None:
     path = tmp_path / "study" / "journal.log"
     ends = survey(lambda: add(path, 3), path.parent, result=lambda: values(path), faults=("kill", "full", "read-only"))
