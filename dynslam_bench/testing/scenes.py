@@ -120,7 +120,7 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
     }
 
 
-@lru_cache(maxsize=12)
+@lru_cache(maxsize=32)  # the 4 frames and the 24 turning ones of `tracker_report`; 25 MB
 def draw(scene: type[CornerSequence], index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
     """Colour, depth and the panel's mask of a frame."""
     camera, pose = scene.camera, scene.pose(index)
