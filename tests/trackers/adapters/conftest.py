@@ -1,11 +1,7 @@
 """The fixture of the tests of programs."""
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 import shlex
+import sys
 import textwrap
 
 import pytest
