@@ -20,10 +20,10 @@ def headline(board: Board) -> str:
         return "No tracker can be ranked."
     where = f"On {_sequences(board)} "
     best = ranked[0]
+    ratio = "" if best.key == board.reference else f", {_ratio_words(board, best)}"
     if len(ranked) == 1:
-        return f"{where}{board.labels[best.key]} alone is ranked; its error is {_ratio_words(board, best)}."
+        return f"{where}{board.labels[best.key]} alone is ranked{ratio}."
     if len(board.common) < FEWEST:
-        ratio = "" if best.key == board.reference else f", {_ratio_words(board, best)}"
         return (
             f"{where}{board.labels[best.key]} has the smallest error{ratio}; below {FEWEST} sequences "
             "no tracker is called better than another."
@@ -107,4 +107,4 @@ def _names(board: Board, standings: list[Standing]) -> str:
 
 def _ratio_words(board: Board, standing: Standing) -> str:
     reference = "a static camera" if board.reference_name == STATIC_CAMERA else board.reference_name
-    return f"{standing.ratio.value:.2f} times that of {reference}"
+    return f"with {standing.ratio.value:.2f} times the error of {reference}"
