@@ -214,7 +214,9 @@ def _pageless(pages: int, runs: int) -> str:
 
 def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool) -> str:
     """The command that makes the report again."""
-    words = ["dynslam-bench", "report", *map(str, roots), "-o", str(output)]
+    folder = Path.cwd()
+    paths = [path.relative_to(folder) if path.is_relative_to(folder) else path for path in (*roots, output)]
+    words = ["dynslam-bench", "report", *map(str, paths[:-1]), "-o", str(paths[-1])]
     words += ["--on", board.on] if board.on != "common" else []
     words += ["--reference", board.asked_reference] if board.asked_reference else []
     words += ["--most-pages", str(most_pages)] if most_pages is not None else []

@@ -433,6 +433,8 @@ def medians(board: Board, value: Value) -> dict[tuple[str, str], float]:
 def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis]:
     """Best and second best of every column among the ranked trackers whose runs there compete and all succeeded.
 
+    A tracker that is no better there than a static camera takes no part.
+
     Args:
         board: The board.
         values: A number a cell, less is better; a cell that has none takes no part.
@@ -440,7 +442,7 @@ def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis
     marks: dict[tuple[str, str], Emphasis] = {}
     for name in board.sequences:
         keys = [key for key in board.ranked if name in board.cells[key] and not board.cells[key][name].failed]
-        places = [(key, name) for key in keys if board.competes(key, name)]
+        places = [(k, name) for k in keys if board.competes(k, name) and not board.no_better_than_static(k, name)]
         marks |= zip(places, emphasise([values.get(place) for place in places]), strict=True)
     return marks
 
@@ -615,7 +617,9 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         tip = SEEN_NOTE
     elif base is not None:
         ratio = cell.median / max(base, FLOOR_M)
-        colour = max(shade(ratio), 0.0) if cell.failed else shade(ratio)
+        colour = shade(ratio)
+        if cell.failed or board.no_better_than_static(key, sequence):
+            colour = max(colour, 0.0)
         tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
     text = mm(cell.median) + SEEN * cell.in_training
     return TableCell(text, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)

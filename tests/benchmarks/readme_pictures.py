@@ -44,22 +44,20 @@ def main() -> None:
     parser.add_argument("site", type=Path)
     parser.add_argument("results", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "pictures")
-    parser.add_argument("--frame", type=int, default=-1, help="which of the run's pictures, by its number")
+    parser.add_argument("--frame", type=int, default=-1, help="which frame of the run")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(Path(folder) / "browser")
         browser.open(options.site / "leaderboard" / "index.html", 1400)
-        browser.run("all('details').forEach((each) => { each.open = false; })")
-        browser.run("all('.figure').forEach(draw)")
-        browser.settle()
-        framed(browser, "#leaderboard", options.output / "leaderboard.webp", most=760)
+        browser.until("one('.dt-search input')", tries=200)
+        framed(browser, "main", options.output / "leaderboard.webp", most=760)
         store = RunStore(options.results)
         report = build_report(store, Path(folder) / "report")
         browser.open(report.run, 1100, anchor=f"#{store.ids()[0]}")
-        browser.until("one('.thumb canvas')", tries=200)
-        browser.run(f"slide(all('#annotations input[type=range]')[0], {options.frame})") if options.frame >= 0 else None
+        browser.until("one('#time .main-svg') && one('#picture img').complete", tries=200)
+        browser.run(f"slide(byId('frame'), {options.frame})") if options.frame >= 0 else None
         browser.settle()
-        framed(browser, "#s-track .grid-2", options.output / "culling.webp")
+        framed(browser, ".panes", options.output / "culling.webp")
         browser.close()
 
 

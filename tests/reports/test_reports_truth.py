@@ -309,4 +309,10 @@ def test_what_is_no_better_than_not_moving_is_named():
     )
     small = {cells[0].text: [cell.small for cell in cells[1:]] for cells in per_sequence(board, PROTOCOL, []).rows}
     assert "no better than a static camera" in small["FROZEN"][0]
+    worse = make_board([row("frozen", s, 0.3) for s in "st"] + [row("orb-slam2", s, 0.6) for s in "st"])
+    cells = (
+        cell_of(per_sequence(worse, PROTOCOL, []), "FROZEN"),
+        cell_of(per_sequence(worse, PROTOCOL, []), "ORB-SLAM2"),
+    )
+    assert [(cell.emphasis, cell.shade) for cell in cells] == [("", 0.0)] * 2, "neither bold nor blue"
     assert not any("no better" in text for name in ("GOOD", "CONTROL", "FLAKY") for text in small[name])
