@@ -5,7 +5,7 @@ read_kitti  # users with trajectories in KITTI's format
 write_kitti  # the same, the other way
 of_classes  # on Instances, for authors of filters and segmenters
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/reference/environments.md)
-rtf  # on Outcome, for objectives of one's own (docs/tuning.md)
+rtf  # on Outcome, for objectives of one's own (docs/how-to/study.md)
 
 compile_kernels  # cli.demo: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by

@@ -12,6 +12,7 @@ from dynslam_bench.core.settings import Settings, flatten, settings_table
 from dynslam_bench.envs import STATS_LAYOUT
 from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.reports.model.board import Board
+from dynslam_bench.reports.model.published import KINDS, lines_of, records
 from dynslam_bench.runs import RunRecord, load_frames
 from dynslam_bench.runs.store import runs_frame
 from dynslam_bench.trackers import TRACKERS
@@ -37,6 +38,9 @@ PACKAGES = {
 }
 """Pages, with their titles and the modules on them."""
 
+HEADER = ("sequence", "m", "system", "input", "alignment", "protocol", "hardware", "source", "read")
+"""Columns of a table of published errors."""
+
 MANY = 6
 """More trackers than this that share a group of settings are counted, not named."""
 
@@ -44,7 +48,7 @@ MANY = 6
 def reference_pages() -> dict[str, str]:
     """Markdown of every page below ``reference/``, by its path on the site."""
     pages = {"settings": settings(), "commands": commands(), "systems": systems(), "protocols": protocols()}
-    pages["columns"] = columns()
+    pages |= {"columns": columns(), "published": published()}
     for name, (title, modules) in PACKAGES.items():
         pages[f"python/{name}"] = f"# {title}\n\n" + "".join(f"## {m}\n\n::: dynslam_bench.{m}\n\n" for m in modules)
     return {f"reference/{name}.md": text for name, text in pages.items()}
@@ -157,6 +161,23 @@ def columns() -> str:
         name, _, meaning = entry.partition(": ")
         text.append(f"| `{name}` | {' '.join(meaning.split())} |")
     return "\n".join(text) + "\n"
+
+
+def published() -> str:
+    """The lowest published errors by sequence, a table a kind."""
+    text = [
+        "# Published errors\n\nThe lowest absolute trajectory errors found in print, by sequence: RMSE in metres.\n"
+    ]
+    text.append("[How to read them](../how-to/published.md#read-the-numbers)\n")
+    frame = records()
+    for kind, title in KINDS.items():
+        text.append(f"## {title[0].upper()}{title[1:]}\n\n| {' | '.join(HEADER)} |\n|{' --- |' * len(HEADER)}")
+        for r in lines_of(frame[frame["kind"] == kind]):
+            protocol = f"`{r.protocol}`" if r.protocol else "-"
+            cells = (r.system, r.input, r.alignment, protocol, r.hardware, r.source, r.how)
+            text.append(f"| `{r.sequence}` | {r.value:g} | {' | '.join(cells)} |")
+        text.append("")
+    return "\n".join(text)
 
 
 def _section(docstring: str, name: str) -> str:

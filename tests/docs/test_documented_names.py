@@ -85,7 +85,7 @@ def test_files_and_folders_exist() -> None:
 
 
 def test_links_lead_somewhere() -> None:
-    made = re.compile(r"/docs/reference/(?:python/\w+|columns|commands|protocols|settings|systems)\.md$")
+    made = re.compile(r"/docs/reference/(?:python/\w+|columns|commands|protocols|published|settings|systems)\.md$")
     assert not missing(list(links()), lambda text: Path(text).exists() or made.search(text))
 
 

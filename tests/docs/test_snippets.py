@@ -59,8 +59,8 @@ ELSEWHERE = {
     "docs/how-to/program.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
     "docs/how-to/segmenter.md": (2, "tests/trackers/adapters/test_adapter_docs.py"),
     "docs/reference/plugins.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
-    "docs/reports.md": (1, "tests/reports/test_reports_tables.py"),
-    "docs/tuning.md": (2, "tests/tuning/test_python_study.py"),
+    "docs/how-to/report.md": (1, "tests/reports/test_reports_tables.py"),
+    "docs/how-to/study.md": (2, "tests/tuning/test_python_study.py"),
 }
 """Pages with blocks of Python that another test runs, how many, and which."""
 
@@ -134,7 +134,7 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
     assert {spec.tracker for spec in specs} == trackers
 
 
-@pytest.mark.parametrize("page", ["docs/tuning.md", "docs/tutorials/study.md"])
+@pytest.mark.parametrize("page", ["docs/how-to/study.md", "docs/tutorials/study.md"])
 def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
     (text,) = blocks(page, "toml")
     (tmp_path / "study.toml").write_text(text)

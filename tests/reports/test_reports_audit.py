@@ -1,7 +1,6 @@
 """The audit of the paper's tables finds what is known of them, and passes tables that are right."""
 
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -205,18 +204,3 @@ def test_records_stand_beside_their_own_protocol_only():
     assert [cell.value for cell in records_for(names, get_protocol("droid-w/v1-bonn"))] == [0.013]
     assert records_for(names, get_protocol("bonn-camera/v1")) == []
     assert records_for(["bonn/crowd [0:200]"], get_protocol("tum-rgbd/v1")) == []
-
-
-def test_the_page_of_records_is_the_data():
-    page = (Path(__file__).resolve().parents[2] / "docs" / "published.md").read_text(encoding="utf-8")
-    lines = [
-        f"| `{r.sequence}` | {r.value:g} | {r.system} | {r.input} | "
-        f"{f'`{r.protocol}`' if r.protocol else '-'} | {r.source} | {r.how} |"
-        for r in records().itertuples()
-    ]
-    assert [line for line in page.splitlines() if line.startswith("| `")] == lines
-    alignments = {"": "not stated", "tum-rgbd/v1": "SE(3) or not stated"}  # what the page says by the protocol
-    assert all(r.alignment == alignments.get(r.protocol, "Sim(3)") for r in records().itertuples())
-    assert {(r.system, r.hardware) for r in records().itertuples() if r.hardware != "not stated"} == {
-        ("NGD-SLAM", "Ryzen 7 4800H, no GPU")
-    }

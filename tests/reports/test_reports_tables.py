@@ -47,9 +47,9 @@ def test_a_column_in_which_nothing_is_written_is_in_the_csv_only():
 
 def test_the_page_s_python_goes_as_it_stands(made, monkeypatch):
     pytest.importorskip("matplotlib", reason="pandas draws with it")
-    page = Path(__file__).resolve().parents[2] / "docs" / "reports.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "report.md"
     (text,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), flags=re.S | re.M)
     monkeypatch.chdir(made[0].root.parent)
     names = {}
-    exec(compile(text, "docs/reports.md", "exec"), names)
+    exec(compile(text, "docs/how-to/report.md", "exec"), names)
     assert len(names["board"].frame()) == len(names["frame"]) > 5

@@ -118,11 +118,11 @@ def test_the_page_s_python_goes_as_it_stands_but_for_its_runs(
     pytest.importorskip("matplotlib", reason="pandas draws with it")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fast.toml").write_text('"backend.keyframes.tracked_share" = 0.8\n')
-    first, second = re.findall(r"^```python\n(.*?)^```", (DOCS / "tuning.md").read_text(), flags=re.S | re.M)
-    exec(compile(first.replace("trials=30", "trials=6"), "docs/tuning.md", "exec"), {})
+    first, second = re.findall(r"^```python\n(.*?)^```", (DOCS / "how-to" / "study.md").read_text(), flags=re.S | re.M)
+    exec(compile(first.replace("trials=30", "trials=6"), "docs/how-to/study.md", "exec"), {})
     assert "baseline" in capsys.readouterr().out.splitlines()[-1]
     tuned = "params.backend.keyframes.tracked_share"
     second = second.replace("studies/thresholds", "studies/mine").replace("params.epipolar.threshold_px", tuned)
     names: dict[str, Any] = {}
-    exec(compile(second, "docs/tuning.md", "exec"), names)
+    exec(compile(second, "docs/how-to/study.md", "exec"), names)
     assert len(names["frame"]) == 6
