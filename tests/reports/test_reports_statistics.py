@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scikit_posthocs as posthocs
 from scipy import stats
 
 from dynslam_bench.reports.model.statistics import (
@@ -133,7 +134,6 @@ def test_the_critical_difference_is_demsars_and_the_ranks_are_those_of_friedmans
 
 
 def test_nemenyis_differences_are_those_of_scikit_posthocs():
-    posthocs = pytest.importorskip("scikit_posthocs")
     rng = np.random.default_rng(10)
     logs = {str(i): rng.normal(0.4 * i, 0.5, 10) for i in range(6)}
     found = mean_rank_test(logs)
