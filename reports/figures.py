@@ -23,6 +23,8 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "cross", "x", "star", "pentagon", "hexagon", "bowtie")
 DASHES = ("solid", "dash", "dot", "dashdot")
 NEUTRAL = "#8a8a8a"
+MOST_ROWS = 40
+"""Trackers in the figure of ratios; the table beside it has all."""
 MOST_POINTS = 400
 """Points of one tracker in the figure of masks; of more runs as many, from the best to the worst."""
 
@@ -116,11 +118,11 @@ def guide(figure: go.Figure, x: float | None = None, y: float | None = None) -> 
 
 
 def ratio_figure(board: Board) -> go.Figure | None:
-    """Geometric-mean ATE ratios with their intervals, best on top; None where nothing is scored."""
+    """Geometric-mean ATE ratios of the first trackers with their intervals, best on top; None for nothing scored."""
     standings = [s for s in board.standings if np.isfinite(s.ratio.value) and s.key not in board.hopeless]
     if not standings:
         return None
-    look = looks(board)
+    look, standings = looks(board), standings[:MOST_ROWS]
     traces = [
         go.Scatter(
             x=[significant(s.ratio.value)],
@@ -182,7 +184,7 @@ def speed_figure(board: Board) -> go.Figure | None:
         )
     figure = figure_of(
         traces,
-        max(420, 110 + 21 * len(points)),
+        min(max(420, 110 + 21 * len(points)), 1000),
         xaxis=log_axis("× real time (right is better)"),
         yaxis=log_axis("ATE ratio (down is better)"),
     )

@@ -2,15 +2,15 @@
 function startBoard() {
   const tables = new Map();
   const view = address.read();
-  const selected = new Set((view.get("select") ?? "").split(".").filter(Boolean));
-  const panel = () => select("[data-panel]").find((each) => !each.hidden);
+  const selected = new Set((view.get("select") ?? "").split(".").filter(Boolean)), panel = () => select("[data-panel]").find((each) => !each.hidden);
 
   /** The table of a category, made when it is first shown. */
   function tableOf(place) {
     if (tables.has(place)) return tables.get(place);
-    const made = sortable(place.querySelector("table"), {
-      orderFixed: [0, "asc"],
-      layout: { ...TABLE.layout, topStart: { buttons: [{ extend: "colvis", text: "Columns", columns: ":gt(1)" }] }, topEnd: "search" },
+    const element = place.querySelector("table"), paging = element.rows.length > 60;
+    const made = sortable(element, {
+      paging, pageLength: 50, orderFixed: [0, "asc"],
+      layout: { ...TABLE.layout, topStart: { buttons: [{ extend: "colvis", text: "Columns", columns: ":gt(1)" }] }, topEnd: "search", bottomEnd: paging ? "paging" : null },
       columnDefs: [{ targets: 0, visible: false }, { targets: [".n", 2], type: "number" }],
       search: { search: view.get("q") ?? "" },
     });
@@ -20,7 +20,7 @@ function startBoard() {
     made.on("search", () => address.write({ q: made.search() }));
     made.on("order", () => address.write({ sort: made.order().filter(([column, to]) => column && to).map(([column, to]) => `${column}.${to}`)[0] ?? "" }));
     made.on("column-visibility", () => address.write({ hide: made.columns().indexes().toArray().filter((column) => column && !made.column(column).visible()).join(".") }));
-    tables.set(place, made);
+    tables.set(place, made.on("draw", ticks));
     return made;
   }
 

@@ -41,7 +41,7 @@ async function startErrors() {
         return cell;
       }))));
     byId("explore-table").replaceChildren(head, body);
-    table = sortable(byId("explore-table"), { layout: { ...TABLE.layout, topStart: { buttons: [{ extend: "colvis", text: "Columns" }] }, topEnd: "search" } });
+    table = sortable(byId("explore-table"), { paging: trackers.length > 60, pageLength: 50, layout: { ...TABLE.layout, bottomEnd: trackers.length > 60 ? "paging" : null, topStart: { buttons: [{ extend: "colvis", text: "Columns" }] }, topEnd: "search" } });
     const unit = view.scale === "ratio" ? `ratio to ${data.reference}` : { m: "mm", "m/s": "mm/s", deg: "°", "deg/s": "°/s" }[metric.unit];
     byId("explore-caption").textContent = `${metric.name} of the ${metric.which} trajectory (${unit}), median over repeats. Blue is better than ${data.reference}, orange worse. A cell leads to its run with the median error; ✕ counts failures, which enter the ATE as a static camera or worse. ${data.protocol}.`;
   }
