@@ -471,7 +471,8 @@ def _track_figure(track: Series) -> dict[str, Any]:
 def _path(name: str, part: str, line: dict[str, Any], hover: str = "") -> dict[str, Any]:
     place: dict[str, Any] = {axis: f"@{part}_{axis}" for axis in "xyz"}
     extra: dict[str, Any] = {"hovertemplate": hover} if hover else {"hoverinfo": "skip"}
-    return {"type": "scatter3d", "mode": "lines", "name": name, "line": line} | place | extra
+    path: dict[str, Any] = {"type": "scatter3d", "mode": "lines", "name": name, "line": line}
+    return path | place | extra
 
 
 def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
