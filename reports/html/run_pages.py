@@ -471,8 +471,7 @@ def _track_figure(track: Series) -> dict[str, Any]:
 def _path(name: str, part: str, line: dict[str, Any], hover: str = "") -> dict[str, Any]:
     place: dict[str, Any] = {axis: f"@{part}_{axis}" for axis in "xyz"}
     extra: dict[str, Any] = {"hovertemplate": hover} if hover else {"hoverinfo": "skip"}
-    path: dict[str, Any] = {"type": "scatter3d", "mode": "lines", "name": name, "line": line}
-    return path | place | extra
+    return {"type": "scatter3d", "mode": "lines", "name": name, "line": line} | place | extra
 
 
 def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
@@ -481,14 +480,15 @@ def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
         return {}
     parts = {"x": "x (m)", "y": "y (m)", "z": "z (m)"}
     parts |= {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"} if row.rotation_reliable else {}
-    data, layout = [], {"height": 130 * len(parts), "xaxis": {"title": {"text": "time (s)"}}, "showlegend": False}
+    data = []
+    time = {"title": {"text": "time (s)"}, "anchor": f"y{len(parts)}"}
+    layout: dict[str, Any] = {"height": 130 * len(parts), "xaxis": time, "showlegend": False}
     for at, (part, title) in enumerate(parts.items(), 1):
         if "true_t" in track:
             data.append(_line("truth", "true_t", f"true_{part}", NEUTRAL, at, line={"dash": "dash"}))
         data.append(_line("estimate", "track_t", f"track_{part}", COLOURS[0], at))
         domain = [1 - at / len(parts) + 0.01, 1 - (at - 1) / len(parts) - 0.01]
         layout[f"yaxis{at if at > 1 else ''}"] = {"title": {"text": title}, "domain": domain}
-    layout["xaxis"] |= {"anchor": f"y{len(parts)}"}
     return {"data": data, "layout": layout}
 
 
