@@ -337,7 +337,7 @@ def _files_state(files: Iterable[str | Path]) -> tuple[str, int]:
         OSError: One is not there.
     """
     texts, newest = [], 0
-    for path in map(os.fspath, files):
+    for path in [os.fspath(file) for file in files]:
         if not path.startswith(os.sep):
             path = os.path.abspath(path)  # noqa: PTH100 - thousands of files: pathlib takes several times as long
         stat = os.stat(path)  # noqa: PTH116

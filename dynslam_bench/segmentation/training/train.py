@@ -253,7 +253,7 @@ def draw_curve(table: pd.DataFrame, path: Path, title: str) -> None:
         path: The page; plotly's script lies beside it.
         title: Above it.
     """
-    from plotly.subplots import make_subplots  # type: ignore[import-untyped]
+    from plotly.subplots import make_subplots
 
     figure = make_subplots(cols=2, subplot_titles=("losses", "validation scores"))
     for column, names in enumerate((("loss", *LOSSES), SCORES), start=1):
