@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from dynslam_bench.reports import ReportPaths
     from dynslam_bench.runs import ResolvedRun, RunEvent
     from dynslam_bench.runs.running import OnFault
-    from dynslam_bench.tuning import StudySpec, StudySummary, Tuner
+    from dynslam_bench.tuning import Study, StudySpec, StudySummary
 
 R = TypeVar("R", bound=Record)
 
@@ -98,7 +98,7 @@ class StudyResult:
 
     summary: StudySummary
     page: Path
-    tuner: Tuner
+    tuner: Study
 
     @property
     def preset(self) -> Path:

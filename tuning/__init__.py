@@ -10,30 +10,22 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dynslam_bench.tuning.evaluate import Outcome
-    from dynslam_bench.tuning.final_runs import finish, read_preset_text
-    from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
+    from dynslam_bench.tuning.judgement import StudySummary, Verdict, finish, read_preset_text
+    from dynslam_bench.tuning.objectives import Outcome
     from dynslam_bench.tuning.page import write_page
-    from dynslam_bench.tuning.plan import Plan, Preview
+    from dynslam_bench.tuning.plan import Plan, Preview, distributions, search_space
     from dynslam_bench.tuning.samplers import EmfoaSampler
-    from dynslam_bench.tuning.space import distributions, search_space
-    from dynslam_bench.tuning.study import Study, run_study
-    from dynslam_bench.tuning.study_file import SpaceSpec, StudySpec, read_study
-    from dynslam_bench.tuning.summary import StudySummary, Verdict
-    from dynslam_bench.tuning.tuner import Evaluation, StudyEvent, Tuner
+    from dynslam_bench.tuning.study import Evaluation, Study, StudyEvent, run_study
+    from dynslam_bench.tuning.study_file import ProblemInstance, SpaceSpec, StudySpec, parse_instances, read_study
 
 _HOMES = {
-    "instances": ("ProblemInstance", "parse_instances"),
-    "samplers": ("EmfoaSampler",),
-    "evaluate": ("Outcome",),
-    "final_runs": ("finish", "read_preset_text"),
+    "judgement": ("StudySummary", "Verdict", "finish", "read_preset_text"),
+    "objectives": ("Outcome",),
     "page": ("write_page",),
-    "plan": ("Plan", "Preview"),
-    "study": ("Study", "run_study"),
-    "space": ("distributions", "search_space"),
-    "tuner": ("Evaluation", "StudyEvent", "Tuner"),
-    "study_file": ("SpaceSpec", "StudySpec", "read_study"),
-    "summary": ("StudySummary", "Verdict"),
+    "plan": ("Plan", "Preview", "distributions", "search_space"),
+    "samplers": ("EmfoaSampler",),
+    "study": ("Evaluation", "Study", "StudyEvent", "run_study"),
+    "study_file": ("ProblemInstance", "SpaceSpec", "StudySpec", "parse_instances", "read_study"),
 }
 
 __all__ = [
@@ -48,7 +40,6 @@ __all__ = [
     "StudyEvent",
     "StudySpec",
     "StudySummary",
-    "Tuner",
     "Verdict",
     "distributions",
     "finish",

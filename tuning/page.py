@@ -22,13 +22,12 @@ from dynslam_bench.reports.figures import COLOURS, NEUTRAL, figure_of, guide
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
 from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
-from dynslam_bench.tuning.final_runs import preset_text
-from dynslam_bench.tuning.instances import ProblemInstance, scenes
+from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict, preset_text, worth
 from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
-from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, Verdict, worth
-from dynslam_bench.tuning.trials import EARLIER, FEWEST_TRIALS, errors_of
-from dynslam_bench.tuning.tuner import Tuner
+from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, errors_of
+from dynslam_bench.tuning.study import Study
+from dynslam_bench.tuning.study_file import ProblemInstance, scenes
 
 _LEVELS = {Verdict.PROVEN: "green", Verdict.WORSE: "red"}
 """Colour of the verdict; all others are amber."""
@@ -36,7 +35,7 @@ _CONTOURS = 4
 """Contours of so many parameters are drawn, the most important ones."""
 
 
-def write_page(tuner: Tuner, summary: StudySummary) -> Path:
+def write_page(tuner: Study, summary: StudySummary) -> Path:
     """Write the page of a finished study.
 
     Args:
@@ -83,7 +82,7 @@ def write_page(tuner: Tuner, summary: StudySummary) -> Path:
     return path
 
 
-def _asked(tuner: Tuner, summary: StudySummary) -> str:
+def _asked(tuner: Study, summary: StudySummary) -> str:
     """What the study was asked, in words."""
     goals = " and ".join(objective.what for objective in tuner.objectives)
     trials = ", ".join(f"{count} {state}" for state, count in summary.trials.items() if count)
@@ -103,7 +102,7 @@ def _size(instances: Sequence[ProblemInstance]) -> str:
     return f"{len(instances)} runs, {len(scenes(instances))} scenes" if instances else "none"
 
 
-def _plots(tuner: Tuner, summary: StudySummary) -> list[Block]:
+def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
     """Optuna's own plots of the study; ratios in place of logarithms."""
     from optuna import visualization
 
@@ -135,7 +134,7 @@ def _plots(tuner: Tuner, summary: StudySummary) -> list[Block]:
     return blocks
 
 
-def _preset(tuner: Tuner, summary: StudySummary, settings: Table) -> list[Block]:
+def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]:
     """The best settings with their status, and how to use them only if they are proven."""
     shown, best = Block("table", table=settings), summary.best
     if best is None:
@@ -170,7 +169,7 @@ def _importance_note(summary: StudySummary) -> str:
     return f"Importances (PED-ANOVA) and their 95 % intervals: {shares}. They add up to 100 % even where none matters."
 
 
-def _funnel_figure(tuner: Tuner, summary: StudySummary) -> go.Figure | None:
+def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure | None:
     """Ratios of all trials, of the confirmed candidates, and of the choice where it is judged; None for no trial."""
     tried = [
         (trial.number, math.exp(trial.values[0]))
@@ -228,7 +227,7 @@ def fewer_starts(design: Design) -> str:
     )
 
 
-def warnings_of(tuner: Tuner) -> list[str]:
+def warnings_of(tuner: Study) -> list[str]:
     """What a reader of the course should know, in sentences."""
     notes = []
     if _seeds_change_nothing(tuner):
@@ -252,7 +251,7 @@ def warnings_of(tuner: Tuner) -> list[str]:
     return notes
 
 
-def _seeds_change_nothing(tuner: Tuner) -> bool:
+def _seeds_change_nothing(tuner: Study) -> bool:
     """Whether there are runs of one trial that differ in the seed alone, and all of them are equal to the bit."""
     errors: dict[tuple[int, ProblemInstance], list[float]] = {}
     for trial in tuner.study.get_trials(deepcopy=False):
@@ -318,7 +317,7 @@ def _marked(summary: StudySummary, *headings: tuple[str, str]) -> list[str]:
     return [f"{heading} {SEEN}" if split in summary.seen else heading for heading, split in headings]
 
 
-def _trials(tuner: Tuner, summary: StudySummary) -> Table:
+def _trials(tuner: Study, summary: StudySummary) -> Table:
     names = [parameter.name for parameter in tuner.space]
     rows = [
         [

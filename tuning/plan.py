@@ -3,32 +3,136 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import optuna
 import pandas as pd
 
+from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.core.records import Record
-from dynslam_bench.core.settings import Settings, apply_overrides, field_names, flatten
+from dynslam_bench.core.settings import (
+    Parameter,
+    Scalar,
+    Settings,
+    apply_overrides,
+    field_names,
+    flatten,
+    parameters,
+    why_unused,
+)
 from dynslam_bench.core.toml import read_settings
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunRecord, RunStore, load_frames
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning.evaluate import Configuration, held_protocol, outcome
-from dynslam_bench.tuning.instances import ProblemInstance, scenes
 from dynslam_bench.tuning.objectives import (
+    FEWEST_SCENES,
     FLOOR_M,
+    Configuration,
     Objective,
     detectable,
     find_objective,
+    held_protocol,
+    outcome,
     place_of,
     scenes_needed,
 )
-from dynslam_bench.tuning.space import search_space, starting_point
-from dynslam_bench.tuning.splits import design_of
-from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.splits import design_of, source_of_masks
+from dynslam_bench.tuning.study_file import ProblemInstance, SpaceSpec, StudySpec, scenes
+
+
+def search_space(settings: Settings, spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
+    """The parameters of a study; what has no effect with the baseline's settings is no part of it.
+
+    Args:
+        settings: The tracker's, the baseline's and the fixed ones among them.
+        spec: Which of them are tuned.
+        sequences: What the study runs on, which decides what the source of masks ``auto`` is.
+
+    Raises:
+        StudyError: A pattern matches nothing, names a setting that has no effect, or nothing is left to tune.
+    """
+    every = parameters(type(settings))
+    for pattern in (*spec.include, *spec.exclude):
+        if not any(fnmatchcase(parameter.name, pattern) for parameter in every):
+            similar = did_you_mean(pattern, [parameter.name for parameter in every])
+            hint = "it exists, but is not tunable" if pattern in field_names(type(settings)) else similar
+            raise StudyError(f"'{pattern}' matches no tunable setting", hint)
+    chosen = [
+        parameter
+        for parameter in every
+        if any(fnmatchcase(parameter.name, pattern) for pattern in spec.include)
+        and not any(fnmatchcase(parameter.name, pattern) for pattern in spec.exclude)
+        and parameter.name not in spec.fixed
+    ]
+    if hasattr(settings, "segmentation"):  # "auto" stands for a source
+        settings = apply_overrides(settings, {"segmentation.source": source_of_masks(settings, list(sequences))})
+    unused = {parameter.name: why for parameter in chosen if (why := why_unused(settings, parameter.name))}
+    chosen = [parameter for parameter in chosen if parameter.name not in unused]
+    if not chosen:
+        raise StudyError("the space is empty: all that matches is excluded, fixed, or switched off by a fixed value")
+    for name in spec.include:
+        if name in unused:
+            raise StudyError(
+                f"'{name}' has no effect in this study: {unused[name]}", "leave it out, or fix that otherwise"
+            )
+    return chosen
+
+
+def distributions(space: Sequence[Parameter]) -> dict[str, optuna.distributions.BaseDistribution]:
+    """A space of `search_space` as ``optuna.Study.ask`` takes it."""
+    return {parameter.name: distribution(parameter) for parameter in space}
+
+
+def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
+    """Optuna's distribution of a parameter."""
+    if parameter.kind in ("bool", "categorical"):
+        return optuna.distributions.CategoricalDistribution(parameter.choices)
+    assert parameter.low is not None and parameter.high is not None
+    log = parameter.scale == "log"
+    if parameter.kind == "int":
+        return optuna.distributions.IntDistribution(int(parameter.low), int(parameter.high), log=log)
+    return optuna.distributions.FloatDistribution(parameter.low, parameter.high, log=log)
+
+
+def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
+    """A preset as a configuration of a study; what it does not say is as the baseline has it.
+
+    Args:
+        preset: Settings by dotted name.
+        space: The study's, from `search_space`.
+        base: Values of all settings that are not tuned.
+
+    Raises:
+        StudyError: The preset sets what the study does not tune to something else, or to a value out of its range.
+    """
+    tuned = {parameter.name: parameter for parameter in space}
+    for name, value in preset.items():
+        if name not in base:
+            raise StudyError(f"the preset to start from sets an unknown '{name}'", did_you_mean(name, list(base)))
+        if name not in tuned and base[name] != value:
+            raise StudyError(
+                f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
+                f'tune it, or say "{name}" = ... under [space.fixed]',
+            )
+    point = {name: preset.get(name, base[name]) for name in tuned}
+    for name, value in point.items():
+        if not _fits(tuned[name], value):
+            raise StudyError(f"the preset to start from sets {name} = {value!r}, out of the range that the study tunes")
+    return point
+
+
+def _fits(parameter: Parameter, value: Any) -> bool:
+    span = distribution(parameter)
+    try:
+        return bool(span._contains(span.to_internal_repr(value)))
+    except ValueError:
+        return False
+
 
 GAIN = 0.10
 """The gain of which a preview says how many scenes would show it."""
@@ -66,13 +170,14 @@ class Preview(Record):
     @property
     def lines(self) -> list[str]:
         """The same for people."""
-        measured = (
-            f"{self.runs} stored runs of the baseline" if self.runs else "other trackers' runs, none is stored yet"
-        )
+        source = f"{self.runs} stored runs of the baseline" if self.runs else "other trackers' runs, none is stored yet"
+        needed = f"A gain of {100 * GAIN:.0f} % takes {self.needed} scenes to show"
+        shown = f"the {self.scenes} that judge this study show {100 * self.detectable:.0f} %"
+        if self.scenes < FEWEST_SCENES:
+            shown = f"{self.scenes} can judge this study, and below {FEWEST_SCENES} it claims nothing"
         lines = [
-            f"A gain of {100 * GAIN:.0f} % takes {self.needed} scenes to show; the {self.scenes} that judge this study "
-            f"show {100 * self.detectable:.0f} % (spread {self.spread:.2f} over scenes, from {measured}).",
-            f"The study takes {self.minutes:.0f} min if no trial is pruned.",
+            f"{needed}; {shown} (spread {self.spread:.2f} over scenes, from {source}).",
+            f"The study takes about {max(1, math.ceil(self.minutes))} min if no trial is pruned.",
         ]
         lines += [f"{name} is not used here: {why}." for name, why in self.unused.items()]
         if self.unused:
@@ -136,8 +241,8 @@ class Plan:
         """What the study could show, from the baseline's stored runs where there are some."""
         design, spec = self.design, self.spec
         records = {instance: record for instance in design.reference if (record := self._stored(instance)) is not None}
-        judged = scenes(design.held_out or design.confirm or design.tune)
-        starts = sum(map(len, judged.values())) / len(judged)
+        judged = scenes(design.held_out or design.confirm if design.confirm else ())
+        starts = sum(map(len, judged.values())) / len(judged) if judged else 1.0
         spread = (self._scatter(records) or SPREAD) / math.sqrt(starts)
         seconds = [record.wall_s for record in records.values()]
         frames = [len(instance.open(spec.data_root)) for instance in design.tune[:1]]

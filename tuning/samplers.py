@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import optuna
 from numpy.typing import NDArray
-from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+from optuna._transform import _SearchSpaceTransform
+from optuna.distributions import BaseDistribution
 from optuna.search_space import IntersectionSearchSpace
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
@@ -45,7 +46,7 @@ class StreamedSampler(optuna.samplers.BaseSampler):
     """Makes a sampler for each trial, seeded by the study's seed and the trial's number.
 
     Numbers are given out by the storage, so no two workers, and no worker that goes on later, draw from one stream, and
-    a study with one worker gives the same trials again.
+    a study with one worker gives the same trials again. `Study.ask` draws all settings of a trial before the next.
 
     Args:
         build: Makes a sampler with a seed; what it knows of earlier trials it reads from the study.
@@ -54,36 +55,27 @@ class StreamedSampler(optuna.samplers.BaseSampler):
 
     def __init__(self, build: Callable[[int], optuna.samplers.BaseSampler], seed: int) -> None:
         self._build, self._seed = build, seed
-        self._samplers: dict[int, optuna.samplers.BaseSampler] = {}
 
     def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
         """Make the trial's sampler."""
-        seed = int(stream(self._seed, "sampler", trial.number).integers(2**31))
-        self._samplers[trial.number] = self._build(seed)
-        self._samplers[trial.number].before_trial(study, trial)
+        self._sampler = self._build(int(stream(self._seed, "sampler", trial.number).integers(2**31)))
+        self._sampler.before_trial(study, trial)
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         """See Optuna."""
-        return self._samplers[trial.number].infer_relative_search_space(study, trial)
+        return self._sampler.infer_relative_search_space(study, trial)
 
     def sample_relative(
         self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
         """See Optuna."""
-        return self._samplers[trial.number].sample_relative(study, trial, search_space)
+        return self._sampler.sample_relative(study, trial, search_space)
 
     def sample_independent(
         self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
         """See Optuna."""
-        return self._samplers[trial.number].sample_independent(study, trial, param_name, param_distribution)
-
-    def after_trial(
-        self, study: optuna.Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
-    ) -> None:
-        """Drop the trial's sampler; a trial of a dead worker of another process has none here."""
-        if sampler := self._samplers.pop(trial.number, None):
-            sampler.after_trial(study, trial, state, values)
+        return self._sampler.sample_independent(study, trial, param_name, param_distribution)
 
 
 def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
@@ -175,8 +167,8 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
     last position around its flame (Eq. 8-10), with a Cauchy step in the first half of the budget (Eq. 13-16) and the
     pull of the best flame in the second (Eq. 17-18). The number of flames falls over the budget (Eq. 11).
 
-    Numbers move in the unit interval of their (linear or logarithmic) range; categories are taken from the flame, or
-    drawn again with the probability that a spiral leaves the interval. Pruned trials with a value count as finished.
+    Moths move in the unit cube: a number in its (linear or logarithmic) range, a category by its one-hot code. Pruned
+    trials count as finished, and as worse than all complete ones.
 
     Args:
         seed: Of the random numbers.
@@ -200,8 +192,8 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         """The parameters that all finished trials share."""
-        space = self._space.calculate(study)
-        return {name: distribution for name, distribution in space.items() if not distribution.single()}
+        shared = self._space.calculate(study).items()
+        return {name: distribution for name, distribution in shared if not distribution.single()}
 
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
@@ -211,30 +203,24 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
             raise ValueError("EmfoaSampler takes one objective")
         if not search_space:
             return {}
-        names = sorted(search_space)
-        finished = []
-        for other in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)):
-            if not np.isnan(_value(other)) and search_space.keys() <= other.params.keys():
-                finished.append(other)
-        units = [[to_unit(other.params[name], search_space[name]) for name in names] for other in finished]
-        moths = np.array(units).reshape(-1, len(names))
+        cube, sign = _SearchSpaceTransform(search_space, transform_0_1=True), 1.0
+        if study.direction == StudyDirection.MAXIMIZE:
+            sign = -1.0
+        trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
+        finished = [one for one in trials if one.value is not None and search_space.keys() <= one.params.keys()]
+        units = [cube.transform({name: one.params[name] for name in search_space}) for one in finished]
+        moths = np.array(units).reshape(-1, len(cube.bounds))
         if len(moths) < self._population:
-            drawn = zip(names, self._first_population(moths), strict=True)
-            return {name: from_unit(value, search_space[name]) for name, value in drawn}
-        sign = 1.0 if study.direction == StudyDirection.MINIMIZE else -1.0
-        order = np.argsort([sign * _value(other) for other in finished], kind="stable")
-        flames = moths[order[: self._population]]
+            return cube.untransform(self._first_population(moths))
+        ranks = [(one.state == TrialState.PRUNED, sign * float(one.value or 0.0)) for one in finished]
+        flames = moths[sorted(range(len(moths)), key=ranks.__getitem__)[: self._population]]
         index, at = trial.number % self._population, min(trial.number, self._n_trials)
-        own = [row for row, other in enumerate(finished) if other.number % self._population == index]
+        own = [row for row, one in enumerate(finished) if one.number % self._population == index]
         moth = moths[own[-1] if own else -1]
         around = flames[min(index, flames_left(self._population, at, self._n_trials) - 1)]
         now = flight(at / self._n_trials, EMFOA)
         landed = moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
-        flame = finished[order[index]]
-        return {
-            name: self._land(value, search_space[name], flame.params[name])
-            for name, value in zip(names, np.asarray(landed), strict=True)
-        }
+        return cube.untransform(np.clip(landed, 0.0, 1.0))
 
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
@@ -249,50 +235,6 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
             low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
             unit = opposites(members[0], low, high, low, high, self._rng.random)
         return np.asarray(unit)
-
-    def _land(self, value: float, distribution: BaseDistribution, flame: Any) -> Any:
-        if isinstance(distribution, CategoricalDistribution):
-            if 0.0 <= value <= 1.0 and self._rng.random() > 0.1:
-                return flame
-            return distribution.choices[int(self._rng.integers(len(distribution.choices)))]
-        return from_unit(float(np.clip(value, 0.0, 1.0)), distribution)
-
-
-def _value(trial: FrozenTrial) -> float:
-    """The value of a complete trial, the last intermediate one of a pruned trial; NaN without any."""
-    if trial.state == TrialState.COMPLETE:
-        return float(trial.value)  # type: ignore[arg-type]  # one objective
-    return trial.intermediate_values[max(trial.intermediate_values)] if trial.intermediate_values else np.nan
-
-
-def _scaled_bounds(distribution: Any) -> tuple[float, float]:
-    """Ends of a numerical range, half a step wider for stepped ones, so that both ends are drawn as often."""
-    half = (distribution.step or 0) / 2
-    low, high = distribution.low - half, distribution.high + half
-    return (float(np.log(low)), float(np.log(high))) if distribution.log else (low, high)
-
-
-def to_unit(value: Any, distribution: Any) -> float:
-    """Where a value lies in its range, 0 to 1; of a category the middle of its share."""
-    if isinstance(distribution, CategoricalDistribution):
-        return float((distribution.to_internal_repr(value) + 0.5) / len(distribution.choices))
-    low, high = _scaled_bounds(distribution)
-    scaled = np.log(value) if distribution.log else float(value)
-    return float((scaled - low) / (high - low))
-
-
-def from_unit(unit: float, distribution: Any) -> Any:
-    """The value that lies at `unit` of its range."""
-    if isinstance(distribution, CategoricalDistribution):
-        return distribution.choices[min(int(unit * len(distribution.choices)), len(distribution.choices) - 1)]
-    low, high = _scaled_bounds(distribution)
-    value = low + unit * (high - low)
-    if distribution.log:
-        value = float(np.exp(value))
-    if distribution.step is not None:
-        value = distribution.low + distribution.step * round((value - distribution.low) / distribution.step)
-    value = np.clip(value, distribution.low, distribution.high)
-    return int(value) if isinstance(distribution, IntDistribution) else float(value)
 
 
 FIRST_STEP = 3

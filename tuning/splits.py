@@ -25,9 +25,8 @@ from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
 from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
 from dynslam_bench.sequences.view import Part, part_of
-from dynslam_bench.tuning.instances import ProblemInstance, further_scenes, scenes, stretches_behind
 from dynslam_bench.tuning.objectives import place_of
-from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, further_scenes, scenes, stretches_behind
 
 FEWEST_STARTS = 3
 """The baseline runs from so many starts at every place: all trials would share the luck of a single one."""

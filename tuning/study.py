@@ -1,37 +1,118 @@
-"""Studies from Python: run one with custom objectives, samplers and callbacks, trial by trial, or open a stored one."""
+"""A study: trial 0 is the baseline, trials run on growing sets of instances, everything resumes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import json
+import math
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import optuna
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.records import digest, write_atomic
+from dynslam_bench.core.sanitise import storable, words_without_passwords
 from dynslam_bench.core.settings import Scalar
-from dynslam_bench.tuning.final_runs import finish
-from dynslam_bench.tuning.instances import ProblemInstance
-from dynslam_bench.tuning.objectives import Cost, Objective, find_objective, own_objective
-from dynslam_bench.tuning.page import write_page
-from dynslam_bench.tuning.plan import Preview
-from dynslam_bench.tuning.storage import load_study, read_stored
-from dynslam_bench.tuning.study_file import StudySpec, make_spec, read_study
-from dynslam_bench.tuning.summary import StudySummary
-from dynslam_bench.tuning.trials import trials_frame
-from dynslam_bench.tuning.tuner import Evaluation, OnEvent, OnRun, StudyEvent, Tuner
+from dynslam_bench.core.toml import read_settings
+from dynslam_bench.runs import RunEvent
+from dynslam_bench.runs.identity import resolve
+from dynslam_bench.runs.record import program_of
+from dynslam_bench.tuning.objectives import (
+    CancelledError,
+    Configuration,
+    Cost,
+    InstanceFailedError,
+    Objective,
+    Outcome,
+    Outcomes,
+    coverage,
+    evaluate,
+    find_objective,
+    fps,
+    own_objective,
+    together,
+    violations,
+)
+from dynslam_bench.tuning.plan import Plan, distributions, starting_point
+from dynslam_bench.tuning.samplers import build_pruner, build_sampler, is_dominated, step_name, steps
+from dynslam_bench.tuning.splits import design_of
+from dynslam_bench.tuning.storage import (
+    EARLIER,
+    SPEC_FILE,
+    best_trials,
+    load_study,
+    open_storage,
+    read_stored,
+    study_folder,
+    trials_frame,
+    without_password,
+    worker_is_dead,
+    worker_name,
+)
+from dynslam_bench.tuning.study_file import ProblemInstance, PrunerName, StudySpec, make_spec, read_study
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from dynslam_bench.tuning.judgement import StudySummary
+
+CRASHED_WORKER = "worker ended in the middle of the trial"
+
+
+@dataclass(frozen=True)
+class StudyEvent:
+    """Something happened in a study.
+
+    Attributes:
+        kind: ``preview`` (what it could show), ``reference`` (runs of the baseline), ``started`` or ``finished`` (a
+            trial).
+        number: Of the trial.
+        total: How many there are to be.
+        text: One line.
+    """
+
+    kind: Literal["preview", "reference", "started", "finished"]
+    number: int
+    total: int
+    text: str
+
+
+OnEvent = Callable[[StudyEvent], None]
+OnRun = Callable[[RunEvent], None]
+"""Called with every event of every run of a study, possibly by several threads at a time."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a trial came to.
+
+    Attributes:
+        state: Complete, pruned or failed.
+        text: In words.
+        values: The objectives' (natural logarithms of ratios to the baseline, less is better); None if it failed.
+    """
+
+    state: TrialState
+    text: str
+    values: list[float] | None = None
 
 
 Callback = Callable[[optuna.Study, FrozenTrial], object]
 """Called after each trial, as Optuna's own."""
 
 
-class Study:
-    """A study, to be run or to be looked at.
+class Study(Plan):
+    """A study to be run: at once, or trial by trial with `ask`, `evaluate` and `tell`.
 
     Example:
         ``Study(tracker="orb-slam2", tune=["synthetic/walking_xyz?scene=0-3&frames=80"], name="few").run().finish()``
@@ -39,105 +120,431 @@ class Study:
     Args:
         spec: The study, or its TOML file; None if the fields say it all.
         results: The results folder.
+        reading: Only look at a stored study: one of another version of the code opens too, but runs nothing more.
         objective: In place of the spec's: names of objectives, or functions from
-            `evaluate.Outcome` to a cost above 0, one or several.
+            `objectives.Outcome` to a cost above 0, one or several.
         sampler: Any of Optuna's, in place of the spec's.
         callbacks: Called with Optuna's study and the trial after each trial.
         **fields: Fields of `StudySpec`, in place of the spec's; `tune`, `confirm` and `held_out` take instances, too.
 
     Attributes:
-        spec: What it asks for.
         study: Optuna's study.
+        on_run: Called with every event of every run from now on; None for no calls.
+        pruner: The study's; trials of several objectives are compared at the steps of ``halving``.
 
     Raises:
-        DynslamError: See `Tuner`.
+        DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
+            study's name; nothing has run then. With `reading` also when nothing is stored.
     """
-
-    spec: StudySpec
-    study: optuna.Study
-    _tuner: Tuner | None
 
     def __init__(
         self,
         spec: StudySpec | Path | str | None = None,
+        results: str | Path = "results",
         *,
-        results: Path | str = "results",
+        reading: bool = False,
         objective: str | Cost | Sequence[str | Cost] | None = None,
         sampler: optuna.samplers.BaseSampler | None = None,
         callbacks: Iterable[Callback] = (),
         **fields: Any,
     ) -> None:
         base = read_study(spec) if isinstance(spec, Path | str) else spec
-        objectives = _objectives(objective)
-        changes = {key: _texts(value) for key, value in fields.items()}
+        changes, objectives = {key: _texts(value) for key, value in fields.items()}, _objectives(objective)
         if objectives is not None:
             changes["objectives"] = tuple(objective.name for objective in objectives)
-        values = {} if base is None else base.model_dump()
-        self.spec = make_spec({"name": "study", **values, **changes}, "the study")
-        self._tuner = tuner = Tuner(self.spec, results, objectives=objectives, sampler=sampler)
-        self.study = tuner.study
-        self._callbacks = tuple(callbacks)
+        if base is None or changes:
+            values = {} if base is None else base.model_dump()
+            base = make_spec({"name": "study", **values, **changes}, "the study")
+        super().__init__(base, results, objectives=objectives, accept=reading)
+        spec, self._callbacks = base, tuple(callbacks)
+        self.reading = reading
+        several = len(self.objectives) > 1  # Optuna's pruners take one objective
+        self.pruner: PrunerName = "halving" if several and spec.pruner == "wilcoxon" else spec.pruner
+        sampler = build_sampler(spec) if sampler is None else sampler
+        self.steps = self._comparable_steps()
+        self.store.prepare()
+        self.folder = study_folder(self.results, spec)
+        self._identity = self._identify()
+        self._lock = threading.Lock()
+        self._interrupted = threading.Event()
+        self._reference: dict[ProblemInstance, Outcome] = {}
+        self.on_run: OnRun | None = None
+        self.study = self._open(sampler, [] if reading else list(self._beginnings()))
+        if self.extension["scenes"]:
+            self.design = design_of(spec, accept=reading, further=self.extension["scenes"])
 
-    @classmethod
-    def open(cls, study: StudySpec | Path | str, results: Path | str = "results") -> Study:
-        """Open a stored study to look at; nothing is run, and neither tracker nor sequences need to be there.
+    @property
+    def extension(self) -> dict[str, int]:
+        """Scenes and trials that `extend` has added."""
+        return {"scenes": 0, "trials": 0, **self.study.user_attrs.get("extension", {})}
+
+    @property
+    def trials(self) -> int:
+        """How many finished trials the study asks for."""
+        return self.spec.trials + self.extension["trials"]
+
+    def extend(self, *, scenes: int = 0, trials: int = 0) -> None:
+        """Ask for more trials, and for more rendered scenes to choose and to judge on.
+
+        Raises:
+            StudyError: So many scenes cannot be made.
+        """
+        total = {"scenes": self.extension["scenes"] + scenes, "trials": self.extension["trials"] + trials}
+        self.design = design_of(self.spec, further=total["scenes"])
+        self.study.set_user_attr("extension", total)
+
+    def run(self, *, jobs: int = 1, on_event: OnEvent | None = None) -> Study:
+        """Run trials until the study has as many finished ones as it asks for.
+
+        Several processes, on one or many machines, may do so at the same time on one storage.
 
         Args:
-            study: A study, its TOML file, or its folder in the results (``results/studies/NAME``).
-            results: The results folder; a study's own folder says where it lies.
+            jobs: Trials at a time in this process.
+            on_event: Called with every event.
 
         Raises:
-            StudyError: There is no such study.
+            StudyError: The baseline fails on a sequence; says where and why.
         """
-        opened, root = cls.__new__(cls), Path(results)
-        if isinstance(study, StudySpec):
-            opened.spec = study
-        elif (path := Path(study).expanduser()).is_dir():
-            opened.spec, root = read_stored(path)
-        else:
-            opened.spec = read_study(path)
-        opened.study, opened._tuner = load_study(root, opened.spec), None
-        return opened
+        self.reference(on_event, jobs)
+        deadline, tell = time.monotonic() + (self.spec.timeout_s or math.inf), on_event or (lambda _: None)
 
-    def preview(self, *, jobs: int = 1) -> Preview:
-        """What the study could show and how long it takes; see `plan.Plan.preview`."""
-        return self._running().preview(jobs)
+        def work() -> None:
+            while time.monotonic() < deadline and not self._interrupted.is_set() and self._more():
+                trial = self.ask()
+                tell(StudyEvent("started", trial.number, self.trials, f"trial {trial.number}"))
+                evaluation = self.evaluate(trial)
+                self.tell(trial, evaluation)
+                tell(StudyEvent("finished", trial.number, self.trials, f"trial {trial.number}: {evaluation.text}"))
+                for callback in self._callbacks:
+                    callback(self.study, self.study.get_trials(deepcopy=False)[trial.number])
 
-    def run(self, *, jobs: int = 1) -> Study:
-        """Run the trials that are missing.
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool, self._ending_all():
+            for future in [pool.submit(work) for _ in range(jobs)]:
+                future.result()
+        return self
+
+    @contextmanager
+    def _ending_all(self) -> Iterator[None]:
+        """Whatever interrupts the waiting ends the runs of all threads at once."""
+        try:
+            yield
+        except BaseException:
+            self._interrupted.set()
+            raise
+
+    def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[ProblemInstance, Outcome]:
+        """The baseline's outcomes on the tune split, to which every trial is compared.
 
         Raises:
-            StudyError: The baseline fails, or the study was opened to be looked at.
+            StudyError: The baseline fails; says where and why.
         """
-        self._running().run(jobs=jobs, on_event=self._call_back)
-        return self
+        missing = [instance for instance in self.design.reference if instance not in self._reference]
+        if on_event is not None:
+            on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
+        with self._ending_all():
+            try:
+                self._reference |= self.outcomes(
+                    self.baseline.settings, missing, tracker=self.baseline.tracker, jobs=jobs
+                )
+            except InstanceFailedError as error:
+                raise StudyError(f"the baseline fails: {error.args[0]}", "a study needs one that runs") from error
+            except CancelledError as error:
+                raise StudyError("interrupted") from error
+        return self._reference
 
-    def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
-        """The next trial, as the sampler proposes it; see `Tuner.ask`."""
-        return self._running().ask(settings)
+    def outcomes(
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        tracker: str = "",
+        jobs: int = 1,
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
+        """Run settings on instances as this study does; see `objectives.evaluate`.
 
-    def evaluate(self, trial: optuna.Trial) -> Evaluation:
-        """Run a trial; see `Tuner.run_trial`."""
-        return self._running().run_trial(trial)
+        Args:
+            settings: Overrides, dotted name to value.
+            instances: Where.
+            tracker: Whose; the study's if empty.
+            jobs: Runs at a time.
+            cache: Whether to use the stage cache; None for what the study says.
+        """
+        return evaluate(
+            tracker or self.spec.tracker, settings, instances, results=self.store, jobs=jobs,
+            protocol=self.spec.protocol, threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
+            data_root=self.spec.data_root, study=self.spec.name, cancelled=self._interrupted.is_set, on_run=self.on_run,
+        )  # fmt: skip
 
-    def tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
-        """Store what a trial came to."""
-        self._running().tell(trial, evaluation)
+    def evaluate_beside(
+        self, configurations: Sequence[Configuration], instances: Sequence[ProblemInstance], *, jobs: int = 1
+    ) -> list[dict[ProblemInstance, Outcome] | InstanceFailedError]:
+        """Run configurations instance by instance, without the stage cache, so that their times can be compared.
 
-    def extend(self, *, scenes: int = 0, trials: int = 0) -> Study:
-        """Ask for more rendered scenes to judge on and for more trials; `run` and `finish` then go on."""
-        self._running().extend(scenes=scenes, trials=trials)
-        return self
+        Other load on the machine then slows all of them alike.
+
+        Returns:
+            For each configuration its outcomes, or the error of its first failed run; it runs on no instance after it.
+        """
+        results: list[dict[ProblemInstance, Outcome] | InstanceFailedError] = [{} for _ in configurations]
+
+        def one(instance: ProblemInstance, number: int) -> None:
+            result = results[number]
+            if isinstance(result, dict):
+                try:
+                    tracker, settings = configurations[number]
+                    result |= self.outcomes(settings, [instance], tracker=tracker, cache=False)
+                except InstanceFailedError as error:
+                    results[number] = error
+
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-beside") as pool, self._ending_all():
+            for future in [pool.submit(one, *task) for task in product(instances, range(len(results)))]:
+                future.result()
+        return results
+
+    @staticmethod
+    def open(study: StudySpec | Path | str, results: Path | str = "results") -> StoredStudy:
+        """Open a stored study to look at; see `StoredStudy`."""
+        return StoredStudy(study, results)
 
     def finish(self, *, jobs: int = 1) -> StudySummary:
-        """Judge the best trials, write presets, summary and page; see `final_runs.finish`."""
-        tuner = self._running()
-        summary = finish(tuner, jobs=jobs)
-        write_page(tuner, summary)
+        """Judge the best trials, write presets, summary and page; see `judgement.finish`."""
+        from dynslam_bench.tuning.judgement import finish
+        from dynslam_bench.tuning.page import write_page
+
+        summary = finish(self, jobs=jobs)
+        write_page(self, summary)
         return summary
 
     def frame(self) -> pd.DataFrame:
-        """All trials; see `trials.trials_frame`.
+        """All trials; see `storage.trials_frame`."""
+        return trials_frame(self.spec, self.study)
+
+    def configuration_of(self, trial: FrozenTrial | optuna.Trial) -> Configuration:
+        """What a trial runs with."""
+        return Configuration(self.spec.tracker, {**self.held, **trial.params})
+
+    def _comparable_steps(self) -> list[int]:
+        """The steps at which every objective has an instance that counts."""
+        *early, last = steps(self.pruner, len(self.design.tune))
+        counted = [[objective.counts(instance) for instance in self.design.tune] for objective in self.objectives]
+        return [*(step for step in early if all(any(flags[:step]) for flags in counted)), last]
+
+    def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
+        """The next trial: the first is the baseline's, then come those that wait, then the sampler's.
+
+        Args:
+            settings: A configuration to wait in line; what it does not say is as the baseline has it.
+
+        Raises:
+            StudyError: It sets what the study does not tune, or is out of range.
+        """
+        with self._lock:
+            if settings is not None:
+                self.study.enqueue_trial(starting_point(settings, self.space, self.base))
+            trial = self.study.ask(distributions(self.space))
+        trial.set_user_attr("worker", worker_name())
+        return trial
+
+    def evaluate(self, trial: optuna.Trial) -> Evaluation:
+        """Run a trial on growing sets of instances until it ends or is pruned."""
+        outcomes: dict[ProblemInstance, Outcome] = {}
+        reference, values = self._reference or self.reference(), list[float]()
+        for step in self.steps:
+            first = len(outcomes)
+            try:
+                outcomes |= self.outcomes(self.configuration_of(trial).settings, self.design.tune[first:step])
+            except (CancelledError, InstanceFailedError) as error:
+                text = CRASHED_WORKER if isinstance(error, CancelledError) else str(error)
+                return Evaluation(TrialState.FAIL, text)
+            values = [objective.value(outcomes, reference) for objective in self.objectives]
+            trial.set_user_attr("coverage", coverage(outcomes))
+            trial.set_user_attr("fps", fps(outcomes))
+            trial.set_user_attr("scenes", together(self.objectives).ratios(outcomes, reference))
+            rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
+            trial.set_user_attr("instances", rows)
+            if self._pruned(trial, outcomes, values, first) and trial.number > 0:
+                return Evaluation(TrialState.PRUNED, f"pruned after {step} of {self.steps[-1]} instances")
+        violated = violations(self.spec, outcomes, reference)
+        for name, value in violated.items():
+            trial.set_constraint(name, value)
+        ratios = zip(self.objectives, values, strict=True)
+        text = ", ".join(f"{objective.what} x {math.exp(value):.3f}" for objective, value in ratios)
+        broken = [name for name, value in violated.items() if value > 0]
+        return Evaluation(TrialState.COMPLETE, text + (f", violates {' and '.join(broken)}" if broken else ""), values)
+
+    def tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
+        """Store what a trial came to."""
+        if evaluation.state != TrialState.COMPLETE:
+            trial.set_user_attr("reason", evaluation.text)
+        with self._lock:
+            self.study.tell(trial, evaluation.values, state=evaluation.state)
+
+    def _pruned(self, trial: optuna.Trial, outcomes: Outcomes, values: list[float], first: int) -> bool:
+        """Report a trial's values and ask the pruner; `first` instances were reported before.
+
+        Optuna's pruners know no constraints: a trial that violates one at a step takes no part in the comparison there.
+        """
+        step, final = len(outcomes), len(outcomes) == self.steps[-1]
+        if self.pruner == "wilcoxon":
+            for index, value in enumerate(self.objectives[0].by_start(outcomes, self._reference)):
+                if index >= first:
+                    trial.report(value, index)
+            return not final and trial.should_prune()
+        if final or any(value > 0 for value in violations(self.spec, outcomes, self._reference).values()):
+            return False
+        if len(values) == 1:
+            trial.report(values[0], step)
+            return trial.should_prune()
+        trial.set_user_attr(step_name(step), values)
+        return is_dominated(self.study.get_trials(deepcopy=False), trial.number, step)
+
+    def _more(self) -> bool:
+        """Whether another trial is wanted; running ones count, those of dead workers are marked as failed."""
+        with self._lock:
+            lost = set()
+            trials = self.study.get_trials(deepcopy=False)
+            for trial in trials:
+                if trial.state == TrialState.RUNNING and worker_is_dead(trial.user_attrs.get("worker", "")):
+                    lost.add(trial.number)
+                    with suppress(RuntimeError):  # another worker has done so meanwhile
+                        self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
+                        self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+                crashed = trial.user_attrs.get("reason") == CRASHED_WORKER
+                if trial.state == TrialState.WAITING or crashed or EARLIER in trial.user_attrs:
+                    lost.add(trial.number)
+            return len(trials) - len(lost) < self.trials
+
+    def _beginnings(self) -> Iterator[FrozenTrial | dict[str, Scalar]]:
+        """What a new study knows of earlier ones (trials), and what it tries after its baseline (settings)."""
+        for entry in self.spec.start:
+            if isinstance(entry, str) and Path(entry).expanduser().is_dir():
+                yield from self._earlier(Path(entry).expanduser())
+            else:
+                preset = read_settings(Path(entry)) if isinstance(entry, str) else entry
+                yield starting_point(preset, self.space, self.base)
+
+    def _earlier(self, folder: Path) -> Iterator[FrozenTrial | dict[str, Scalar]]:
+        """Complete trials of an earlier study, marked as such; its best ones are to be tried again."""
+        spec, results = read_stored(folder)
+        study = load_study(results, spec)
+        if spec.objectives != self.spec.objectives:
+            raise StudyError(f"the earlier study '{spec.name}' has other objectives: {', '.join(spec.objectives)}")
+        other = study.user_attrs.get("identity", {}).get("code") != self._identity["code"]
+        marks = {EARLIER: f"study {spec.name}{', other code' * other}"}
+        spans, again = distributions(self.space), {trial.number for trial in best_trials(study, self.spec.top)}
+        for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            params = {name: value for name, value in trial.params.items() if name in spans}
+            with suppress(StudyError):  # out of this study's range
+                params = starting_point(params, self.space, self.base)
+                if trial.number in again:
+                    yield params
+                yield create_trial(params=params, distributions=spans, values=trial.values, user_attrs=marks)
+
+    def _open(
+        self, sampler: optuna.samplers.BaseSampler, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]
+    ) -> optuna.Study:
+        """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.pruner)}
+        if self.reading:
+            study = load_study(self.results, self.spec, **how)
+        else:
+            how |= {"storage": open_storage(self.results, self.spec), "study_name": self.spec.name}
+            try:
+                study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
+                self._begin(study, beginnings)
+            except optuna.exceptions.DuplicatedStudyError:
+                study = optuna.load_study(**how)
+            except Exception as error:  # storages raise their drivers' errors
+                text = f"cannot open study '{self.spec.name}': {error}"
+                raise StudyError(without_password(text, self.spec.storage)) from None
+        self._check_identity(study)
+        if not self.spec.storage:
+            write_atomic(self.folder / SPEC_FILE, json.dumps(self.spec.for_others(), indent=2) + "\n")
+        return study
+
+    def _begin(self, study: optuna.Study, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]) -> None:
+        """What a new study begins with; the identity comes last, other workers wait for it."""
+        study.set_user_attr("spec", self.spec.for_others())
+        study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            study.set_metric_names(list(self.spec.objectives))
+        study.enqueue_trial({parameter.name: self.base[parameter.name] for parameter in self.space})
+        for beginning in beginnings:
+            if isinstance(beginning, FrozenTrial):
+                study.add_trial(beginning)
+            else:
+                study.enqueue_trial(beginning, skip_if_exists=True)
+        study.set_user_attr("identity", self._identity)
+
+    def _check_identity(self, study: optuna.Study) -> None:
+        """Refuse a stored study that was made with something else; data and program count only to go on with it."""
+        deadline = time.monotonic() + 10.0
+        while (stored := study.user_attrs.get("identity")) is None and time.monotonic() < deadline:
+            time.sleep(0.05)  # another worker is beginning the study
+        if stored is None:
+            raise StudyError(
+                f"the storage holds a study '{self.spec.name}' that is none of this toolkit", "give yours another name"
+            )
+        identity = self._identity
+        changed = [key for key in identity if stored.get(key) != identity[key]]
+        if changed:
+            there, here = (json.dumps(values.get(changed[0]))[:80] for values in (stored, identity))
+            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+            raise StudyError(
+                f"study '{self.spec.name}' is stored with other {changed[0]}{more}: {there} there, {here} here",
+                f"give the study another name, or delete {self.folder}",
+            )
+
+    def _identify(self) -> dict[str, Any]:
+        """What must be the same when a study is resumed, by name; to read one, its own fields alone.
+
+        Beside the fields these are the baseline's settings, the content of its sequences, and the program that runs on
+        them: code, weights, libraries, device.
+        """
+        spec = self.spec
+        identity = spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "start", "baseline"})
+        if self.reading:
+            return identity
+        instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
+        for sequence, instance in {instance.sequence: instance for instance in reversed(instances)}.items():
+            how = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(self.held)}
+            run = resolve(instance.run_spec(spec.tracker, **how)).identity
+            identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
+            identity |= program_of(run) | {"device": run["device"]}
+        identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
+        return identity | {"parameters": digest([repr(parameter) for parameter in self.space])}
+
+
+class StoredStudy:
+    """A stored study to look at; nothing is run, and neither tracker nor sequences need to be there.
+
+    Args:
+        study: A study, its TOML file, or its folder in the results (``results/studies/NAME``).
+        results: The results folder; a study's own folder says where it lies.
+
+    Attributes:
+        spec: What it asks for.
+        study: Optuna's study.
+
+    Raises:
+        StudyError: There is no such study.
+    """
+
+    def __init__(self, study: StudySpec | Path | str, results: Path | str = "results") -> None:
+        root = Path(results)
+        if isinstance(study, StudySpec):
+            self.spec = study
+        elif (path := Path(study).expanduser()).is_dir():
+            self.spec, root = read_stored(path)
+        else:
+            self.spec = read_study(path)
+        self.study = load_study(root, self.spec)
+
+    def frame(self) -> pd.DataFrame:
+        """All trials; see `storage.trials_frame`.
 
         Raises:
             StudyError: The storage holds something else than this package stores of a trial.
@@ -145,18 +552,8 @@ class Study:
         try:
             return trials_frame(self.spec, self.study)
         except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError) as error:
-            raise StudyError(f"the storage of study '{self.spec.name}' holds what is no trial: {error}") from error
-
-    def _running(self) -> Tuner:
-        if self._tuner is None:
-            raise StudyError(f"study '{self.spec.name}' was opened to be looked at", "Study(...) makes one to run")
-        return self._tuner
-
-    def _call_back(self, event: StudyEvent) -> None:
-        if event.kind == "finished" and self._callbacks:
-            trial = self.study.get_trials(deepcopy=False)[event.number]
-            for callback in self._callbacks:
-                callback(self.study, trial)
+            text = f"the storage of study '{self.spec.name}' holds what is no trial: {error}"
+            raise StudyError(text) from error
 
 
 def _objectives(given: str | Cost | Sequence[str | Cost] | None) -> list[Objective] | None:
@@ -182,7 +579,7 @@ def run_study(
     trials: int = 0,
     on_event: OnEvent | None = None,
     on_run: OnRun | None = None,
-) -> Tuner:
+) -> Study:
     """Run a study to its end, or go on with it.
 
     Args:
@@ -198,9 +595,9 @@ def run_study(
         The study, for `finish`.
 
     Raises:
-        DynslamError: See `Tuner`.
+        DynslamError: See `Study`.
     """
-    tuner = Tuner(spec, results)
+    tuner = Study(spec, results)
     if scenes or trials:
         tuner.extend(scenes=scenes, trials=trials)
     tuner.on_run = on_run

@@ -91,9 +91,9 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 @app.command()
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
-    from dynslam_bench.tuning.trials import best_trials, count_states
+    from dynslam_bench.tuning.storage import best_trials, count_states
 
-    tuner = tuning.Tuner(tuning.read_study(study), results, reading=True)
+    tuner = tuning.Study(tuning.read_study(study), results, reading=True)
     facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.trials}
     facts |= count_states(tuner.study)
     settings: dict[str, Any] = {}
@@ -130,7 +130,7 @@ def report(study: Study, results: Results = Path("results"), as_json: AsJson = F
 
     spec = tuning.read_study(study)
     stored = study_folder(results, spec) / "summary.json"
-    tuner = tuning.Tuner(spec, results, reading=stored.is_file())
+    tuner = tuning.Study(spec, results, reading=stored.is_file())
     if stored.is_file():
         summary = tuning.StudySummary.read(stored)
     else:
@@ -179,7 +179,7 @@ class StudyBar:
         self._advance(done, total, part)
 
 
-def show_summary(tuner: tuning.Tuner, summary: tuning.StudySummary, page: Path) -> None:
+def show_summary(tuner: tuning.Study, summary: tuning.StudySummary, page: Path) -> None:
     """The conclusion, the best settings and the paths of page and preset."""
     from dynslam_bench.tuning.splits import seen_note
 

@@ -23,10 +23,9 @@ from pydantic import create_model
 from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning import SpaceSpec, StudySpec, Tuner, finish
-from dynslam_bench.tuning.evaluate import evaluate
-from dynslam_bench.tuning.objectives import SPEED
-from dynslam_bench.tuning.summary import compared
+from dynslam_bench.tuning import SpaceSpec, Study, StudySpec, finish
+from dynslam_bench.tuning.judgement import compared
+from dynslam_bench.tuning.objectives import SPEED, evaluate
 
 UNMASKED = ("features.n_features", "motion.enabled", "motion.threshold_px", "motion.threshold_sigma",
             "epipolar.threshold_px", "backend.keyframes.max_gap")  # fmt: skip
@@ -79,11 +78,11 @@ def study_of(case: str, options: argparse.Namespace) -> StudySpec:
 
 def study(case: str, options: argparse.Namespace) -> str:
     """Look at a injection's loss; where there is one, run a study and say what it recovered."""
-    tuner = Tuner(study_of(case, options), options.results)
+    tuner = Study(study_of(case, options), options.results)
     fixed, held = tuner.spec.space.fixed, tuner.design.held_out
     good = "mask-rcnn" if case in MASKED_CASES else "emfoa-oft?masks=none"
     published = evaluate(good, fixed, held, results=tuner.store, jobs=options.jobs)
-    injected = tuner.evaluate(fixed, held, jobs=options.jobs, cache=False)
+    injected = tuner.outcomes(fixed, held, jobs=options.jobs, cache=False)
     loss = compared(injected, published)
     if not loss.shows_loss:
         time_taken = compared(injected, published, objective=SPEED)
@@ -95,7 +94,7 @@ def study(case: str, options: argparse.Namespace) -> str:
     summary = finish(tuner, lambda text: print(text, flush=True), jobs=options.jobs)
     minutes = (time.perf_counter() - began) / 60
     best = {} if summary.best is None else summary.best.params
-    left = compared(tuner.evaluate({**fixed, **best}, held, jobs=options.jobs, cache=False), published)
+    left = compared(tuner.outcomes({**fixed, **best}, held, jobs=options.jobs, cache=False), published)
     share = 100 * (1 - math.log(left.ratio) / math.log(loss.ratio))
     return (
         f"{case}: injected {loss}, after the study {left}: recovered {share:.0f} % in {minutes:.1f} min, "

@@ -18,10 +18,9 @@ from pathlib import Path
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs import RunStore
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning.evaluate import Outcome, evaluate
-from dynslam_bench.tuning.instances import ProblemInstance, parse_instances
-from dynslam_bench.tuning.objectives import SPEED
-from dynslam_bench.tuning.summary import compared
+from dynslam_bench.tuning.judgement import compared
+from dynslam_bench.tuning.objectives import SPEED, Outcome, evaluate
+from dynslam_bench.tuning.study_file import ProblemInstance, parse_instances
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 NETWORK = SHARED / "weights/yolov8n-seg_480x640_fp32.onnx"

@@ -60,7 +60,7 @@ def null(studies: int, folder: Path) -> Iterable[str]:
             for seed in range(scenes * 1000 + int(100 * simulated.STARTS_SD) * 100000, 10**9)[:studies]:
                 spec = study_on(scenes, sampler_seed=seed, sampler="tpe")
                 tuner = simulated.SimulatedTuner(spec, folder / f"{scenes}-{simulated.STARTS_SD}-{seed}", seed=seed)
-                lucky += tuner.run().best_value < math.log(0.95)
+                lucky += tuner.run().study.best_value < math.log(0.95)
                 summary = finish(tuner)
                 chosen += summary.best is not None and summary.best.chosen
                 said[summary.verdict.value] += 1
@@ -95,7 +95,7 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
                 first = tuner.runs
                 while tuner.runs - first + len(tuner.design.tune) <= MOST_RUNS:
                     trial = tuner.ask()
-                    tuner.tell(trial, tuner.run_trial(trial))
+                    tuner.tell(trial, tuner.evaluate(trial))
                 runs += tuner.runs - first
                 summary = finish(tuner)
                 every += tuner.runs
@@ -132,8 +132,8 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
 
 def plain(tuner: Any, seed: int, most: int) -> dict[str, Any]:
     """Settings of the best of two trials by the same bound: TPE and `WilcoxonPruner` as Optuna's manual has them."""
-    from dynslam_bench.tuning.space import distributions
-    from dynslam_bench.tuning.summary import compared
+    from dynslam_bench.tuning.judgement import compared
+    from dynslam_bench.tuning.plan import distributions
 
     pruner = optuna.pruners.WilcoxonPruner(p_threshold=0.1)
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), pruner=pruner)
@@ -142,7 +142,7 @@ def plain(tuner: Any, seed: int, most: int) -> dict[str, Any]:
     while runs + len(tuner.design.tune) <= most:
         trial, logs, state = study.ask(distributions(tuner.space)), [], TrialState.COMPLETE
         for index in order.permutation(len(tuner.design.tune)):
-            (run,) = tuner.evaluate(trial.params, [tuner.design.tune[index]]).values()
+            (run,) = tuner.outcomes(trial.params, [tuner.design.tune[index]]).values()
             logs.append(math.log(run.ate_m))
             trial.report(logs[-1], int(index))
             if trial.should_prune():
@@ -152,10 +152,10 @@ def plain(tuner: Any, seed: int, most: int) -> dict[str, Any]:
         runs += len(logs)
     complete = study.get_trials(states=(TrialState.COMPLETE,))
     best = sorted((trial for trial in complete if trial.number), key=lambda trial: trial.value)[:2]
-    baseline = tuner.evaluate({}, tuner.design.confirm)
+    baseline = tuner.outcomes({}, tuner.design.confirm)
 
     def bound(trial: optuna.trial.FrozenTrial) -> float:
-        return compared(tuner.evaluate(trial.params, tuner.design.confirm), baseline, candidates=2).bound
+        return compared(tuner.outcomes(trial.params, tuner.design.confirm), baseline, candidates=2).bound
 
     return min(best, key=bound).params
 

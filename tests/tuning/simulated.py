@@ -15,11 +15,11 @@ import toy_tracker
 
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.tuning import StudySpec, Tuner
-from dynslam_bench.tuning.evaluate import Outcome
-from dynslam_bench.tuning.instances import ProblemInstance
+from dynslam_bench.tuning import Study, StudySpec
+from dynslam_bench.tuning.objectives import Outcome
 from dynslam_bench.tuning.splits import Design, design_of
 from dynslam_bench.tuning.storage import open_storage
+from dynslam_bench.tuning.study_file import ProblemInstance
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 TUNE, HELD_OUT = (
@@ -55,7 +55,7 @@ def valley(settings: Mapping[str, Any]) -> float:
     return 1.5 * min(1.0, math.log(settings.get("gain", 1.5)) ** 2)
 
 
-class SimulatedTuner(Tuner):
+class SimulatedTuner(Study):
     """A study whose runs are drawn.
 
     Args:
@@ -73,7 +73,7 @@ class SimulatedTuner(Tuner):
         with (
             _PATCHING,
             patch.multiple(
-                "dynslam_bench.tuning.tuner",
+                "dynslam_bench.tuning.study",
                 open_storage=(lambda *_: optuna.storages.InMemoryStorage()) if in_memory else open_storage,
                 design_of=simulated_design,
             ),
@@ -82,13 +82,13 @@ class SimulatedTuner(Tuner):
             super().__init__(spec, results)
 
     def extend(self, **more: int) -> None:
-        with _PATCHING, patch("dynslam_bench.tuning.tuner.design_of", simulated_design):
+        with _PATCHING, patch("dynslam_bench.tuning.study.design_of", simulated_design):
             super().extend(**more)
 
     def _identify(self) -> dict[str, Any]:
         return {"code": "simulated"}  # looking it up takes longer than a study here
 
-    def evaluate(
+    def outcomes(
         self,
         settings: Mapping[str, Any],
         instances: Sequence[ProblemInstance],

@@ -10,9 +10,8 @@ import pytest
 import toy_tracker
 
 from dynslam_bench.core.errors import DynslamError, StudyError
-from dynslam_bench.tuning.instances import ProblemInstance, further_scenes, parse_instances, scenes
 from dynslam_bench.tuning.splits import check_splits, design_of, with_more_starts
-from dynslam_bench.tuning.study_file import StudySpec
+from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, further_scenes, parse_instances, scenes
 
 WALK = "synthetic/walking_xyz"
 

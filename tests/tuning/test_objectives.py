@@ -15,8 +15,14 @@ from simulated import SimulatedTuner, make_spec
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning import Outcome, ProblemInstance, Verdict, finish, read_preset_text, write_page
-from dynslam_bench.tuning.evaluate import Configuration, InstanceFailedError
-from dynslam_bench.tuning.objectives import OBJECTIVES, find_objective, own_objective, together
+from dynslam_bench.tuning.objectives import (
+    OBJECTIVES,
+    Configuration,
+    InstanceFailedError,
+    find_objective,
+    own_objective,
+    together,
+)
 
 PLAIN = [ProblemInstance(f"synthetic/walking_xyz?scene={scene}") for scene in range(4)]
 BLURRED = replace(PLAIN[0], degradation=(("blur", 0.5),))
@@ -55,7 +61,7 @@ class TimedTuner(SimulatedTuner):
 
     price = 0.0
 
-    def evaluate(
+    def outcomes(
         self,
         settings: Mapping[str, Any],
         instances: Sequence[ProblemInstance],
@@ -65,7 +71,7 @@ class TimedTuner(SimulatedTuner):
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
         gain, wobble = float(settings.get("gain", 1.5)), int(settings.get("wobble", 2))
-        found = super().evaluate({"gain": gain}, instances, jobs=jobs, cache=cache)
+        found = super().outcomes({"gain": gain}, instances, jobs=jobs, cache=cache)
         time = 0.02 * (0.5 + 0.25 * wobble) * gain
         cost = math.exp(self.price * max(0.0, 1.5 - gain))
         return {instance: replace(each, ate_m=each.ate_m * cost, processor_s=time) for instance, each in found.items()}
@@ -118,7 +124,7 @@ def test_a_front_gives_three_presets_in_either_order(objectives: list[str], tmp_
 class DriftingTuner(SimulatedTuner):
     """A machine that slows down with every run, and settings that change nothing; a gain of 13 breaks."""
 
-    def evaluate(
+    def outcomes(
         self,
         settings: Mapping[str, Any],
         instances: Sequence[ProblemInstance],
@@ -132,7 +138,7 @@ class DriftingTuner(SimulatedTuner):
         return {
             instance: replace(found, ate_m=0.02, processor_s=0.03 * 1.02 ** (self.runs / 2))
             for instance in instances
-            for found in super(DriftingTuner, self).evaluate(settings, [instance]).values()
+            for found in super(DriftingTuner, self).outcomes(settings, [instance]).values()
         }
 
 
@@ -145,5 +151,5 @@ def test_a_machine_that_slows_down_decides_nothing(tmp_path: Path) -> None:
     assert isinstance(broken, InstanceFailedError) and not isinstance(default, InstanceFailedError)
     assert list(default) == list(instances) == list(same)
     assert OBJECTIVES["speed"].value(same, default) == pytest.approx(math.log(1.01), abs=0.002), "one run apart"
-    apart = [tuner.evaluate(settings, instances) for settings in ({}, {"gain": 1.1})]
+    apart = [tuner.outcomes(settings, instances) for settings in ({}, {"gain": 1.1})]
     assert OBJECTIVES["speed"].value(apart[1], apart[0]) > 0.2, "all of one after all of the other"

@@ -13,10 +13,10 @@ from optuna.trial import TrialState
 from reports_browser import Browser, needs_browser
 
 from dynslam_bench.core.settings import Parameter
-from dynslam_bench.tuning import Tuner, finish, write_page
-from dynslam_bench.tuning.instances import ProblemInstance
+from dynslam_bench.tuning import Study, finish, write_page
 from dynslam_bench.tuning.page import fewer_starts, settings_table, warnings_of
 from dynslam_bench.tuning.splits import Design, with_more_starts
+from dynslam_bench.tuning.study_file import ProblemInstance
 
 SPACE = [
     Parameter("a.threshold", "float", 1.0, 0.1, 10.0, "log", unit="px"),
@@ -24,8 +24,8 @@ SPACE = [
 ]
 
 
-def tuner_of(study: optuna.Study, objective: str = "accuracy") -> Tuner:
-    return cast("Tuner", SimpleNamespace(study=study, spec=SimpleNamespace(objectives=(objective,))))
+def tuner_of(study: optuna.Study, objective: str = "accuracy") -> Study:
+    return cast("Study", SimpleNamespace(study=study, spec=SimpleNamespace(objectives=(objective,))))
 
 
 @pytest.mark.parametrize("offsets", [(0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)])

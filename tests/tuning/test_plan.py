@@ -16,7 +16,7 @@ from simulated import SimulatedTuner, make_spec, valley
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning import Plan, StudySpec, Verdict, finish, read_preset_text, run_study, write_page
-from dynslam_bench.tuning.trials import EARLIER, best_trials, importances
+from dynslam_bench.tuning.storage import EARLIER, best_trials, importances
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 
@@ -55,9 +55,9 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     )  # fmt: skip
     plan = Plan(spec, tmp_path)
     assert plan.preview().unused == {}, "no run is stored"
-    from dynslam_bench.tuning import Tuner
+    from dynslam_bench.tuning import Study
 
-    Tuner(spec, tmp_path).reference()
+    Study(spec, tmp_path).reference()
     preview = plan.preview()
     assert {name.split(".")[0] for name in preview.unused} == {"epipolar"}
     assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.lines[-1]
@@ -114,7 +114,7 @@ def earlier(tmp_path: Path) -> Iterator[SimulatedTuner]:
 def test_a_study_begins_with_what_an_earlier_one_learnt(earlier: SimulatedTuner, tmp_path: Path) -> None:
     spec = make_spec(name="second", trials=5, pruner="none", start=[str(earlier.folder), {"gain": 0.9}])
     tuner = SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False)
-    trials = tuner.run().get_trials()
+    trials = tuner.run().study.get_trials()
     taken = [trial for trial in trials if EARLIER in trial.user_attrs]
     assert len(taken) == 8 and {trial.user_attrs[EARLIER] for trial in taken} == {"study first"}
     own = [trial for trial in trials if EARLIER not in trial.user_attrs]
@@ -124,7 +124,7 @@ def test_a_study_begins_with_what_an_earlier_one_learnt(earlier: SimulatedTuner,
     assert not any(trial in taken for trial in best_trials(tuner.study, 9)), "an earlier trial is no candidate"
     assert importances(tuner.study) == {}
     resumed = SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False)
-    assert len(resumed.run().get_trials()) == len(trials)
+    assert len(resumed.run().study.get_trials()) == len(trials)
 
 
 def test_trials_of_other_code_are_marked(
@@ -145,12 +145,12 @@ def test_trials_may_be_asked_for_and_told_one_by_one(tmp_path: Path) -> None:
     values: list[Any] = []
     for gain in (1.0, 2.0, 0.5):
         trial = tuner.ask({"gain": gain})
-        evaluation = tuner.run_trial(trial)
+        evaluation = tuner.evaluate(trial)
         tuner.tell(trial, evaluation)
         values.append((trial.params["gain"], evaluation.state))
     assert [gain for gain, _ in values] == [1.5, 1.0, 2.0], "the baseline is the first"
     assert {state for _, state in values} == {TrialState.COMPLETE}
-    assert len(tuner.run().get_trials()) == 12, "the rest follows, with those that wait"
+    assert len(tuner.run().study.get_trials()) == 12, "the rest follows, with those that wait"
     with pytest.raises(StudyError, match="gain = 99"):
         tuner.ask({"gain": 99.0})
 
@@ -161,7 +161,7 @@ def test_an_extended_study_goes_on_with_more_scenes_and_trials(tmp_path: Path) -
     tuner.run()
     tuner.extend(scenes=3, trials=2)
     again = SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False)
-    assert len(again.run().get_trials()) == 6 == again.trials
+    assert len(again.run().study.get_trials()) == 6 == again.trials
     summary = finish(again)
     assert (len(summary.confirm), len(summary.held_out)) == ((12 + 3) * 2, (8 + 3) * 3)
     again.extend(scenes=1)
@@ -174,9 +174,9 @@ def test_an_extended_study_goes_on_with_more_scenes_and_trials(tmp_path: Path) -
 def test_any_trial_is_a_preset(tmp_path: Path) -> None:
     spec = make_spec(trials=4, pruner="none")
     tuner = SimulatedTuner(spec, tmp_path, in_memory=False)
-    trial = tuner.run().get_trials()[2]
+    trial = tuner.run().study.get_trials()[2]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("dynslam_bench.tuning.final_runs.Tuner", lambda *_, **__: tuner)
+        patched.setattr("dynslam_bench.tuning.judgement.Study", lambda *_, **__: tuner)
         text = read_preset_text(spec, tmp_path, trial=2)
         (tmp_path / "two.toml").write_text(text)
         assert read_settings(tmp_path / "two.toml") == trial.params and 'status = "not judged"' in text

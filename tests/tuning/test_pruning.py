@@ -21,8 +21,8 @@ from simulated import SimulatedTuner, make_spec, nothing, valley
 from dynslam_bench.tuning import Verdict, finish
 from dynslam_bench.tuning.objectives import ACCURACY
 from dynslam_bench.tuning.samplers import is_dominated, step_name, steps
-from dynslam_bench.tuning.trials import errors_of
-from dynslam_bench.tuning.tuner import CRASHED_WORKER, StudyEvent
+from dynslam_bench.tuning.storage import errors_of
+from dynslam_bench.tuning.study import CRASHED_WORKER, StudyEvent
 
 
 @pytest.mark.parametrize(
@@ -57,12 +57,12 @@ def test_a_trial_of_several_objectives_ends_once_two_dominate_it() -> None:
 )
 def test_values_are_of_the_instances_that_ran(pruner: str, objectives: list[str], tmp_path: Path) -> None:
     tuner = SimulatedTuner(make_spec(pruner=pruner, objectives=objectives, trials=16), tmp_path, effect=valley)
-    trials = tuner.run().get_trials()
+    trials = tuner.run().study.get_trials()
     states = [trial.state for trial in trials]
     assert states[0] == TrialState.COMPLETE and TrialState.PRUNED in states
     for trial in trials:
         instances = list(errors_of(trial))
-        value = ACCURACY.value(tuner.evaluate(tuner.configuration_of(trial).settings, instances), tuner.reference())
+        value = ACCURACY.value(tuner.outcomes(tuner.configuration_of(trial).settings, instances), tuner.reference())
         if trial.state == TrialState.COMPLETE:
             assert instances == list(tuner.design.tune), "a value is one of all instances"
             assert trial.values[0] == pytest.approx(value, abs=1e-12)
@@ -83,7 +83,7 @@ def test_pruning_takes_half_the_runs_at_the_same_regret(tmp_path: Path) -> None:
         for seed in range(3):
             spec = make_spec(pruner=pruner, trials=24, sampler_seed=seed)
             tuner = SimulatedTuner(spec, tmp_path / f"{pruner}{seed}", effect=valley, seed=seed)
-            regret[pruner].append(valley(tuner.run().best_trial.params))
+            regret[pruner].append(valley(tuner.run().study.best_trial.params))
             runs[pruner] += tuner.runs
     assert runs["halving"] <= 0.5 * runs["none"]
     assert np.mean(regret["halving"]) <= np.mean(regret["none"]) + 0.01
@@ -94,7 +94,7 @@ def test_nothing_is_claimed_where_nothing_is_better(tmp_path: Path) -> None:
     chosen = claims = lucky = no_matter = 0
     for seed in range(12):
         tuner = SimulatedTuner(make_spec(sampler_seed=seed), tmp_path / str(seed), effect=nothing, seed=seed)
-        lucky += tuner.run().best_value < math.log(0.95)
+        lucky += tuner.run().study.best_value < math.log(0.95)
         summary = finish(tuner)
         chosen += summary.candidates[0].chosen
         claims += summary.verdict == Verdict.PROVEN
@@ -120,7 +120,7 @@ def test_eight_workers_and_a_resume_repeat_no_trial(tmp_path: Path) -> None:
 
     def work(count: int) -> int:
         tuner = SimulatedTuner(spec.model_copy(update={"trials": count}), tmp_path, effect=valley, in_memory=False)
-        return len(tuner.run().get_trials())
+        return len(tuner.run().study.get_trials())
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(work, [32] * 8))
@@ -150,7 +150,7 @@ def test_a_trial_of_a_dead_worker_is_repeated(tmp_path: Path, dead: str) -> None
         if event.kind == "finished" and event.number == 2:
             other.study.ask().set_user_attr("worker", dead)
 
-    reasons = [trial.user_attrs.get("reason") for trial in tuner.run(on_event=dies_later).get_trials()]
+    reasons = [trial.user_attrs.get("reason") for trial in tuner.run(on_event=dies_later).study.get_trials()]
     assert (len(reasons), reasons.count(CRASHED_WORKER)) == (7, 1)
 
 
@@ -175,7 +175,7 @@ def test_one_worker_makes_the_same_trials_again(tmp_path: Path) -> None:
     def drawn(name: str, seed: int) -> list[dict[str, object]]:
         tuner = SimulatedTuner(make_spec(sampler="tpe", sampler_seed=seed), tmp_path / name, effect=valley)
         tuner.study.enqueue_trial({"gain": 1.0, "wobble": 0})
-        return [trial.params for trial in tuner.run().get_trials()]
+        return [trial.params for trial in tuner.run().study.get_trials()]
 
     first = drawn("a", 1)
     assert first == drawn("b", 1) != drawn("c", 2)

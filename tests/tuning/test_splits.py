@@ -15,10 +15,10 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning import StudySpec, Tuner, Verdict, finish, run_study, write_page
+from dynslam_bench.tuning import Study, StudySpec, Verdict, finish, run_study, write_page
 from dynslam_bench.tuning.page import warnings_of
 from dynslam_bench.tuning.splits import check_splits, seen_note, splits_seen
-from dynslam_bench.tuning.trials import errors_of
+from dynslam_bench.tuning.storage import errors_of
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 WALK = "synthetic/walking_xyz"
@@ -135,7 +135,7 @@ def test_an_accepted_overlap_stands_in_every_table(tmp_path: Path) -> None:
     whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3)
     copy = shutil.copytree(whole, tmp_path / "copy")
     with pytest.raises(StudyError, match="allow_overlap = true"):
-        Tuner(spec([str(whole)], [str(copy)]), tmp_path / "results")
+        Study(spec([str(whole)], [str(copy)]), tmp_path / "results")
     tuner = run_study(spec([str(whole)], [str(copy)], allow_overlap=True), results=tmp_path / "results")
     summary = finish(tuner)
     assert len(summary.split_notes) == 1 and summary.verdict != Verdict.PROVEN

@@ -21,8 +21,8 @@ from dynslam_bench.core.toml import read_settings
 from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import (
+    Study,
     StudySpec,
-    Tuner,
     Verdict,
     distributions,
     finish,
@@ -31,8 +31,8 @@ from dynslam_bench.tuning import (
     search_space,
     write_page,
 )
+from dynslam_bench.tuning.study import CRASHED_WORKER
 from dynslam_bench.tuning.study_file import SpaceSpec
-from dynslam_bench.tuning.tuner import CRASHED_WORKER
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 
@@ -131,7 +131,7 @@ def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_
         assert child.poll() is None, "the worker ended before it could be killed"
     os.killpg(child.pid, signal.SIGKILL)
     child.wait()
-    before = {t.number: t.values for t in Tuner(spec, tmp_path).study.get_trials() if t.state == TrialState.COMPLETE}
+    before = {t.number: t.values for t in Study(spec, tmp_path).study.get_trials() if t.state == TrialState.COMPLETE}
     tuner = run_study(spec, results=tmp_path)
     after = tuner.study.get_trials()
     assert len(before) >= 3
@@ -199,7 +199,7 @@ def test_a_study_does_not_go_on_after_its_data_changed(tmp_path: Path) -> None:
     truth.write_text("\n".join([*lines[:-1], lines[-1].replace(" 0.0", " 0.1", 1).replace(" 0 ", " 0.1 ", 1)]) + "\n")
     with pytest.raises(StudyError, match=r"stored with other content of \S*s1"):
         run_study(make(folders, trials=3), results=tmp_path / "r")
-    assert len(Tuner(spec, tmp_path / "r", reading=True).study.get_trials()) == 2
+    assert len(Study(spec, tmp_path / "r", reading=True).study.get_trials()) == 2
 
 
 def test_a_study_of_older_code_can_be_read_but_not_continued(
@@ -209,15 +209,13 @@ def test_a_study_of_older_code_can_be_read_but_not_continued(
     run_study(spec, results=tmp_path)
     monkeypatch.setattr("dynslam_bench.runs.identity.source_fingerprint", lambda *_: "newer")
     with pytest.raises(StudyError, match="stored with other code"):
-        Tuner(spec, tmp_path)
-    reader = Tuner(spec, tmp_path, reading=True)
+        Study(spec, tmp_path)
+    reader = Study(spec, tmp_path, reading=True)
     assert len(reader.study.get_trials()) == 2
-    with pytest.raises(StudyError, match="opened for reading"):
-        reader.run()
     with pytest.raises(StudyError, match="seeds"):
-        Tuner(make(sequences, seeds=[5]), tmp_path, reading=True)
+        Study(make(sequences, seeds=[5]), tmp_path, reading=True)
     with pytest.raises(StudyError, match="there is no study 'toy'"):
-        Tuner(spec, tmp_path / "elsewhere", reading=True)
+        Study(spec, tmp_path / "elsewhere", reading=True)
     assert not (tmp_path / "elsewhere" / "studies").exists(), "looking creates nothing"
 
 

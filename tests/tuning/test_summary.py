@@ -15,12 +15,19 @@ from scipy.stats import mstats
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning import Study, StudySpec, Verdict, finish, run_study, write_page
-from dynslam_bench.tuning.evaluate import Outcome
-from dynslam_bench.tuning.instances import ProblemInstance
-from dynslam_bench.tuning.objectives import bounds, by_scene, centre, detectable, scenes_needed, spread_test, upper
-from dynslam_bench.tuning.storage import open_storage
-from dynslam_bench.tuning.summary import Candidate, Ratio, StudySummary, compared, judge
-from dynslam_bench.tuning.trials import FEWEST_TRIALS, importances
+from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, compared, judge
+from dynslam_bench.tuning.objectives import (
+    Outcome,
+    bounds,
+    by_scene,
+    centre,
+    detectable,
+    scenes_needed,
+    spread_test,
+    upper,
+)
+from dynslam_bench.tuning.storage import FEWEST_TRIALS, importances, open_storage
+from dynslam_bench.tuning.study_file import ProblemInstance
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 CONFIRM = Ratio(ratio=0.7, low=0.6, high=0.82, n=8, sequences=4, bound=0.85)
