@@ -552,6 +552,7 @@ def publish(
     title: str = "Visual SLAM in dynamic scenes",
     note: str = "",
     protocol: Protocol | str = "tum-rgbd/v1",
+    most_pages: int | None = None,
     on_progress: OnProgress = no_progress,
 ) -> Site:
     """Make the report of some results folders, take a study's page beside it, and write a first page for both.
@@ -566,6 +567,7 @@ def publish(
         title: Heading.
         note: What a reader should know, shown on the first page.
         protocol: How to evaluate.
+        most_pages: As in `build_report`; the pictures of a run take about 0.4 MB.
         on_progress: As in `build_report`.
 
     Raises:
@@ -579,7 +581,7 @@ def publish(
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(
         list(runs), output / "leaderboard", protocol=protocol, title=title, command="dynslam-bench report RESULTS",
-        on_progress=on_progress,
+        most_pages=most_pages, on_progress=on_progress,
     )  # fmt: skip
     for path in (report.data, report.markdown, report.latex):  # for work with the results, not for looking at them
         path.unlink()

@@ -18,6 +18,12 @@ app = typer.Typer(
 )
 
 
+MostPages = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option(min=0, help="Runs that have a page of their own; default all of up to 5000, of more some 2000."),
+]
+
+
 @app.command()
 def make(
     results: Annotated[Optional[list[Path]], typer.Argument(help="Results folders; default ./results.")] = None,  # noqa: UP045
@@ -37,10 +43,7 @@ def make(
     trials: Annotated[
         bool, typer.Option("--trials", help="Show the trials of studies, too, which are left out otherwise.")
     ] = False,
-    most_pages: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(min=0, help="Runs that have a page of their own; default all of up to 5000, of more some 2000."),
-    ] = None,
+    most_pages: MostPages = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     as_json: AsJson = False,
 ) -> None:
@@ -104,6 +107,7 @@ def publish(
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     remark: Annotated[str, typer.Option(help="What a reader should know, for the first page.")] = "",
     protocol: ProtocolId = "tum-rgbd/v1",
+    most_pages: MostPages = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a static site of stored runs and a study: one folder for any web server, or a repository."""
@@ -111,7 +115,8 @@ def publish(
 
     with progress("site") as advance:
         site = publish_site(
-            results, output, study=study, title=title, note=remark, protocol=protocol, on_progress=advance,
+            results, output, study=study, title=title, note=remark, protocol=protocol, most_pages=most_pages,
+            on_progress=advance,
         )  # fmt: skip
     present(site, f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")
 
