@@ -294,7 +294,8 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
     unsettled = _unsettled(best, split_notes)
     if not unsettled:
         return Verdict.PROVEN, f"{name} has {gain}: {numbers}"
-    if p_value is not None and p_value > MATTER_LEVEL and not best.chosen and not ratio.shows_gain:
+    luck = not best.chosen or ratio.ratio >= 1
+    if p_value is not None and p_value > MATTER_LEVEL and luck and not ratio.shows_gain:
         return Verdict.NO_MATTER, (
             f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}); the best, "
             f"{name}, has {numbers}"
