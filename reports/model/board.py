@@ -36,6 +36,8 @@ DEFAULT_REFERENCE = "orb-slam2"
 On = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
 OVERALL = "overall"
+EXACT_MASKS = "oracle"
+"""Source of masks that no tracker could have: a bound, which never ranks beside others."""
 _GROUPS = {
     "unknown-objects": "unknown objects",
     "static": "static",
@@ -389,6 +391,7 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     """
     rankable = [key for key in scored if board.is_rankable(key)]
     rankable = [key for key in rankable if not board.first(key).realtime] or rankable  # never beside real-time runs
+    rankable = [key for key in rankable if board.first(key).segmentation != EXACT_MASKS] or rankable  # a bound
     has = {key: {name for name in board.scored(key) if board.competes(key, name)} for key in rankable}
     rankable = [key for key in rankable if has[key] and any(cell.success for cell in board.cells[key].values())]
     competing = sorted(rankable, key=lambda key: (-len(has[key]), key))

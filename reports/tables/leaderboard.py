@@ -124,8 +124,8 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
-        "in the map of an earlier one or by an older program, real-time runs beside others, trackers that lack "
-        "sequences, never succeeded, or are no better than a static camera.",
+        "in the map of an earlier one or by an older program, real-time runs and exact masks beside others, "
+        "trackers that lack sequences, never succeeded, or are no better than a static camera.",
     ]
     counts = {key: sum(board.no_better_than_static(key, name) for name in board.sequences) for key in board.trackers}
     worse = "; ".join(
@@ -212,7 +212,7 @@ def verdict_cell(board: Board, standing: Standing) -> TableCell:
         return TableCell()
     p = "" if standing.p_value is None else "p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}"
     colours = {"better": shade(0.5), "worse": shade(2.0)}
-    return TableCell(standing.verdict, p, standing.p_value, shade=colours.get(standing.verdict))
+    return TableCell(standing.verdict, p, shade=colours.get(standing.verdict))
 
 
 def category_table(boards: Mapping[str, Board]) -> Table | None:

@@ -80,3 +80,15 @@ def test_all_pairs_stand_in_a_frame_and_a_matrix():
     assert [len(cells) for cells in table.rows] == [5] * 4
     assert "critical" not in mean_rank_note(board) and "Nemenyi" in mean_rank_note(board)
     assert tables.pair_table(make_board(rows_of_truth(SIZES, {"high-dynamic": 4}))) is None
+
+
+def test_exact_masks_are_a_bound_and_never_rank_beside_others():
+    rows = rows_of_truth(SIZES, {"high-dynamic": 12})
+    bound_info = dict(variant={"segmentation.source": "oracle"}, tags=["high-dynamic"], segmentation="oracle")
+    plain = [other for other in rows if other.tracker.id == "orb-slam2"]
+    exact = [row("masks", other.sequence.id, 0.1 * other.score_m, **bound_info) for other in plain]
+    board = make_board([*rows, *exact])
+    ratios = {s.key: s.ratio.value for s in board.standings}
+    bound = next(key for key in board.labels if "oracle" in key)
+    assert bound not in board.ranked and len(board.ranked) == 4 and ratios[bound] == pytest.approx(0.1)
+    assert make_board(exact).ranked == [bound], "alone they rank"
