@@ -25,7 +25,7 @@ def store(tmp_path):
         add_run(store, "orb-slam2", sequence, error=0.05)
         add_run(store, "mask-rcnn", sequence, error=0.01, masks="embedded")
         add_run(store, "dynaslam", sequence, error=0.03, masks="embedded")
-        add_run(store, "ds-slam", sequence, error=0.02, masks="oracle")
+        add_run(store, "ds-slam", sequence, error=0.02, masks="yolo")
     return store
 
 
@@ -55,7 +55,7 @@ def test_such_cells_do_not_rank_unless_asked_for(store):
 
 def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ranked(tmp_path):
     store = RunStore(tmp_path / "results")
-    for tracker, masks in (("orb-slam2", ""), ("ds-slam", "oracle"), ("mask-rcnn", "embedded")):
+    for tracker, masks in (("orb-slam2", ""), ("ds-slam", "yolo"), ("mask-rcnn", "embedded")):
         add_run(store, tracker, OLD, masks=masks, error=0.001 if masks == "embedded" else 0.03)
     board = load_board(store)
     assert {board.first(key).tracker.id for key in board.ranked} == {"orb-slam2", "ds-slam"}
