@@ -113,7 +113,7 @@ def test_the_page_s_python_goes_as_it_stands_but_for_its_runs(
     (tmp_path / "fast.toml").write_text('"backend.keyframes.tracked_share" = 0.8\n')
     first, second = re.findall(r"^```python\n(.*?)^```", (DOCS / "how-to" / "study.md").read_text(), flags=re.S | re.M)
     exec(compile(first.replace("trials=30", "trials=6"), "docs/how-to/study.md", "exec"), {})
-    assert "baseline" in capsys.readouterr().out.splitlines()[-1]
+    assert "scenes that no trial saw" in capsys.readouterr().out.splitlines()[-1]
     tuned = "params.backend.keyframes.tracked_share"
     second = second.replace("studies/thresholds", "studies/mine").replace("params.epipolar.threshold_px", tuned)
     names: dict[str, Any] = {}
