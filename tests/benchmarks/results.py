@@ -17,7 +17,7 @@ A section is a heading, what the table shows, a block of commands, a line that b
     *Made at 1a2b3c4d on 2026-11-25; two cores of an AMD EPYC; data: fr1_xyz, fr1_rpy.*
 
 What follows that line, up to the next heading, is replaced by what the commands print. Commit, date and machine are
-written anew, `data` stays as it is. A new table is a section without the line: ``--data`` says what it is made of.
+written again, `data` stays as it is. A new table is a section without the line: ``--data`` says what it is made of.
 """
 
 from __future__ import annotations
