@@ -29,7 +29,6 @@ OpenCvOdometry  # trackers.adapters.specs
 OrbSlam3  # trackers.adapters.specs
 OrbSlam3Monocular  # trackers.adapters.specs
 Replay  # trackers.adapters.specs
-build_vote  # trackers.systems.emfoa_oft: a variant's spec
 BoxDepthFilter  # trackers.systems: a system names its rules
 BoxEpipolarFilter  # trackers.systems: a system names its rules
 ClassRuleFilter  # trackers.systems: a system names its rules

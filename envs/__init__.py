@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gymnasium as gym
 
-from dynslam_bench.contracts.checks import TrackerContractError
+from dynslam_bench.contracts import TrackerContractError
 from dynslam_bench.envs.arguments import resolve_device
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.spaces import REWARDS, STATS_LAYOUT, ActionMap

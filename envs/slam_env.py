@@ -15,10 +15,9 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import Frame, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory
+from dynslam_bench.contracts import Frame, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory, exact_stamps
 from dynslam_bench.contracts import Sequence as FrameSequence
 from dynslam_bench.contracts.checks import check_frame, check_result, check_sensors, check_trajectory, tracker_code
-from dynslam_bench.contracts.sequence import exact_stamps
 from dynslam_bench.core.errors import DynslamError, EvaluationError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.folders import stage_cache_folder
 from dynslam_bench.core.seeding import derive_seed
@@ -325,7 +324,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         truncated = len(outcomes) == len(self.sequence.timestamps)
         if terminated:
             stamps = self.sequence.timestamps[len(outcomes) :]
-            reward += sum(self._reward(self._errors.update(float(stamp), None, False)) for stamp in stamps)
+            reward += sum(self._reward(self._errors.update(float(stamp), None)) for stamp in stamps)
         self.episode.over = terminated or truncated
         info = frame_info(outcomes[-1])
         if self.episode.over:
@@ -350,7 +349,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         total = 0.0
         for index in range(self.episode.next_index, self.episode.next_index + count):
             stamp = float(self.sequence.timestamps[index])
-            error = self._errors.update(stamp, None, False)
+            error = self._errors.update(stamp, None)
             outcome = FrameOutcome(index, stamp, "dropped", None, {}, {}, error, self._reward(error))
             self.episode.add(outcome)
             total += outcome.reward
@@ -499,7 +498,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         frame, result, timings = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
         self.frame, self.result = frame, result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
-        error = self._errors.update(frame.timestamp, pose, pose is not None)
+        error = self._errors.update(frame.timestamp, pose)
         reward = self._reward(error)
         self.episode.add(FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error, reward))
 

@@ -15,12 +15,12 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts import Frame
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.spaces import MAX_DEPTH_M
-from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.geometry import write_tum
 
 
 class SlamWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

@@ -14,7 +14,7 @@ from dynslam_bench.cli.output import set_json_mode
 from dynslam_bench.core.errors import DynslamError
 
 if TYPE_CHECKING:
-    from dynslam_bench.contracts.tracker import TrackerSpec
+    from dynslam_bench.contracts import TrackerSpec
 
 START, MEASURE = "Begin here", "Run and measure"
 REPORT, CARE = "Report and tune", "Extend and care"

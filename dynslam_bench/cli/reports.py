@@ -152,7 +152,7 @@ def audit_paper(
     """Hold the numbers that the paper prints against arithmetic, and against a static camera."""
     from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.core.records import write_atomic
-    from dynslam_bench.geometry.trajectory_files import read_tum
+    from dynslam_bench.geometry import read_tum
     from dynslam_bench.reports.audit import audit_paper as audit
     from dynslam_bench.reports.model.published import claimed
     from dynslam_bench.sequences.catalogue import entry_of

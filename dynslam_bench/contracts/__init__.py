@@ -23,11 +23,19 @@ Example:
 from __future__ import annotations
 
 from dynslam_bench.contracts.checks import TrackerContractError
-from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec, Keypoints
+from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need
 from dynslam_bench.contracts.flow import FlowEstimator, FlowResult, FlowSpec
 from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
-from dynslam_bench.contracts.sequence import DatasetSpec, Frame, FrameMasks, MaskSource, Sequence
+from dynslam_bench.contracts.sequence import (
+    DatasetSpec,
+    Frame,
+    FrameMasks,
+    MaskSource,
+    Sequence,
+    exact_stamps,
+    timestamps_ns,
+)
 from dynslam_bench.contracts.tracker import (
     KeyframeRecord,
     MapOutputs,
@@ -38,8 +46,7 @@ from dynslam_bench.contracts.tracker import (
     TrackingState,
     TrackResult,
 )
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory
 
 __all__ = [
     "Camera",
@@ -61,6 +68,7 @@ __all__ = [
     "Keypoints",
     "MapOutputs",
     "MaskSource",
+    "MaskedExtractor",
     "Need",
     "Provenance",
     "Segmenter",
@@ -74,4 +82,6 @@ __all__ = [
     "TrackerSpec",
     "TrackingState",
     "Trajectory",
+    "exact_stamps",
+    "timestamps_ns",
 ]

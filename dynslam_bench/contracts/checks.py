@@ -17,9 +17,7 @@ import numpy as np
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec, TrackingState, TrackResult
 from dynslam_bench.core.errors import SequenceError, TrackerError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, se3
 
 STATES = get_args(TrackingState)
 FARTHEST_M = 1e9

@@ -14,7 +14,7 @@ from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.tracker import Provenance as Provenance
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 
 Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
 """What a filter asks for: `FilterState` and `FrameBundle` hold it."""

@@ -8,9 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.stamps import from_seconds
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, from_seconds
 
 
 @dataclass(frozen=True, eq=False)

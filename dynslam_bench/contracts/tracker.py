@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.sequence import Frame, MaskSource
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 
 
 @runtime_checkable

@@ -10,9 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation.comparison import Comparison, compare, hold
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.association import associate
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory, associate, se3
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ from functools import partial
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_loaded
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Alignment, Protocol, RPESpec
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import TumFile
+from dynslam_bench.geometry import Trajectory, TumFile
 
 
 @dataclass(frozen=True)

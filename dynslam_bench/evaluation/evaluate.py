@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import field_validator
 
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.ape import absolute_errors, absolute_metrics, static_camera_metrics
 from dynslam_bench.evaluation.comparison import AssociationRecord, Comparison, apply_policy, compare, truth_of_file
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import TumFile, load_trajectory
+from dynslam_bench.geometry import Trajectory, TumFile, load_trajectory
 
 SCHEMA_VERSION = 1
 METRICS: tuple[Callable[[Comparison], dict[str, float]], ...] = (
@@ -73,13 +71,6 @@ class Evaluation(Record):
     alignment: AlignmentRecord
     association: AssociationRecord
     diagnostics: list[str]
-
-    @field_validator("metrics")
-    @classmethod
-    def _has_the_absolute_error(cls, metrics: dict[str, float]) -> dict[str, float]:
-        if "ate_rmse_m" not in metrics:
-            raise ValueError("the metrics lack ate_rmse_m")
-        return metrics
 
     def summary(self) -> str:
         """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""

@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import FileNotes
+from dynslam_bench.geometry import FileNotes, Trajectory, se3
 
 FARTHEST_M = 1e12
 """Squares of larger numbers are no numbers any more."""

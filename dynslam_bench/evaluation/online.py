@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory, se3
 
 Array = NDArray[np.float64]
 
@@ -54,10 +53,6 @@ class OnlineError:
     def __init__(self, ground_truth: Trajectory | None, max_dt: float = 0.02) -> None:
         self._truth = ground_truth if ground_truth is not None and len(ground_truth) else None
         self._max_dt = max_dt
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin again at the first frame."""
         self._align: Array | None = None
         self._held: Array | None = None
         self._previous_truth: Array | None = None
@@ -73,18 +68,16 @@ class OnlineError:
         nearest = int(gaps.argmin())
         return np.array(self._truth.T_world_cam[nearest]) if gaps[nearest] < self._max_dt else None
 
-    def update(self, timestamp: float, T_world_cam: Array | None, ok: bool) -> OnlineSample | None:
+    def update(self, timestamp: float, pose: Array | None) -> OnlineSample | None:
         """Take in the next frame.
 
         Args:
             timestamp: Seconds, the frame's stamp.
-            T_world_cam: Estimated camera-to-world pose ``[4, 4]``; None if there is none.
-            ok: Whether the frame was tracked; a pose given with False is a prediction and counts for nothing.
+            pose: Estimated camera-to-world pose ``[4, 4]``; None where the frame was not tracked.
 
         Returns:
             The error at this frame, or None where there is no ground truth.
         """
-        pose = np.array(T_world_cam, dtype=np.float64) if ok and T_world_cam is not None else None
         truth = self.truth_at(timestamp)
         if pose is not None and truth is not None and self._align is None:
             self._align = truth @ se3.inverse(pose)

@@ -12,8 +12,7 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.evaluation.ape import named, statistics
 from dynslam_bench.evaluation.comparison import Comparison, Index
 from dynslam_bench.evaluation.protocol import RPESpec
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.association import nearest_gap
+from dynslam_bench.geometry import nearest_gap, se3
 
 Array = NDArray[np.float64]
 _ANGLES = {"deg": 180 / np.pi, "rad": 1.0}

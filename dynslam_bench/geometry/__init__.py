@@ -1,1 +1,41 @@
-"""Camera model, SE(3), and trajectories with their file formats."""
+"""Camera model, SE(3), association of stamps, and trajectories with their file formats."""
+
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.association import associate, nearest_gap
+from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry.stamps import format_ns, from_seconds, ns_of, refuse_close
+from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
+from dynslam_bench.geometry.trajectory_files import (
+    FileNotes,
+    TumFile,
+    format_tum,
+    is_number,
+    load_trajectory,
+    read_kitti,
+    read_tum,
+    write_kitti,
+    write_tum,
+)
+
+__all__ = [
+    "Camera",
+    "FileNotes",
+    "RepeatedStamps",
+    "Trajectory",
+    "TumFile",
+    "associate",
+    "format_ns",
+    "format_tum",
+    "from_seconds",
+    "inside",
+    "is_number",
+    "load_trajectory",
+    "nearest_gap",
+    "ns_of",
+    "read_kitti",
+    "read_tum",
+    "refuse_close",
+    "se3",
+    "write_kitti",
+    "write_tum",
+]

@@ -10,15 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
+from dynslam_bench.contracts import MapOutputs, TrackResult
 from dynslam_bench.core.errors import RunError, TrackerError
 from dynslam_bench.core.reading import read_npz
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory, se3
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_ply
 from dynslam_bench.slam.run_figure import write_run_figure

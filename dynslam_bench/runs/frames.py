@@ -18,10 +18,7 @@ from pydantic.dataclasses import dataclass as validated
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.sanitise import storable
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.stamps import format_ns, ns_of
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.geometry import Trajectory, format_ns, ns_of, se3, write_tum
 from dynslam_bench.runs.record import RunRecord, StageTime
 from dynslam_bench.runs.store import RunStore
 

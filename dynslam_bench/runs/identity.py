@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.contracts.checks import check_sensors
-from dynslam_bench.contracts.sequence import Sequence
-from dynslam_bench.contracts.tracker import TrackerSpec
 from dynslam_bench.core.errors import PluginError, RunError, SettingsError, did_you_mean
 from dynslam_bench.core.fingerprint import (
     code_digest,
@@ -28,7 +27,7 @@ from dynslam_bench.envs.wrappers import Degradation
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.registry import FLOWS
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, segmentation_source, weights_digest

@@ -15,7 +15,7 @@ from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.wrappers import DegradeFrames, DropFrames
 from dynslam_bench.evaluation.masks import compare_masks
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.geometry import write_tum
 from dynslam_bench.runs.artifacts import (
     SHEET_FILE,
     SheetWriter,

@@ -19,7 +19,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from dynslam_bench.contracts.sequence import exact_stamps, timestamps_ns
+from dynslam_bench.contracts import exact_stamps, timestamps_ns
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, SequenceError, TrajectoryError
 from dynslam_bench.core.files import TemporaryFolder, write_atomic
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions

@@ -27,9 +27,7 @@ from dynslam_bench.core.toml import assignments
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.evaluation.hints import hints
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, get_protocol
-from dynslam_bench.geometry.stamps import format_ns
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import format_tum, read_tum
+from dynslam_bench.geometry import Trajectory, format_ns, format_tum, read_tum
 from dynslam_bench.runs.record import MetricRecord, RunRecord
 
 if TYPE_CHECKING:

@@ -23,7 +23,14 @@ from dynslam_bench.contracts import (
     Provenance,
 )
 from dynslam_bench.geometry import se3
-from dynslam_bench.testing.report import ConformanceReport, require, require_arrays, require_unchanged
+from dynslam_bench.testing.report import (
+    ConformanceReport,
+    require,
+    require_all,
+    require_arrays,
+    require_equal,
+    require_unchanged,
+)
 from dynslam_bench.testing.scenes import CornerSequence
 
 _TWO_RUNS = ("two runs differ", "all randomness has to come from state.seed")
@@ -125,20 +132,24 @@ def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
     require(isinstance(result, FilterResult), f"{where}apply() gave a {type(result).__name__}, not a FilterResult")
     cause = "the verdict is on all keypoints, not only on those that earlier filters kept"
     require_arrays(result, {"keep": (np.bool_, count), "weight": (np.float32, count)}, where, cause)
-    require(((result.weight >= 0) & (result.weight <= 1)).all(), f"{where}a weight lies outside [0, 1] or is no number")
-    bad = {key: value for key, value in result.stats.items() if not np.isfinite(value)}
-    require(not bad, f"{where}stats hold values that are not finite: {bad}")
+    weight, bad = result.weight, {key: value for key, value in result.stats.items() if not np.isfinite(value)}
+    require_all(
+        (((weight >= 0) & (weight <= 1)).all(), f"{where}a weight lies outside [0, 1] or is no number"),
+        (not bad, f"{where}stats hold values that are not finite: {bad}"),
+    )
     if result.mask is not None:
         require_arrays(result, {"mask": (np.bool_, frame.depth.shape)}, where)
     return result
 
 
 def _declaration(candidate: DynamicFilter) -> None:
-    require(isinstance(candidate.name, str) and candidate.name, f"the name is {candidate.name!r}")
     needs, tags = get_args(Need), get_args(Provenance)
     unknown = sorted(candidate.needs - set(needs))
-    require(not unknown, f"unknown needs {unknown}", f"known are {', '.join(sorted(needs))}")
-    require(candidate.provenance in tags, f"provenance is {candidate.provenance!r}", f"one of {', '.join(tags)}")
+    require_all(
+        (isinstance(candidate.name, str) and candidate.name, f"the name is {candidate.name!r}"),
+        (not unknown, f"unknown needs {unknown}", f"known are {', '.join(sorted(needs))}"),
+        (candidate.provenance in tags, f"provenance is {candidate.provenance!r}", f"one of {', '.join(tags)}"),
+    )
 
 
 def _run(candidate: DynamicFilter, steps: Steps) -> list[FilterResult]:
@@ -164,8 +175,7 @@ def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
 def _repeated(pair: tuple[DynamicFilter, DynamicFilter], steps: Steps, fault: str, cause: str) -> None:
     """Run two filters, or one twice, which have to give the same."""
     for index, (a, b) in enumerate(zip(*(_run(candidate, steps) for candidate in pair), strict=True)):
-        same = np.array_equal(a.keep, b.keep) and np.array_equal(a.weight, b.weight)
-        require(same, f"{fault} at frame {index}", cause)
+        require_equal(a, b, ("keep", "weight"), f"{fault} at frame {index}", cause)
 
 
 def _without_flow(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:

@@ -16,17 +16,19 @@ from dynslam_bench.contracts import (
     Frame,
     Instances,
     Keypoints,
+    MaskedExtractor,
     Segmenter,
     Sequence,
 )
-from dynslam_bench.contracts.features import MaskedExtractor
 from dynslam_bench.contracts.flow import stats_names_of
-from dynslam_bench.geometry.camera import inside
+from dynslam_bench.geometry import inside
 from dynslam_bench.testing.report import (
     ConformanceReport,
     NotApplicable,
     require,
+    require_all,
     require_arrays,
+    require_equal,
     require_methods,
     require_unchanged,
 )
@@ -66,8 +68,8 @@ def features_report(
         require_unchanged(lambda: construct().extract(image), image, what="the image")
 
     report = ConformanceReport.of("extractor", construct)
-    built = report.run("construction", lambda: require_methods(construct(), "extract"))
-    if built and report.run("results", lambda: results(scene[0], least=20)):
+    report.run("construction", lambda: require_methods(construct(), "extract"))
+    if report.ok and report.run("results", lambda: results(scene[0], least=20)):
         report.run("beside a mask", lambda: _masked_extraction(construct(), image))
         _run_common(report, scene[0], left_alone, lambda: _extractor_determinism(construct, image, other), results)
     return report
@@ -99,44 +101,37 @@ def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_byt
         ConformanceError: Something in it breaks the contract.
     """
     require(isinstance(keypoints, Keypoints), f"extract() gave a {type(keypoints).__name__}, not Keypoints")
-    count, descriptors = len(keypoints.xy), keypoints.descriptors
+    xy, angle, descriptors, count = keypoints.xy, keypoints.angle, keypoints.descriptors, len(keypoints.xy)
     types = {"octave": np.int32, "angle": np.float32, "response": np.float32}
-    require_arrays(
-        keypoints, {"xy": (np.float32, (count, 2)), **{name: (kind, (count,)) for name, kind in types.items()}}
-    )
-    require(
-        descriptors.dtype == np.uint8 and descriptors.ndim == 2 and len(descriptors) == count,
-        f"descriptors are {descriptors.dtype} {descriptors.shape}, expected uint8 [{count}, bytes]",
-        "bits are packed: eight in a byte",
-    )
-    require(
-        descriptor_bytes is None or not count or descriptors.shape[1] == descriptor_bytes,
-        f"descriptors have {descriptors.shape[1]} bytes, the spec says {descriptor_bytes}",
-    )
-    require(np.isfinite(keypoints.xy).all(), "a keypoint is not finite")
-    outside = ((keypoints.xy < -0.5) | (keypoints.xy > np.array(shape[::-1]) - 0.5)).any(axis=1)
-    require(
-        not outside.any(),
-        f"{int(outside.sum())} of {count} keypoints lie outside the image",
-        "pixels of the full resolution, x first",
-    )
-    require((keypoints.octave >= 0).all(), "a pyramid level is negative")
-    require(
-        ((keypoints.angle >= 0) & (keypoints.angle < 360)).all(),
-        "an angle lies outside [0, 360)",
-        "degrees, not radians",
+    require_arrays(keypoints, {"xy": (np.float32, (count, 2)), **{name: (types[name], (count,)) for name in types}})
+    outside = ((xy < -0.5) | (xy > np.array(shape[::-1]) - 0.5)).any(axis=1)
+    require_all(
+        (
+            descriptors.dtype == np.uint8 and descriptors.ndim == 2 and len(descriptors) == count,
+            f"descriptors are {descriptors.dtype} {descriptors.shape}, expected uint8 [{count}, bytes]",
+            "bits are packed: eight in a byte",
+        ),
+        (
+            descriptor_bytes is None or not count or descriptors.shape[1:] == (descriptor_bytes,),
+            f"descriptors have {descriptors.shape[-1]} bytes, the spec says {descriptor_bytes}",
+        ),
+        (np.isfinite(xy).all(), "a keypoint is not finite"),
+        (
+            not outside.any(),
+            f"{int(outside.sum())} of {count} keypoints lie outside the image",
+            "pixels of the full resolution, x first",
+        ),
+        ((keypoints.octave >= 0).all(), "a pyramid level is negative"),
+        (((angle >= 0) & (angle < 360)).all(), "an angle lies outside [0, 360)", "degrees, not radians"),
     )
 
 
 def _extractor_determinism(construct: Callable[[], FeatureExtractor], image: Image, other: Image) -> None:
     first = construct()
     first.extract(other)  # an earlier image has no influence
-    a, b = first.extract(image), construct().extract(image)
-    require(
-        np.array_equal(a.xy, b.xy) and np.array_equal(a.descriptors, b.descriptors),
-        "the same image gives other keypoints",
-        "unseeded randomness, or state that outlives an image",
-    )
+    cause = "unseeded randomness, or state that outlives an image"
+    again = construct().extract(image)
+    require_equal(first.extract(image), again, ("xy", "descriptors"), "the same image gives other keypoints", cause)
 
 
 def _masked_extraction(extractor: FeatureExtractor, image: Image) -> None:
@@ -190,8 +185,8 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         require(not result.valid[-3:].any(), "a point outside the reference image is valid in the target")
 
     report = ConformanceReport.of("flow", construct)
-    built = report.run("construction", lambda: require_methods(construct(), "prepare", "track"))
-    if built and report.run("results", lambda: results(second, grid)):
+    report.run("construction", lambda: require_methods(construct(), "prepare", "track"))
+    if report.ok and report.run("results", lambda: results(second, grid)):
         report.run("no points", lambda: results(second, grid[:0]))
         report.run("points outside", outside)
         report.run("guesses", lambda: results(second, grid, guess))
@@ -216,10 +211,12 @@ def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tu
     require(isinstance(result, FlowResult), f"track() gave a {type(result).__name__}, not a FlowResult")
     expected = {"xy": (np.float32, (count, 2)), "valid": (np.bool_, (count,)), "cost": (np.float32, (count,))}
     require_arrays(result, expected, cause="one row a point, in the order of the points")
-    require(np.isfinite(result.xy[result.valid]).all(), "a valid row is not finite", "mark it as not valid")
-    require(not np.isnan(result.cost[result.valid]).any(), "a valid row has no cost")
     missing = [name for name in names if name not in result.stats]
-    require(not missing, f"stats lack {missing}", "stats_names declares them")
+    require_all(
+        (np.isfinite(result.xy[result.valid]).all(), "a valid row is not finite", "mark it as not valid"),
+        (not np.isnan(result.cost[result.valid]).any(), "a valid row has no cost"),
+        (not missing, f"stats lack {missing}", "stats_names declares them"),
+    )
 
 
 def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
@@ -284,8 +281,8 @@ def segmenter_report(
         require_unchanged(lambda: construct().segment(frame), frame.rgb, frame.depth, what="the frame")
 
     report = ConformanceReport.of("segmenter", construct)
-    built = report.run("construction", lambda: require_methods(construct(), "segment"))
-    if built and report.run("results", lambda: results(*inputs)):
+    report.run("construction", lambda: require_methods(construct(), "segment"))
+    if report.ok and report.run("results", lambda: results(*inputs)):
         _run_common(report, inputs[0], left_alone, lambda: _segmenter_determinism(construct, inputs), results)
     return report
 
@@ -296,49 +293,38 @@ def check_instances(instances: Instances, frame: Frame) -> None:
     Raises:
         ConformanceError: Something in it breaks the contract.
     """
-    where = f"frame {frame.index}: "
     require(
         isinstance(instances, Instances),
-        f"{where}segment() gave a {type(instances).__name__}, not Instances",
+        f"frame {frame.index}: segment() gave a {type(instances).__name__}, not Instances",
         "a frame without objects is Instances.empty(height, width)",
     )
-    count = len(instances.class_names)
-    shape = (count, *frame.depth.shape)
-    require_arrays(
-        instances, {"masks": (np.bool_, shape)}, where, "masks have to be at the frame's resolution and thresholded"
-    )
+    where, boxes, scores = f"frame {frame.index}: ", instances.boxes, instances.scores
+    count, shape = len(instances.class_names), frame.depth.shape
+    cause = "masks have to be at the frame's resolution and thresholded"
+    require_arrays(instances, {"masks": (np.bool_, (count, *shape))}, where, cause)
     require_arrays(instances, {"boxes": (np.float32, (count, 4)), "scores": (np.float32, (count,))}, where)
-    require(
-        ((instances.scores >= 0) & (instances.scores <= 1)).all(),
-        f"{where}a score lies outside [0, 1]",
-        "logits, not scores",
+    require_all(
+        (((scores >= 0) & (scores <= 1)).all(), f"{where}a score lies outside [0, 1]", "logits, not scores"),
+        (all(isinstance(name, str) and name for name in instances.class_names), f"{where}a class has no name"),
+        (np.isfinite(boxes).all(), f"{where}a box is not finite"),
+        (
+            (boxes[:, :2] <= boxes[:, 2:]).all(),
+            f"{where}a box ends before it begins",
+            "boxes are x0, y0, x1, y1, not x, y, w, h",
+        ),
+        (instances.moving is None or instances.moving.shape == (count,), f"{where}moving does not fit the objects"),
     )
-    require(all(isinstance(name, str) and name for name in instances.class_names), f"{where}a class has no name")
-    require(np.isfinite(instances.boxes).all(), f"{where}a box is not finite")
-    require(
-        (instances.boxes[:, :2] <= instances.boxes[:, 2:]).all(),
-        f"{where}a box ends before it begins",
-        "boxes are x0, y0, x1, y1, not x, y, w, h",
-    )
-    for mask, box, name in zip(instances.masks, instances.boxes, instances.class_names, strict=True):
+    for mask, box, name in zip(instances.masks, boxes, instances.class_names, strict=True):
         rows, columns = np.nonzero(mask)
         within = (columns >= box[0] - 1) & (columns <= box[2] + 1) & (rows >= box[1] - 1) & (rows <= box[3] + 1)
         outside = 100 * (1 - float(within.mean())) if len(rows) else 0.0
-        require(
-            outside < 10,
-            f"{where}{outside:.0f} % of the mask of a {name} lie outside its box",
-            "boxes of another resolution, or y before x",
-        )
-    require(instances.moving is None or instances.moving.shape == (count,), f"{where}moving does not fit the objects")
+        fault = f"{where}{outside:.0f} % of the mask of a {name} lie outside its box"
+        require(outside < 10, fault, "boxes of another resolution, or y before x")
 
 
 def _segmenter_determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> None:
     first, second = construct(), construct()
     for frame in frames:
-        a, b = first.segment(frame), second.segment(frame)
-        same = np.array_equal(a.masks, b.masks) and np.array_equal(a.scores, b.scores)
-        require(
-            same and a.class_names == b.class_names,
-            f"frame {frame.index} gives other objects when it is segmented again",
-            "a network in training mode, or unseeded randomness",
-        )
+        fault = f"frame {frame.index} gives other objects when it is segmented again"
+        cause = "a network in training mode, or unseeded randomness"
+        require_equal(first.segment(frame), second.segment(frame), ("masks", "scores", "class_names"), fault, cause)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -103,6 +103,25 @@ def require(condition: object, fault: str, cause: str = "") -> None:
     """
     if not condition:
         raise ConformanceError(f"{fault} (likely cause: {cause})" if cause else fault)
+
+
+def require_all(*rules: tuple[object, str] | tuple[object, str, str]) -> None:
+    """`require` for each of several rules, in their order.
+
+    Raises:
+        ConformanceError: The first that does not hold.
+    """
+    for rule in rules:
+        require(*rule)
+
+
+def require_equal(first: object, second: object, names: Sequence[str], fault: str, cause: str) -> None:
+    """Raise unless two results have the same arrays, or other values, under these names.
+
+    Raises:
+        ConformanceError: They have not.
+    """
+    require(all(np.array_equal(getattr(first, name), getattr(second, name)) for name in names), fault, cause)
 
 
 def require_methods(candidate: object, *names: str) -> None:

@@ -11,7 +11,14 @@ import numpy as np
 
 from dynslam_bench.contracts import Camera, Frame, Sequence, Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.testing.report import ConformanceReport, NotApplicable, require, require_arrays
+from dynslam_bench.testing.report import (
+    ConformanceReport,
+    NotApplicable,
+    require,
+    require_all,
+    require_arrays,
+    require_equal,
+)
 
 
 def check_sequence(sequence: Sequence | str | Path, *, frames: int = 3) -> None:
@@ -58,47 +65,53 @@ def _protocol(sequence: Sequence) -> None:
     require(
         not missing, f"a {type(sequence).__name__} lacks {', '.join(missing)}", "see dynslam_bench.sequences.Sequence"
     )
-    require(isinstance(sequence.id, str) and sequence.id, f"the id is {sequence.id!r}, not a text")
-    require(isinstance(sequence.camera, Camera), f"the camera is a {type(sequence.camera).__name__}, not a Camera")
-    require(len(sequence) >= 1, "the sequence has no frame")
-    require(isinstance(sequence.license, str) and isinstance(sequence.citation, str), "license or citation is no text")
+    texts = (sequence.license, sequence.citation)
+    require_all(
+        (isinstance(sequence.id, str) and sequence.id, f"the id is {sequence.id!r}, not a text"),
+        (isinstance(sequence.camera, Camera), f"the camera is a {type(sequence.camera).__name__}, not a Camera"),
+        (len(sequence) >= 1, "the sequence has no frame"),
+        (all(isinstance(text, str) for text in texts), "license or citation is no text"),
+    )
 
 
 def _timestamps(sequence: Sequence) -> None:
-    stamps = sequence.timestamps
+    stamps, fps = sequence.timestamps, sequence.fps
     require(
         isinstance(stamps, np.ndarray) and stamps.dtype == np.float64,
         "timestamps are no float64 array",
         "float32 holds stamps of today to 100 s only",
     )
-    require(stamps.shape == (len(sequence),), f"{stamps.shape} timestamps for {len(sequence)} frames")
-    require(np.isfinite(stamps).all(), "a timestamp is not finite")
     intervals = np.diff(stamps)
-    require((intervals > 0).all(), "timestamps are not strictly increasing", "the list is unsorted or has duplicates")
-    require(sequence.fps > 0, f"fps is {sequence.fps}")
-    rate = 1 / float(np.median(intervals)) if len(intervals) else sequence.fps
-    fault = f"fps is {sequence.fps:g}, but the median rate is {rate:g} Hz"
-    require(1 / 3 < rate / sequence.fps < 3, fault, "timestamps have to be in seconds")
+    require_all(
+        (stamps.shape == (len(sequence),), f"{stamps.shape} timestamps for {len(sequence)} frames"),
+        (np.isfinite(stamps).all(), "a timestamp is not finite"),
+        ((intervals > 0).all(), "timestamps are not strictly increasing", "the list is unsorted or has duplicates"),
+        (fps > 0, f"fps is {fps}"),
+    )
+    rate = 1 / float(np.median(intervals)) if len(intervals) else fps
+    fault = f"fps is {fps:g}, but the median rate is {rate:g} Hz"
+    require(1 / 3 < rate / fps < 3, fault, "timestamps have to be in seconds")
 
 
 def _frames(sequence: Sequence, chosen: list[int]) -> None:
     size = sequence.camera.height, sequence.camera.width
     for index in chosen:
-        frame, where = sequence[index], f"frame {index}: "
+        frame, stamp, where = sequence[index], float(sequence.timestamps[index]), f"frame {index}: "
         require(isinstance(frame, Frame), f"frame {index} is a {type(frame).__name__}, not a Frame")
-        require(frame.index == index, f"frame {index} says that its index is {frame.index}")
-        stamp = float(sequence.timestamps[index])
-        require(frame.timestamp == stamp, f"{where}stamped {frame.timestamp!r}, but timestamps[{index}] is {stamp}")
         cause = "the camera's size is not the image's, or the image is grey"
         require_arrays(frame, {"rgb": (np.uint8, (*size, 3)), "depth": (np.float32, size)}, where, cause)
-        require(
-            (np.isfinite(frame.depth) & (frame.depth >= 0)).all(),
-            f"{where}depth has values below 0 or not finite",
-            "missing depth is 0",
+        depth, measured = frame.depth, frame.depth[frame.depth > 0]
+        median = float(np.median(measured)) if len(measured) else 1.0
+        require_all(
+            (frame.index == index, f"frame {index} says that its index is {frame.index}"),
+            (frame.timestamp == stamp, f"{where}stamped {frame.timestamp!r}, but timestamps[{index}] is {stamp}"),
+            (
+                (np.isfinite(depth) & (depth >= 0)).all(),
+                f"{where}depth has values below 0 or not finite",
+                "missing depth is 0",
+            ),
+            (0.05 < median < 200, f"{where}the median depth is {median:g} m", "wrong depth_factor"),
         )
-        if frame.depth.any():
-            median = float(np.median(frame.depth[frame.depth > 0]))
-            require(0.05 < median < 200, f"{where}the median depth is {median:g} m", "wrong depth_factor")
 
 
 def _end(sequence: Sequence) -> None:
@@ -110,9 +123,9 @@ def _end(sequence: Sequence) -> None:
 
 
 def _twice(sequence: Sequence, index: int) -> None:
-    first, second = sequence[index], sequence[index]
-    same = np.array_equal(first.rgb, second.rgb) and np.array_equal(first.depth, second.depth)
-    require(same, f"frame {index} differs when it is read again", "randomness, or a buffer that is written again")
+    cause = "randomness, or a buffer that is written again"
+    fault = f"frame {index} differs when it is read again"
+    require_equal(sequence[index], sequence[index], ("rgb", "depth"), fault, cause)
 
 
 def _ground_truth(sequence: Sequence) -> None:
@@ -137,14 +150,16 @@ def _masks(sequence: Sequence, chosen: list[int]) -> None:
     shape = (sequence.camera.height, sequence.camera.width)
     for index in chosen:
         masks = source[index]
-        kind = masks.instances.dtype
-        require(
-            masks.instances.shape == shape and np.issubdtype(kind, np.integer),
-            f"the mask of frame {index} is {kind} {masks.instances.shape}, expected integers {shape}",
+        kind, names = masks.instances.dtype, set(masks.class_names)
+        unnamed = sorted(set(np.unique(masks.instances).tolist()) - {0} - names)
+        require_all(
+            (
+                masks.instances.shape == shape and np.issubdtype(kind, np.integer),
+                f"the mask of frame {index} is {kind} {masks.instances.shape}, expected integers {shape}",
+            ),
+            (not unnamed, f"instances {unnamed} of frame {index} have no class name", "0 is the background"),
+            (set(masks.moving) <= names, f"moving instances of frame {index} have no class name"),
         )
-        unnamed = set(np.unique(masks.instances).tolist()) - {0} - set(masks.class_names)
-        require(not unnamed, f"instances {sorted(unnamed)} of frame {index} have no class name", "0 is the background")
-        require(set(masks.moving) <= set(masks.class_names), f"moving instances of frame {index} have no class name")
 
 
 def _digest(sequence: Sequence) -> None:

@@ -7,23 +7,17 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from hashlib import sha256
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.contracts.tracker import Tracker, TrackerContext, TrackerSpec
+from dynslam_bench.contracts import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import PluginError, TrackerError
 from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.settings import Settings, apply_overrides
 from dynslam_bench.trackers.adapters.specs import ADAPTERS
+from dynslam_bench.trackers.systems import emfoa_oft, published
 
-SYSTEMS = (
-    "blitz_slam", "cfp_slam", "chen_slam", "dai_slam", "detect_slam", "dgs_slam", "di_slam", "ds_slam", "dynaslam",
-    "dynatm_slam", "emfoa_oft", "huai_slam", "mask_rcnn", "mor_slam", "ngd_slam", "opf_slam", "orb_slam2", "seg_slam",
-    "sgc_slam", "sof_slam", "yolo_slam",
-)  # fmt: skip
-"""The modules of `trackers.systems` that announce trackers, as ``SPEC`` or ``SPECS``."""
 KINDS = {
     "own": "this project's", "faithful-code": "published", "faithful-paper": "published", "inspired": "published",
     "assumed": "published", "external": "external", "control": "control",
@@ -33,9 +27,7 @@ KINDS = {
 
 def all_specs() -> list[TrackerSpec]:
     """The specs of all built-in trackers; imports neither torch nor OpenCV."""
-    modules = [import_module(f"dynslam_bench.trackers.systems.{name}") for name in SYSTEMS]
-    systems = [spec for module in modules for spec in getattr(module, "SPECS", None) or [module.SPEC]]
-    return [*ADAPTERS, *systems]
+    return [*ADAPTERS, *emfoa_oft.SPECS, *published.SPECS]
 
 
 def tracker_groups() -> dict[str, list[list[TrackerSpec]]]:

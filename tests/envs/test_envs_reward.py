@@ -34,7 +34,7 @@ def episode(seed: int) -> tuple[Trajectory, np.ndarray, np.ndarray]:
 
 def rewards(name: str, truth: Trajectory, poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
     stamps, online = np.arange(len(poses)) / 30.0, OnlineError(truth)
-    errors = [online.update(*frame) for frame in zip(stamps, poses, tracked, strict=True)]
+    errors = [online.update(t, p if ok else None) for t, p, ok in zip(stamps, poses, tracked, strict=True)]
     return np.array([0.0 if error is None else REWARDS[name](error) for error in errors])
 
 

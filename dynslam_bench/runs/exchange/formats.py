@@ -13,10 +13,7 @@ from dynslam_bench.core.errors import RunError, TrajectoryError
 from dynslam_bench.core.files import temporary_folder, write_atomic
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import FileNotes, TumFile, is_number, load_trajectory
+from dynslam_bench.geometry import Camera, FileNotes, Trajectory, TumFile, is_number, load_trajectory, se3
 from dynslam_bench.sequences.bags import read_bag_poses
 from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.sequences.readers.lists import read_image_list

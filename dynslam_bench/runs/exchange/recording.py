@@ -12,9 +12,8 @@ and without time, from the end of the run: ``world/map``, ``world/estimate``, ``
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +21,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts import Sequence
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.rendering import CULLED, ESTIMATE, KEPT, MASK, TRUTH
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.runs.artifacts import Snapshot, aligned_truth, read_snapshots
 from dynslam_bench.runs.frames import CSV_FILE, read_csv
 from dynslam_bench.runs.record import RunRecord
@@ -38,8 +35,6 @@ from dynslam_bench.slam.map_files import read_ply
 RECORDING_FILE = "recording.rrd"
 IMAGE = "world/camera/image"
 LAYERS = {"mask": f"{IMAGE}/mask", "kept": f"{IMAGE}/kept", "culled": f"{IMAGE}/culled"}
-_BLOCK = 25
-"""Frames that are logged at once, which costs a third of logging one by one."""
 _QUALITY = 80
 _TOLERANCE_S = 1e-5
 
@@ -51,7 +46,7 @@ class RecordedFrame:
     Attributes:
         index: Of the frame in the run's part of the sequence.
         stamp: Seconds.
-        jpeg: The image at half size, see `encode`; None to show none.
+        jpeg: The image at half size, see `encode`.
         pose: Camera to world ``[4, 4]``; None where the tracker has none: the camera stays where it was.
         shot: Features in pixels of the image, and the mask; None if they are not known, which shows none.
         state: ``ok``, ``lost``, ...
@@ -60,7 +55,7 @@ class RecordedFrame:
 
     index: int
     stamp: float
-    jpeg: bytes | None
+    jpeg: bytes
     pose: NDArray[np.float64] | None
     shot: Snapshot | None = None
     state: str = ""
@@ -115,7 +110,7 @@ def write_recording(
     except (OSError, RuntimeError) as error:
         raise RunError(f"cannot write {path}: {error}", "check the permissions and the free space") from error
     stream.send_recording_name(name)
-    _Stream(rr, stream, camera).write(frames)
+    _log_frames(rr, stream, camera, frames)
     for track_name, track, colour in zip(("estimate", "truth"), tracks, (ESTIMATE, TRUTH), strict=True):
         if track is not None and len(track):
             stream.log(f"world/{track_name}", rr.LineStrips3D([track.positions], colors=[colour]), static=True)
@@ -124,100 +119,49 @@ def write_recording(
     stream.disconnect()
 
 
-class _Stream:
-    """Logs frames in blocks.
-
-    Args:
-        rr: The library.
-        stream: Where to.
-        camera: Of the images.
-    """
-
-    def __init__(self, rr: Any, stream: Any, camera: Camera) -> None:
-        self.rr, self.stream = rr, stream
-        self.size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
-        self.scale = np.array([self.size[0] / camera.width, self.size[1] / camera.height])
-        matrix = camera.matrix * np.array([*self.scale, 1.0])[:, None]
-        matrix[:2, 2] += 0.5 * self.scale  # rerun puts the corner of the top-left pixel at 0, we its centre
-        pinhole = rr.Pinhole(
-            image_from_camera=matrix, width=self.size[0], height=self.size[1], camera_xyz=rr.ViewCoordinates.RDF
-        )
-        classes = rr.AnnotationContext([(0, "static", (0, 0, 0, 0)), (1, "dynamic", (*MASK, 110))])
-        stream.log("world", rr.ViewCoordinates.RDF, static=True)
-        stream.log(IMAGE, pinhole, classes, static=True)
-        for layer, colour in (("kept", KEPT), ("culled", CULLED)):
-            stream.log(LAYERS[layer], rr.Points2D.from_fields(colors=[colour], radii=[1.0]), static=True)
-        self.first: float | None = None
-        self.state = ""
-        self.shown: set[str] = set()
-
-    def write(self, frames: Iterable[RecordedFrame]) -> None:
-        """Log all frames."""
-        rr, remaining = self.rr, iter(frames)
-        while block := list(islice(remaining, _BLOCK)):
-            self.first = block[0].stamp if self.first is None else self.first
-            poses = [(f, np.concatenate(se3.to_quaternion(f.pose))) for f in block if f.pose is not None]
-            self._send("world/camera", poses, self._transforms)
-            self._send(IMAGE, [(f, f.jpeg) for f in block if f.jpeg is not None], self._images)
-            errors = [(f, f.error_m) for f in block if f.error_m is not None]
-            self._send("error/trans_m", errors, lambda values: rr.Scalars.columns(scalars=values))
-            self._send("state", self._changes(block), lambda values: rr.TextLog.columns(text=values))
-            for layer, cleared in self._cleared(block).items():
-                self._send(LAYERS[layer], cleared, lambda values: rr.Clear.columns(is_recursive=values))
-            shots = [(f, f.shot) for f in block if f.shot is not None]
-            for layer in ("kept", "culled"):
-                points = [(f, self._points(shot, kept=layer == "kept")) for f, shot in shots]
-                self._send(LAYERS[layer], points, self._point_columns)
-                counts = [(f, float(len(chosen))) for f, chosen in points]
-                self._send(f"features/{layer}", counts, lambda values: rr.Scalars.columns(scalars=values))
-            self._send(LAYERS["mask"], [(f, shot.mask) for f, shot in shots if shot.mask is not None], self._masks)
-
-    def _send(self, entity: str, rows: list[tuple[RecordedFrame, Any]], columns: Callable[[list[Any]], Any]) -> None:
-        if not rows:
-            return
-        seconds = np.array([frame.stamp for frame, _ in rows]) - (self.first or 0.0)
-        numbers = np.array([frame.index for frame, _ in rows])
-        index = [self.rr.TimeColumn("frame", sequence=numbers), self.rr.TimeColumn("time", duration=seconds)]
-        self.stream.send_columns(entity, indexes=index, columns=columns([value for _, value in rows]))
-
-    def _transforms(self, values: list[Any]) -> Any:
-        rows = np.array(values)
-        return self.rr.Transform3D.columns(translation=rows[:, :3], quaternion=rows[:, 3:])
-
-    def _images(self, values: list[bytes]) -> Any:
-        return self.rr.EncodedImage.columns(blob=values, media_type=["image/jpeg"] * len(values))
-
-    def _points(self, shot: Snapshot, *, kept: bool) -> NDArray[np.float32]:
-        points: NDArray[np.float32] = ((shot.points + 0.5) * self.scale).astype(np.float32)
-        return points[shot.kept if kept else ~shot.kept]
-
-    def _point_columns(self, values: list[NDArray[np.float32]]) -> Any:
-        columns = self.rr.Points2D.columns(positions=np.concatenate(values))
-        return columns.partition([len(points) for points in values])
-
-    def _masks(self, values: list[NDArray[np.bool_]]) -> Any:
-        shape = self.rr.components.ImageFormat(
-            width=self.size[0], height=self.size[1], channel_datatype=self.rr.ChannelDatatype.U8
-        )
-        resized = [cv2.resize(mask.astype(np.uint8), self.size, interpolation=cv2.INTER_NEAREST) for mask in values]
-        buffers = [mask.tobytes() for mask in resized]
-        return self.rr.SegmentationImage.columns(buffer=buffers, format=[shape] * len(buffers))
-
-    def _changes(self, block: list[RecordedFrame]) -> list[tuple[RecordedFrame, str]]:
-        """The frames on which the state is another one than before."""
-        before = [self.state, *(frame.state for frame in block)]
-        self.state = before[-1]
-        return [(frame, frame.state) for frame, state in zip(block, before, strict=False) if frame.state != state]
-
-    def _cleared(self, block: list[RecordedFrame]) -> dict[str, list[tuple[RecordedFrame, bool]]]:
-        """Layers that a frame showed and the next one does not know: the viewer would show them on."""
-        cleared: dict[str, list[tuple[RecordedFrame, bool]]] = {layer: [] for layer in LAYERS}
-        for frame in block:
-            shown = set() if frame.shot is None else {"kept", "culled", *(["mask"] * (frame.shot.packed is not None))}
-            for layer in self.shown - shown:
-                cleared[layer].append((frame, False))
-            self.shown = shown
-        return cleared
+def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedFrame]) -> None:
+    width, height = size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
+    scale = np.array([width / camera.width, height / camera.height])
+    matrix = camera.matrix * np.array([*scale, 1.0])[:, None]
+    matrix[:2, 2] += 0.5 * scale  # rerun puts the corner of the top-left pixel at 0, we its centre
+    pinhole = rr.Pinhole(image_from_camera=matrix, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF)
+    classes = rr.AnnotationContext([(0, "static", (0, 0, 0, 0)), (1, "dynamic", (*MASK, 110))])
+    stream.log("world", rr.ViewCoordinates.RDF, static=True)
+    stream.log(IMAGE, pinhole, classes, static=True)
+    for layer, colour in (("kept", KEPT), ("culled", CULLED)):
+        stream.log(LAYERS[layer], rr.Points2D.from_fields(colors=[colour], radii=[1.0]), static=True)
+    first: float | None = None
+    state, shown = "", set[str]()
+    for frame in frames:
+        first = frame.stamp if first is None else first
+        stream.set_time("frame", sequence=frame.index)
+        stream.set_time("time", duration=frame.stamp - first)
+        stream.log(IMAGE, rr.EncodedImage(contents=frame.jpeg, media_type="image/jpeg"))
+        if frame.pose is not None:
+            position, quaternion = se3.to_quaternion(frame.pose)
+            stream.log("world/camera", rr.Transform3D.from_fields(translation=position, quaternion=quaternion))
+        if frame.error_m is not None:
+            stream.log("error/trans_m", rr.Scalars(frame.error_m))
+        if frame.state != state:
+            stream.log("state", rr.TextLog(frame.state))
+        layers: dict[str, Any] = {}
+        if frame.shot is not None:
+            points, kept, mask = (
+                ((frame.shot.points + 0.5) * scale).astype(np.float32),
+                frame.shot.kept,
+                frame.shot.mask,
+            )
+            for layer, chosen in (("kept", points[kept]), ("culled", points[~kept])):
+                layers[layer] = rr.Points2D.from_fields(positions=chosen)
+                stream.log(f"features/{layer}", rr.Scalars(float(len(chosen))))
+            if mask is not None:
+                small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+                layers["mask"] = rr.SegmentationImage(small)
+        for layer in shown - layers.keys():  # the viewer would show them on
+            stream.log(LAYERS[layer], rr.Clear(recursive=False))
+        for layer, picture in layers.items():
+            stream.log(LAYERS[layer], picture)
+        state, shown = frame.state, set(layers)
 
 
 def _blueprint() -> Any:

@@ -14,16 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dynslam_bench
-from dynslam_bench.contracts.sequence import Sequence, timestamps_ns
+from dynslam_bench.contracts import Sequence, timestamps_ns
 from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.envs.arguments import Frames, open_frames
 from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE
-from dynslam_bench.geometry.association import associate, nearest_gap
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import write_kitti, write_tum
+from dynslam_bench.geometry import Trajectory, associate, nearest_gap, write_kitti, write_tum
 from dynslam_bench.runs.exchange.formats import read_trajectory, write_bag, write_colmap, write_euroc, write_vslam_lab
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
 from dynslam_bench.runs.record import RunRecord, TrackerInfo

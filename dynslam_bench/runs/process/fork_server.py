@@ -322,9 +322,6 @@ def serve(fd: int, start: str) -> None:
     for name in PRELOADED if start == "fork" else ():
         with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
             importlib.import_module(name)
-    if start == "fork":
-        with contextlib.suppress(Exception):
-            importlib.import_module("dynslam_bench.trackers.registry").all_specs()  # imports all systems
     adopt_orphans()
     _Server(control, start).run()
 

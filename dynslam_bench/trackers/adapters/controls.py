@@ -9,13 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory_files import read_tum
+from dynslam_bench.geometry import Camera, read_tum, se3
 from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
 
 MAX_CORNERS = 400

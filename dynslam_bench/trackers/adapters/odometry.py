@@ -15,11 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackingState, TrackResult
+from dynslam_bench.contracts import Frame, TrackingState, TrackResult
 from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.trackers.adapters.specs import Open3dOdometrySettings, OpenCvOdometrySettings
 
 LEAST_DEPTH_PIXELS = 1000

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 import dynslam_bench
-from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.contracts import TrackerContext
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import vocabularies_folder
 from dynslam_bench.core.reading import MEGABYTE, read_bytes
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 from dynslam_bench.trackers.adapters.subprocess_tracker import FinalizingProgramTracker, ProgramTracker
 
@@ -208,23 +208,14 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
     """Refuse cameras with which ORB-SLAM3 crashes or returns meaningless poses.
 
     Raises:
-        TrackerError: Another camera model, intrinsics that are none, or an image too small for the pyramid.
+        TrackerError: Intrinsics that are none, or an image too small for the pyramid.
     """
-    if type(camera) is not Camera:
-        raise TrackerError(
-            f"orbslam3 cannot take a {type(camera).__name__}",
-            "its RGB-D mode knows the pinhole camera with radial-tangential distortion only; undistort the images",
-        )
     values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m, *camera.distortion)
     if not all(math.isfinite(value) for value in values) or min(camera.fx, camera.fy, camera.baseline_m) <= 0:
         raise TrackerError(
             f"orbslam3 cannot take the camera fx={camera.fx:g} fy={camera.fy:g} cx={camera.cx:g} cy={camera.cy:g} "
             f"baseline={camera.baseline_m:g} m distortion={camera.distortion}",
             "focal lengths and baseline must be positive, all values finite",
-        )
-    if len(camera.distortion) != 5:
-        raise TrackerError(
-            f"orbslam3 cannot take {len(camera.distortion)} distortion coefficients", "it knows k1 k2 p1 p2 k3"
         )
     shrunk = settings.scale_factor ** (settings.levels - 1)
     columns, rows = (round(side / shrunk) - 2 * BORDER_PX for side in (camera.width, camera.height))

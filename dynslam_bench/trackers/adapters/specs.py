@@ -14,7 +14,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Settings, names, tunable
 from dynslam_bench.core.version import install_hint
@@ -45,7 +45,7 @@ class ReplaySettings(Settings):
 
     def verify(self) -> None:
         """There must be a file, and a trajectory in it."""
-        from dynslam_bench.geometry.trajectory_files import read_tum
+        from dynslam_bench.geometry import read_tum
 
         if not self.file.strip():
             raise SettingsError("replay needs a trajectory file", "write replay:FILE or --set file=FILE")

@@ -25,16 +25,13 @@ from typing import IO, Any, Literal, cast, get_args
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackerContext, TrackingState, TrackResult
+from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError
 from dynslam_bench.core.files import SHARED_MEMORY, TemporaryFolder
 from dynslam_bench.core.reading import parse_json
 from dynslam_bench.core.seeding import derive_seed
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
 
 _SET_PARENT_DEATH_SIGNAL = 1
@@ -326,14 +323,8 @@ class ImageExchange:
         """Hand over a frame; returns the paths for the ``track`` request, in mode ``png``.
 
         Raises:
-            TrackerError: The images do not have the camera's size.
+            TrackerError: A PNG file cannot be written.
         """
-        expected = (self.camera.height, self.camera.width)
-        if frame.rgb.shape != (*expected, 3) or frame.depth.shape != expected:
-            raise TrackerError(
-                f"frame {frame.index} has colour {frame.rgb.shape} and depth {frame.depth.shape}, "
-                f"but the camera is {self.camera.width}x{self.camera.height}"
-            )
         if self.mode == "raw":
             np.copyto(self._rgb, frame.rgb)
             np.copyto(self._depth, frame.depth)
@@ -360,14 +351,12 @@ def _with_space(size: int) -> TemporaryFolder:
     """
     reasons = []
     for base in (SHARED_MEMORY, Path(tempfile.gettempdir())):
-        with contextlib.ExitStack() as undo:
-            try:
-                folder = undo.enter_context(contextlib.closing(TemporaryFolder(base)))
-                (folder.path / FRAME_FILE).write_bytes(bytes(size))
-                undo.pop_all()
-                return folder
-            except OSError as error:
-                reasons.append(f"{base}: {error.strerror}")
+        try:
+            folder = TemporaryFolder(base)  # where the file does not fit, it is removed with the object
+            (folder.path / FRAME_FILE).write_bytes(bytes(size))
+            return folder
+        except OSError as error:
+            reasons.append(f"{base}: {error.strerror}")
     raise InfrastructureError(f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space")
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, create_model
 
-from dynslam_bench.contracts.filter import DynamicFilter
-from dynslam_bench.contracts.tracker import Tracker, TrackerContext
+from dynslam_bench.contracts import DynamicFilter, Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import SegmentationError, SettingsError
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
@@ -47,6 +47,10 @@ class ObjectSettings(UnrepairedSettings):
 class UnfilteredSystemSettings(Settings):
     """Settings of every system on this project's back end."""
 
+    filters: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """The rules in the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups of the
+    settings that the class takes, its own first. A rule is left out where the settings lack one of its groups, or where
+    its own group has ``enabled = false``."""
     preprocessing: PreprocessingSettings = PreprocessingSettings()
     features: FeatureSettings = FeatureSettings()
     backend: BackendSettings = BackendSettings()
@@ -107,26 +111,17 @@ def movable_classes(filters: Sequence[DynamicFilter]) -> frozenset[str]:
     return frozenset().union(*(expand_classes(names) for names in named if names))
 
 
-def composed(*filters: tuple[str, ...]) -> Callable[[Any, TrackerContext], Tracker]:
-    """A tracker factory: the filters of a system on the shared back end.
+def build(settings: UnfilteredSystemSettings, context: TrackerContext) -> Tracker:
+    """The factory of every system that is a table's entry: its `filters` on the shared back end.
 
-    A filter is left out where the settings lack one of its groups, or where its own group has ``enabled = false``. The
-    filters are loaded when a tracker is built, so that the module of a system imports neither torch nor OpenCV.
-
-    Args:
-        filters: In the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups of the
-            system's settings that the class takes, its own first.
+    The filters are loaded here, so that a table of systems imports neither torch nor OpenCV.
     """
-
-    def build(settings: UnfilteredSystemSettings, context: TrackerContext) -> Tracker:
-        blocks = []
-        for name, *groups in filters:
-            arguments = [getattr(settings, group, None) for group in groups]
-            if None not in arguments and getattr(arguments[0], "enabled", True):
-                blocks.append(load_object(f"dynslam_bench.culling.{name}")(*arguments))
-        return compose(settings, context, blocks, getattr(settings, "flow", None))
-
-    return build
+    blocks = []
+    for name, *groups in settings.filters:
+        arguments = [getattr(settings, group, None) for group in groups]
+        if None not in arguments and getattr(arguments[0], "enabled", True):
+            blocks.append(load_object(f"dynslam_bench.culling.{name}")(*arguments))
+    return compose(settings, context, blocks, getattr(settings, "flow", None))
 
 
 def compose(
@@ -194,8 +189,6 @@ def compose(
     )
 
 
-# Sentences of the specs are made from the settings, so that a spec states the numbers in force.
-
 BACKEND = (
     "monocular back end: the unit of length is the median depth of the first map; "
     "no loop closing unless asked for (backend.loop_closing.enabled)"
@@ -211,20 +204,78 @@ UNMATCHED: dict[Unmatched, str] = {
 """Treatment of features without a match, by the setting `unmatched`."""
 
 
-def describe_masks(segmentation: SegmentationSettings, *, boxes: bool = False) -> str:
-    """Source of a system's masks or boxes, and what the shared stage adds to them."""
-    what = "boxes are those of the instance masks, which" if boxes else "masks"
-    frames = segmentation.compensate
-    bridged = f"bridged for {frames} segmented frames" if frames else "not bridged"
-    return (
-        f"{what} come from the stage that all systems share: scores of at least {segmentation.confidence:g}, "
-        f"missed detections {bridged}"
+def system(
+    name: str,
+    label: str,
+    filters: Sequence[tuple[str, ...]],
+    groups: Mapping[str, Settings],
+    *,
+    base: type[UnfilteredSystemSettings] | tuple[type[UnfilteredSystemSettings], ...] = SemanticSystemSettings,
+    assumptions: Sequence[str] = (),
+    entry_point: str = f"{__name__}:build",
+    **spec: Any,
+) -> TrackerSpec:
+    """The spec of a system that is composed of rules.
+
+    Args:
+        name: Its id.
+        label: Its name in tables.
+        filters: Its rules, see `UnfilteredSystemSettings.filters`.
+        groups: Groups of its settings, with their defaults, that `base` lacks or has with other defaults.
+        base: Settings of the kind of system that it is.
+        assumptions: Where it deviates from its source, or the source is silent; `sentences` fills in ``{masks}``, ...
+        entry_point: Its factory, where it is none of the rules alone.
+        **spec: Further fields of `TrackerSpec`.
+    """
+    title = "".join(word.capitalize() for word in re.findall(r"\w+", name))
+    fields: dict[str, Any] = {group: (type(default), default) for group, default in groups.items()}
+    settings = create_model(f"{title}Settings", __base__=base, __module__=__name__, **fields)
+    settings.filters = tuple(filters)
+    globals()[settings.__name__] = settings  # pickle looks it up there
+    stated = sentences(settings())
+    return TrackerSpec(
+        id=name,
+        entry_point=entry_point,
+        label=label,
+        settings=settings,
+        assumptions=tuple(text.format(**stated) for text in assumptions),
+        **spec,
     )
 
 
-def describe_dilation(segmentation: SegmentationSettings) -> str:
-    """How far a system's masks are grown, where its source is silent."""
-    return f"masks grown by {segmentation.dilation_px} px (not stated)"
+def sentences(settings: UnfilteredSystemSettings) -> dict[str, str]:
+    """Sentences of specs by name, made from the settings, so that a spec states the numbers in force.
+
+    ``masks``, ``boxes``: their source; ``dilation``: how far masks are grown, where the source is silent; ``tracks``:
+    how the flow is computed; ``matches``: the same, of a system that tests matches; ``links``: the same, of one with a
+    memory of features.
+    """
+    stated: dict[str, str] = {}
+    if isinstance(settings, SemanticSystemSettings):
+        masks = describe_masks(settings.segmentation)
+        dilation = f"masks grown by {settings.segmentation.dilation_px} px (not stated)"
+        stated = {
+            "masks": masks,
+            "boxes": f"boxes are those of the instance masks, which{masks[5:]}",
+            "dilation": dilation,
+        }
+    flow = getattr(settings, "flow", None)
+    if flow is not None:
+        tracks = describe_tracks(flow)
+        unmatched: Unmatched = next((group.unmatched for _, group in settings if hasattr(group, "unmatched")), "keep")
+        links = f"features are followed by {tracks}, not by descriptors; one without a past begins at 0.5"
+        stated |= {"tracks": tracks, "matches": f"matches are {tracks}; {UNMATCHED[unmatched]}", "links": links}
+    return stated
+
+
+def describe_masks(segmentation: SegmentationSettings) -> str:
+    """Source of a system's masks, and what the shared stage adds to them."""
+    frames = segmentation.compensate
+    bridged = f"bridged for {frames} segmented frames" if frames else "not bridged"
+    return (
+        f"masks come from the stage that all systems share: scores of at least {segmentation.confidence:g}, "
+        f"missed detections {bridged}"
+    )
 
 
 def describe_tracks(flow: FlowMethodSettings) -> str:
@@ -232,13 +283,3 @@ def describe_tracks(flow: FlowMethodSettings) -> str:
     limit = flow.forward_backward_px
     check = f"a check of {limit:g} px on the way back" if limit else "no check on the way back"
     return f"Lucas-Kanade tracks (window {flow.window_px} px, begun at the motion model's guess, {check})"
-
-
-def describe_matches(flow: FlowMethodSettings, unmatched: Unmatched) -> str:
-    """How a system that tests matches computes them, and how it treats features without one."""
-    return f"matches are {describe_tracks(flow)}; {UNMATCHED[unmatched]}"
-
-
-def describe_links(flow: FlowMethodSettings) -> str:
-    """How a system with a memory of features follows them, and how it treats new ones."""
-    return f"features are followed by {describe_tracks(flow)}, not by descriptors; one without a past begins at 0.5"

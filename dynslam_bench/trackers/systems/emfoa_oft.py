@@ -8,9 +8,11 @@ culls points off their epipolar lines; the rest is tracked and mapped. `docs/exp
 equation.
 """
 
-from dataclasses import replace
+from collections.abc import Mapping
+from typing import Any
 
-from dynslam_bench.contracts.tracker import TrackerSpec
+from dynslam_bench.contracts import TrackerSpec
+from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.settings import EpipolarSettings, FreeSpaceSettings, RigidMotionSettings
 from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 from dynslam_bench.trackers.systems.composition import (
@@ -21,10 +23,11 @@ from dynslam_bench.trackers.systems.composition import (
     ObjectSettings,
     SemanticSystemSettings,
     SystemSettings,
-    composed,
-    describe_dilation,
-    describe_masks,
+    system,
 )
+from dynslam_bench.trackers.systems.published import SEMANTIC, UNGUARDED
+
+Groups = Mapping[str, Settings]
 
 
 class EpipolarTestSettings(SystemSettings):
@@ -34,73 +37,7 @@ class EpipolarTestSettings(SystemSettings):
     epipolar: EpipolarSettings = EpipolarSettings()
 
 
-class DepthTestSettings(EpipolarTestSettings):
-    """The tests of depth as well."""
-
-    motion: RigidMotionSettings = RigidMotionSettings()
-    free_space: FreeSpaceSettings = FreeSpaceSettings()
-
-
-class EmfoaOftSettings(DepthTestSettings, SemanticSystemSettings):
-    """Settings of this project's system."""
-
-
-class MaskedEpipolarTestSettings(EpipolarTestSettings, SemanticSystemSettings):
-    """Masks and the epipolar test."""
-
-
-class LucasKanadeSettings(EmfoaOftSettings):
-    """Lucas-Kanade flow."""
-
-    flow: FlowMethodSettings = FlowMethodSettings(method="lucas-kanade")  # type: ignore[assignment]
-
-
-class PatchMatchSettings(EmfoaOftSettings):
-    """PatchMatch as label search."""
-
-    flow: FlowSettings = FlowSettings(search="patchmatch")
-
-
-class LiteralSettings(EmfoaOftSettings):
-    """The moth-flame equations as printed."""
-
-    flow: FlowSettings = FlowSettings(search="emfoa-literal")
-
-
-class ObjectVoteSettings(MaskedEpipolarTestSettings):
-    """Objects are dynamic by the epipolar vote of their points."""
-
-    segmentation: ObjectSettings = ObjectSettings()
-    epipolar: EpipolarSettings = EpipolarSettings(mode="object")
-
-
-class ObjectVoteDepthTestSettings(EmfoaOftSettings):
-    """The same, and the tests of depth."""
-
-    segmentation: ObjectSettings = ObjectSettings()
-    epipolar: EpipolarSettings = EpipolarSettings(mode="object")
-
-
-class PaperTestSettings(EpipolarTestSettings):
-    """The paper's flow, dense and with all terms, and its test on every frame, without the guard."""
-
-    flow: DenseFlowSettings = DenseFlowSettings(terms=3)  # type: ignore[assignment]
-    epipolar: EpipolarSettings = EpipolarSettings(
-        min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0, max_contradiction=1.0
-    )
-
-
-class PaperSettings(PaperTestSettings, SemanticSystemSettings):
-    """Settings of the paper's system."""
-
-
-class PaperSparseSettings(PaperSettings):
-    """The paper's test on the flow of this project's system."""
-
-    flow: FlowSettings = FlowSettings()  # type: ignore[assignment]
-
-
-class EmfoaOftMonoSettings(MonocularSemanticSettings, EpipolarTestSettings):
+class MonocularSettings(MonocularSemanticSettings, EpipolarTestSettings):
     """This project's system without depth: the paper calls itself monocular in half of its text."""
 
 
@@ -109,10 +46,13 @@ TESTS = (
     ("ego_motion:RigidMotionFilter", "motion"),
     ("free_space:FreeSpaceFilter", "free_space"),
 )
-build = composed(("semantic:SemanticFilter", "segmentation"), *TESTS)
-build_vote = composed(*TESTS)
+EPIPOLAR: Groups = {"flow": FlowSettings(), "epipolar": EpipolarSettings()}
+OWN: Groups = {**EPIPOLAR, "motion": RigidMotionSettings(), "free_space": FreeSpaceSettings()}
+"""The tests of depth as well."""
+VOTE: Groups = {"segmentation": ObjectSettings(), "epipolar": EpipolarSettings(mode="object")}
 """Without mask culling: the epipolar vote of its points decides on an object (`EpipolarFilter`)."""
-
+PAPER: Groups = {"flow": DenseFlowSettings(terms=3), "epipolar": UNGUARDED}
+"""The paper's flow, dense and with all terms, and its test on every frame, without the guard."""
 WHOSE = (
     "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; ours are the flow at the "
     "points alone without aggregated costs, the conditions under which the epipolar test may cull, and the tests of "
@@ -129,92 +69,109 @@ DENSE = (
     "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried on every pixel of the region "
     "(as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the smoothing by regions are ours)",
 )
-DEPTH = "rigid motion in depth and free space seen before are tested as well (ours, no part of the paper)"
+DEPTH_TESTS = "rigid motion in depth and free space seen before are tested as well (ours, no part of the paper)"
 
 
-def _assumptions(settings: SystemSettings) -> tuple[str, ...]:
-    monocular, sparse = (
-        isinstance(settings, EmfoaOftMonoSettings),
-        isinstance(getattr(settings, "flow", None), FlowSettings),
-    )
-    sentences = []
-    if isinstance(settings, SemanticSystemSettings):
-        sentences += [describe_masks(settings.segmentation), CFPN]
-        if settings.segmentation.dilation_px:
-            sentences.append(describe_dilation(settings.segmentation))
-    if isinstance(settings, EpipolarTestSettings):
-        sentences.append(NOT_STATED)
-    if not monocular:
-        sentences.append(SENSOR)
-    if isinstance(settings, PaperTestSettings):
-        sentences += [SPARSE] if sparse else DENSE
-    elif isinstance(settings, EpipolarTestSettings):
-        sentences += [*[SPARSE] * sparse, SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS]
-    if isinstance(settings, DepthTestSettings):
-        sentences.append(DEPTH)
-    return (*sentences, BACKEND) if monocular else tuple(sentences)
+def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[str]:
+    masks, monocular, tested = base is not SystemSettings, base is MonocularSettings, "epipolar" in groups
+    paper, sparse = name.startswith("emfoa-oft-paper"), isinstance(groups.get("flow"), FlowSettings)
+    sentences: list[tuple[bool, tuple[str, ...]]] = [
+        (name == "emfoa-oft", (WHOSE,)),
+        (masks, ("{masks}", CFPN)),
+        (masks and "segmentation" not in groups, ("{dilation}",)),
+        (tested, (NOT_STATED,)),
+        (not monocular, (SENSOR,)),
+        (sparse, (SPARSE,)),
+        (paper and not sparse, DENSE),
+        (tested and not paper, (SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS)),
+        ("motion" in groups, (DEPTH_TESTS,)),
+        (monocular, (BACKEND,)),
+    ]
+    return [sentence for holds, stated in sentences if holds for sentence in stated]
 
 
-def _spec(name: str, label: str, settings: type[SystemSettings], summary: str) -> TrackerSpec:
-    return TrackerSpec(
-        id=name,
-        entry_point=f"{__name__}:build",
-        label=f"{label} (our back end)",
-        settings=settings,
+def _spec(name: str, label: str, base: type[SystemSettings], groups: Groups, summary: str, **more: Any) -> TrackerSpec:
+    filters = TESTS if "masks=vote" in name else (SEMANTIC, *TESTS)
+    return system(
+        name,
+        label,
+        filters,
+        groups,
+        base=base,
         summary=summary,
-        sensors="rgb" if issubclass(settings, MonocularSemanticSettings) else "rgbd",
-        provenance="own",
         license="MIT",
         citation="EMFOA-OFT-SLAM: the paper that this toolkit implements; see docs/explanation/paper.md",
-        assumptions=_assumptions(settings()),
+        assumptions=_assumptions(name, base, groups),
+        **{"provenance": "own", **more},
     )
 
 
-EMFOA_OFT = replace(
-    _spec(
-        "emfoa-oft",
-        "EMFOA-OFT with depth tests, our own",
-        EmfoaOftSettings,
-        "our own system: masks, EMFOA-optimised sparse flow, guarded epipolar test, tests of depth",
+VARIANTS: dict[str, tuple[type[SystemSettings], Groups, str]] = {
+    "emfoa-oft?depth=none": (SemanticSystemSettings, EPIPOLAR, "without the tests of depth, which are ours"),
+    "emfoa-oft?masks=none": (SystemSettings, OWN, "geometry alone"),
+    "emfoa-oft?masks=none&depth=none": (SystemSettings, EPIPOLAR, "the guarded epipolar test alone"),
+    "emfoa-oft?masks=vote": (
+        SemanticSystemSettings,
+        {**OWN, **VOTE},
+        "the vote of an object's points, and the tests of depth",
     ),
-    presets=FAST_FLOW,
-    assumptions=(WHOSE, *_assumptions(EmfoaOftSettings())),
-)
-PAPER = replace(
-    _spec(
-        "emfoa-oft-paper",
-        "EMFOA-OFT-SLAM",
-        PaperSettings,
-        "the paper's system: masks, EMFOA-optimised dense DAISY Filter Flow, epipolar culling",
+    "emfoa-oft?masks=vote&depth=none": (
+        SemanticSystemSettings,
+        {**EPIPOLAR, **VOTE},
+        "objects go by the vote of their points, not by class",
     ),
-    provenance="faithful-paper",
-    published_as=("EMFOA-OFT-SLAM",),
-)
-MONOCULAR = _spec(
-    "emfoa-oft-mono",
-    "EMFOA-OFT, monocular",
-    EmfoaOftMonoSettings,
-    "our own system without depth: masks, EMFOA-optimised sparse flow, guarded epipolar test",
-)
-VARIANTS: dict[str, tuple[type[SystemSettings], str]] = {
-    "emfoa-oft?depth=none": (MaskedEpipolarTestSettings, "without the tests of depth, which are ours"),
-    "emfoa-oft?masks=none": (DepthTestSettings, "geometry alone"),
-    "emfoa-oft?masks=none&depth=none": (EpipolarTestSettings, "the guarded epipolar test alone"),
-    "emfoa-oft?masks=vote": (ObjectVoteDepthTestSettings, "the vote of an object's points, and the tests of depth"),
-    "emfoa-oft?masks=vote&depth=none": (ObjectVoteSettings, "objects go by the vote of their points, not by class"),
-    "emfoa-oft?flow=none": (SemanticSystemSettings, "masks alone"),
-    "emfoa-oft?flow=lucas-kanade": (LucasKanadeSettings, "Lucas-Kanade instead of DAISY Filter Flow"),
-    "emfoa-oft?search=patchmatch": (PatchMatchSettings, "PatchMatch instead of EMFOA"),
-    "emfoa-oft?search=emfoa-literal": (LiteralSettings, "the moth-flame equations as printed"),
-    "emfoa-oft-paper?flow=sparse": (PaperSparseSettings, "the paper's test on the flow of our own system"),
-    "emfoa-oft-paper?masks=none": (PaperTestSettings, "the paper's flow and epipolar test alone"),
+    "emfoa-oft?flow=none": (SemanticSystemSettings, {}, "masks alone"),
+    "emfoa-oft?flow=lucas-kanade": (
+        SemanticSystemSettings,
+        {**OWN, "flow": FlowMethodSettings(method="lucas-kanade")},
+        "Lucas-Kanade instead of DAISY Filter Flow",
+    ),
+    "emfoa-oft?search=patchmatch": (
+        SemanticSystemSettings,
+        {**OWN, "flow": FlowSettings(search="patchmatch")},
+        "PatchMatch instead of EMFOA",
+    ),
+    "emfoa-oft?search=emfoa-literal": (
+        SemanticSystemSettings,
+        {**OWN, "flow": FlowSettings(search="emfoa-literal")},
+        "the moth-flame equations as printed",
+    ),
+    "emfoa-oft-paper?flow=sparse": (
+        SemanticSystemSettings,
+        {**PAPER, "flow": FlowSettings()},
+        "the paper's test on the flow of our own system",
+    ),
+    "emfoa-oft-paper?masks=none": (SystemSettings, PAPER, "the paper's flow and epipolar test alone"),
 }
 """Ablations: id, settings, and what differs."""
-
-
-def _variant(name: str, settings: type[SystemSettings], difference: str) -> TrackerSpec:
-    spec = replace(_spec(name, name, settings, f"ablation: {difference}"), label=f"{name} (ablation)", ranked=False)
-    return replace(spec, entry_point=f"{__name__}:build_vote") if "masks=vote" in name else spec
-
-
-SPECS = [EMFOA_OFT, PAPER, MONOCULAR, *(_variant(name, *variant) for name, variant in VARIANTS.items())]
+SPECS = (
+    _spec(
+        "emfoa-oft",
+        "EMFOA-OFT with depth tests, our own (our back end)",
+        SemanticSystemSettings,
+        OWN,
+        "our own system: masks, EMFOA-optimised sparse flow, guarded epipolar test, tests of depth",
+        presets=FAST_FLOW,
+    ),
+    _spec(
+        "emfoa-oft-paper",
+        "EMFOA-OFT-SLAM (our back end)",
+        SemanticSystemSettings,
+        PAPER,
+        "the paper's system: masks, EMFOA-optimised dense DAISY Filter Flow, epipolar culling",
+        provenance="faithful-paper",
+        published_as=("EMFOA-OFT-SLAM",),
+    ),
+    _spec(
+        "emfoa-oft-mono",
+        "EMFOA-OFT, monocular (our back end)",
+        MonocularSettings,
+        EPIPOLAR,
+        "our own system without depth: masks, EMFOA-optimised sparse flow, guarded epipolar test",
+        sensors="rgb",
+    ),
+    *(
+        _spec(name, f"{name} (ablation)", base, groups, f"ablation: {difference}", ranked=False)
+        for name, (base, groups, difference) in VARIANTS.items()
+    ),
+)

@@ -5,11 +5,9 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-from adapter_programs import GOOD, frame, gone, reset
+from adapter_programs import frame, gone, reset
 
-from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import InfrastructureError, SettingsError, TrackerError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.trackers import build_tracker
@@ -84,11 +82,9 @@ def test_a_second_answer_is_never_taken_for_the_next_frame(program):
         tracker.close()
 
 
-def test_refusals_at_reset_and_of_images_of_another_size(program):
+def test_refusals_at_reset(program):
     with pytest.raises(TrackerError, match="at reset: fisheye cameras only"):
         reset(program("next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)", close_timeout_s=0.1))
-    with pytest.raises(TrackerError, match="but the camera is 64x48"):
-        reset(program(GOOD)).track(Frame(0, 0.0, np.zeros((24, 32, 3), np.uint8), np.zeros((24, 32), np.float32)))
 
 
 def test_faults_at_finalize(program):
