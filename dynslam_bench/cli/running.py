@@ -146,7 +146,6 @@ def run(
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
     from dynslam_bench.api import checked, make_specs, run_specs
-    from dynslam_bench.runs.running import pictures_asked
 
     overrides = opts.gather_settings(assignments, settings)
     if start_map is not None:
@@ -162,7 +161,7 @@ def run(
     )  # fmt: skip
     scored_under = protocol or default_protocol(tracker)
     make = partial(run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under)
-    finish(make, results, jobs, scored_under, yes, pictures_asked(specs[0]))
+    finish(make, results, jobs, scored_under, yes, runs.pictures_asked(specs[0]))
 
 
 def default_protocol(tracker: str) -> str:
@@ -340,27 +339,23 @@ class WatchedRuns:
 
 def event_text(event: runs.RunEvent) -> str:
     """Tracker, sequence and progress of a run, for a progress bar: the frame, then what is written behind the last."""
-    from dynslam_bench.runs.running import pictures_asked
-
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
     if event.kind != "progress" or event.partial is None:
         return text
     done, frames = event.partial["frames_done"], event.partial["frames"]
     if done < frames:
         return f"{text}, frame {done} of {frames}"
-    return f"{text}, writing {', '.join(['trajectories', *pictures_asked(event.spec)])}"
+    return f"{text}, writing {', '.join(['trajectories', *runs.pictures_asked(event.spec)])}"
 
 
-def describe_plan(runs: Collection[runs.ResolvedRun], store: runs.RunStore, jobs: int, protocol: str) -> str:
+def describe_plan(planned: Collection[runs.ResolvedRun], store: runs.RunStore, jobs: int, protocol: str) -> str:
     """How many frames will be tracked, and the expected time by stored runs of the same trackers."""
-    from dynslam_bench.runs.store import list_runs
-
-    text = f"{len(runs)} run{'s' * (len(runs) != 1)}, {sum(len(run.sequence) for run in runs)} frames"
+    text = f"{len(planned)} run{'s' * (len(planned) != 1)}, {sum(len(run.sequence) for run in planned)} frames"
     times_ms = defaultdict[str, list[float]](list)
-    for row in list_runs(store, protocol)[0]:
+    for row in runs.list_runs(store, protocol)[0]:
         if row["frame_ms"]:
             times_ms[row["tracker"]].append(row["frame_ms"])
-    if not {run.tracker.id for run in runs} <= times_ms.keys():
+    if not {run.tracker.id for run in planned} <= times_ms.keys():
         return text
-    expected_ms = sum(len(run.sequence) * median(times_ms[run.tracker.id]) for run in runs) / min(jobs, len(runs))
+    expected_ms = sum(len(run.sequence) * median(times_ms[run.tracker.id]) for run in planned) / min(jobs, len(planned))
     return f"{text}, about {timedelta(seconds=round(expected_ms / 1000))} by the frame times of stored runs"

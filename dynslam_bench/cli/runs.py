@@ -24,7 +24,7 @@ from dynslam_bench.cli.options import (
 )
 from dynslam_bench.cli.output import announce, fields, json_mode, present, progress, table, warn, write
 from dynslam_bench.core.errors import RunError, did_you_mean
-from dynslam_bench.core.toml import label_text
+from dynslam_bench.core.toml import assignments, label_text
 
 COLUMNS = {
     "run": "run_id",
@@ -96,8 +96,6 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List the runs of a results folder, oldest first unless sorted otherwise."""
-    from dynslam_bench.runs.store import list_runs
-
     if status not in (None, *complete_statuses()):
         raise RunError(f"unknown status '{status}'", did_you_mean(str(status), complete_statuses()))
     column = sort.removeprefix("-")
@@ -105,7 +103,7 @@ def list_(
         raise RunError(f"runs are not sorted by '{column}'", did_you_mean(column, SORTED_BY))
     store = _open(results)
     with progress("reading runs") as advance:
-        rows, unreadable = list_runs(store, protocol, on_progress=advance)
+        rows, unreadable = stored.list_runs(store, protocol, on_progress=advance)
     chosen = [
         row
         for row in rows
@@ -128,7 +126,7 @@ def show(
     """Show everything about a run."""
     store = stored.RunStore(results)
     record = store.read(run)
-    metrics = stored.score(store, record, protocol)
+    metrics = store.score(record, protocol)
     lines = [fields(run_facts(store, record))]
     if record.timings:
         stages = record.timings.items()
@@ -151,10 +149,8 @@ def rescore(
     as_json: AsJson = False,
 ) -> None:
     """Compute the errors of all runs again from their trajectories, and list those that have changed."""
-    from dynslam_bench.runs.store import rescore as score_again
-
     with progress("scoring runs") as advance:
-        outcomes = score_again(_open(results), protocol, on_progress=advance)
+        outcomes = stored.rescore(_open(results), protocol, on_progress=advance)
     lines = []
     for outcome in outcomes:
         changed = f": {', '.join(outcome.changed)}" if outcome.changed else ""
@@ -185,9 +181,6 @@ def rm(
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
-    from dynslam_bench.core.toml import assignments
-    from dynslam_bench.runs.store import part_words
-
     return {
         "run": record.run_id,
         "folder": store.folder(record.run_id),
@@ -196,7 +189,7 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
         "reason": record.reason,
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
         "sequence": record.sequence.id,
-        "frames": part_words(record),
+        "frames": stored.part_words(record),
         "n_frames": record.n_frames,
         "tracked": record.n_tracked,
         "lost": record.n_lost,
@@ -223,10 +216,8 @@ def show_runs(
     records: Sequence[stored.RunRecord], store: stored.RunStore, protocol: str, reused: Collection[str] = ()
 ) -> None:
     """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are marked as from the store."""
-    from dynslam_bench.runs.store import run_row
-
     scored = [(record, None if record.status == "stopped" else store.score(record, protocol)) for record in records]
-    show_rows([run_row(*pair) | {"from_store": pair[0].run_id in reused} for pair in scored], store, protocol)
+    show_rows([stored.run_row(*pair) | {"from_store": pair[0].run_id in reused} for pair in scored], store, protocol)
 
 
 def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: str) -> None:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
-    from dynslam_bench.runs.running import RunEvent, run_many, run_one
+    from dynslam_bench.runs.running import RunEvent, pictures_asked, run_many, run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
-    from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, score
+    from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, list_runs, part_words, rescore, run_row, score
 
 _HOMES = {
     "DEFAULT_PROTOCOL": "store",
@@ -26,18 +26,23 @@ _HOMES = {
     "FAILED": "record",
     "import_trajectory": "exchange.transfer",
     "Limits": "spec",
+    "list_runs": "store",
     "load_frames": "frames",
     "MetricRecord": "record",
+    "part_words": "store",
+    "pictures_asked": "running",
     "read_trajectory": "exchange.formats",
+    "rescore": "store",
     "resolve": "identity",
     "ResolvedRun": "identity",
     "run_many": "running",
     "run_one": "running",
+    "run_row": "store",
+    "score": "store",
     "RunEvent": "running",
     "RunRecord": "record",
     "RunSpec": "spec",
     "RunStore": "store",
-    "score": "store",
 }
 
 __all__ = [
@@ -53,11 +58,16 @@ __all__ = [
     "RunStore",
     "export_run",
     "import_trajectory",
+    "list_runs",
     "load_frames",
+    "part_words",
+    "pictures_asked",
     "read_trajectory",
+    "rescore",
     "resolve",
     "run_many",
     "run_one",
+    "run_row",
     "score",
 ]
 

@@ -35,7 +35,7 @@ from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
 from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
 from dynslam_bench.runs.spec import RunSpec, place_of
-from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RUN_FILE, RunStore
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
 from dynslam_bench.sequences.tags import sequence_tags
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.slam.map_files import MAP_FILE
@@ -554,32 +554,22 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     Raises:
         RunError: The bytes are no packed run, or hold names that do not belong there.
     """
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return _take(archive, store)
-    except DynslamError:
-        raise
-    except Exception as error:  # zipfile raises almost anything over damaged archives
-        raise RunError(f"{len(data)} bytes from a worker are no packed run: {error}") from error
-
-
-def _take(archive: zipfile.ZipFile, store: RunStore) -> RunRecord:
-    entries = archive.namelist()
-    names = [match.groups() for match in map(_ENTRY.fullmatch, entries) if match]
-    runs = {folder for kind, folder, _ in names if kind == "runs"}
-    if len(names) != len(entries) or len(runs) != 1:
-        raise RunError(f"a packed run holds {len(runs)} runs, and {len(entries) - len(names)} odd names")
-    (run_id,) = runs
-    with store.work_folder(run_id) as work:
-        for kind, folder, name in names:
-            if kind == "runs":
-                with archive.open(f"{kind}/{folder}/{name}") as source, (work / name).open("wb") as file:
-                    shutil.copyfileobj(source, file)
-        record = RunRecord.read(work / RUN_FILE)
-        if record.run_id != run_id:
-            raise RunError(f"a packed run names itself {record.run_id} but lies under {run_id}")
-        for kind, folder, name in names:
-            target = store.root / kind / folder / name
-            if kind == "sequences" and folder == record.sequence.part and not target.is_file():
-                write_atomic(target, archive.read(f"{kind}/{folder}/{name}"))
-        return store.publish(work, record)
+    with contextlib.closing(TemporaryFolder()) as folder:
+        sent = RunStore(folder.path)
+        try:
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                odd = [name for name in archive.namelist() if not _ENTRY.fullmatch(name)]
+                archive.extractall(folder.path, set(archive.namelist()).difference(odd))
+        except Exception as error:  # zipfile raises almost anything over damaged archives
+            raise RunError(f"{len(data)} bytes from a worker are no packed run: {error}") from error
+        runs = sent.ids()
+        if odd or len(runs) != 1:
+            raise RunError(f"a packed run holds {len(runs)} runs, and {len(odd)} odd names")
+        record = sent.read_whole(runs[0])
+        for file in sorted(folder.path.glob(f"sequences/{record.sequence.part}/*")):
+            target = store.root / file.relative_to(folder.path)
+            if not target.is_file():
+                write_atomic(target, file.read_bytes())
+        with store.work_folder(record.run_id) as work:
+            shutil.copytree(sent.folder(record.run_id), work, dirs_exist_ok=True)
+            return store.publish(work, record)

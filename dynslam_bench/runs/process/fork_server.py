@@ -22,7 +22,6 @@ import ctypes
 import importlib
 import json
 import os
-import selectors
 import signal
 import socket
 import subprocess
@@ -52,6 +51,8 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_T
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 _SET_PARENT_DEATH_SIGNAL, _SET_CHILD_SUBREAPER = 1, 36
+_LOOK_S = 0.02
+"""How often the server looks whether a child has ended."""
 _END_S = 5.0
 _REAP_S = 10.0
 """How long `Child.close` waits for the report of the child's end."""
@@ -215,46 +216,28 @@ def make_job(work: str, folder: Path | str, **details: Any) -> dict[str, Any]:
 
 
 class _Server:
-    """The server's loop: it waits for requests of the parent, for ends of children and for SIGTERM."""
+    """The server's loop: it waits for requests of the parent and for ends of children; SIGTERM ends it."""
 
     def __init__(self, control: socket.socket, start: str) -> None:
         self.control, self.start = control, start
         self.own = frozenset(child.pid for child in psutil.Process().children())  # helpers of libraries
         self.runs: dict[int, int] = {}
-        self.ending = False
-        self.wake_read, self.wake_write = os.pipe()
-        for end in (self.wake_read, self.wake_write):
-            os.set_blocking(end, False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)
-        signal.signal(signal.SIGTERM, self._end)
-        signal.set_wakeup_fd(self.wake_write, warn_on_full_buffer=False)
-        self.selector = selectors.DefaultSelector()
-        self.selector.register(control, selectors.EVENT_READ)
-        self.selector.register(self.wake_read, selectors.EVENT_READ)
-
-    def _end(self, *_: object) -> None:
-        self.ending = True
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
     def run(self) -> None:
-        while not self.ending:
-            for key, _ in self.selector.select():
-                if key.fileobj is self.control:
-                    self._accept()
-                else:
-                    with contextlib.suppress(BlockingIOError):
-                        os.read(self.wake_read, 4096)
-                    self._reap()
+        with contextlib.suppress(SystemExit):
+            while not wait([self.control], _LOOK_S if self.runs else None) or self._accept():
+                self._reap()
         for pid in self.runs:
             end_tree(pid)
         end_children()
         sweep()
 
-    def _accept(self) -> None:
-        """Start the child that is asked for; the end if the parent has closed the socket."""
+    def _accept(self) -> bool:
+        """Start the child that is asked for; False if the parent has closed the socket."""
         message, fds, _, _ = socket.recv_fds(self.control, 1, 2)
         if not message:
-            self.ending = True
-            return
+            return False
         connection_fd, status_fd = fds
         os.set_inheritable(status_fd, False)
         try:
@@ -266,6 +249,7 @@ class _Server:
             _tell(status_fd, {"pid": pid})
             self.runs[pid] = status_fd
         os.close(connection_fd)
+        return True
 
     def _fork(self, connection_fd: int, status_fd: int) -> int:
         """Fork a child, which does not return from here."""
@@ -274,12 +258,10 @@ class _Server:
             return pid
         code = 1
         try:
-            signal.set_wakeup_fd(-1)
-            for number in (signal.SIGCHLD, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+            for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
                 signal.signal(number, signal.SIG_DFL)
-            self.selector.close()
             self.control.close()
-            for inherited in (self.wake_read, self.wake_write, status_fd, *self.runs.values()):
+            for inherited in (status_fd, *self.runs.values()):
                 os.close(inherited)
             from dynslam_bench.runs.process.child import main
 
