@@ -41,10 +41,6 @@ def open_frames(
     Raises:
         SequenceError: Unknown, missing or damaged sequence, or no frames are left.
     """
-    if frames is not None and not isinstance(frames, str):
-        if len(frames) != 2:
-            raise SequenceError(f"frames {list(frames)} has {len(frames)} entries", "give (start, stop)")
-        frames = (int(frames[0] or 0), frames[1])
     start, stop = parse_frames(frames)
     if isinstance(sequence, str | Path):
         return open_sequence(

@@ -39,13 +39,11 @@ def info(as_json: AsJson = False) -> None:
     from dynslam_bench.core.stage_cache import StageCache
 
     usage = StageCache().info()
-    total = sum(usage.bytes_by_stage.values())
-    rows = [(stage, usage.entries_by_stage[stage], size / 1e6) for stage, size in usage.bytes_by_stage.items()]
-    present(
-        {"bytes": total, **vars(usage)},
-        f"{usage.folder}: {total / 1e6:.1f} of {usage.max_bytes / 1e6:.0f} MB",
-        table(("stage", "entries", "MB"), rows),
-    )
+    sizes, entries = usage["bytes_by_stage"], usage["entries_by_stage"]
+    rows = [(stage, entries[stage], size / 1e6) for stage, size in sizes.items()]
+    total = sum(sizes.values())
+    shown = f"{usage['folder']}: {total / 1e6:.1f} of {usage['max_bytes'] / 1e6:.0f} MB"
+    present({"bytes": total, **usage}, shown, table(("stage", "entries", "MB"), rows))
 
 
 @cache.command()

@@ -45,16 +45,6 @@ class Entry:
     cost_s: float
 
 
-@dataclass(frozen=True)
-class CacheInfo:
-    """How full a cache is: bytes and entries by stage."""
-
-    folder: Path
-    max_bytes: int
-    bytes_by_stage: Mapping[str, int]
-    entries_by_stage: Mapping[str, int]
-
-
 class StageCache:
     """A folder of stage results, bounded in size.
 
@@ -106,13 +96,13 @@ class StageCache:
         total = sum(size for _, _, size in self._entries())
         return 0 if total <= self.max_bytes else self._shrink(_SHRINK_TO * self.max_bytes)
 
-    def info(self) -> CacheInfo:
-        """How full the cache is, by stage."""
+    def info(self) -> dict[str, Any]:
+        """How full the cache is: ``folder``, ``max_bytes``, ``bytes_by_stage`` and ``entries_by_stage``."""
         sizes, counts = Counter[str](), Counter[str]()
         for _, path, size in sorted(self._entries(), key=itemgetter(1)):
             sizes[path.parent.parent.name] += size
             counts[path.parent.parent.name] += 1
-        return CacheInfo(self.folder, self.max_bytes, sizes, counts)
+        return {"folder": self.folder, "max_bytes": self.max_bytes, "bytes_by_stage": sizes, "entries_by_stage": counts}
 
     def clear(self) -> int:
         """Delete every entry; returns the bytes freed. Entries that other processes write meanwhile stay."""

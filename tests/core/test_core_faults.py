@@ -185,7 +185,7 @@ def test_the_least_recently_used_entries_go_first(tmp_path: Path) -> None:
     assert cache.get("features", "00") is not None  # now the latest used
     assert cache.prune() > 0
     assert cache.get("features", "00") is not None and cache.get("features", "01") is None
-    assert sum(cache.info().bytes_by_stage.values()) <= 50_000
+    assert sum(cache.info()["bytes_by_stage"].values()) <= 50_000
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, TrackResult
-from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry import Camera, read_tum, se3
 from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
@@ -48,7 +47,6 @@ class ConstantVelocity:
 
     def __init__(self, settings: ConstantVelocitySettings) -> None:
         self.settings = settings
-        self._camera: Camera | None = None
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; nothing here is random."""
@@ -59,13 +57,7 @@ class ConstantVelocity:
         self._previous: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
 
     def track(self, frame: Frame) -> TrackResult:
-        """The measured pose of one of the first frames, the extrapolated one of any other; state ``ok`` throughout.
-
-        Raises:
-            TrackerError: `reset` was not called.
-        """
-        if self._camera is None:
-            raise TrackerError("constant-velocity was given a frame before reset()")
+        """The measured pose of one of the first frames, the extrapolated one of any other; state ``ok`` throughout."""
         start = time.perf_counter()
         if self._count == 0:
             self._first_stamp = self._stamp = frame.timestamp

@@ -34,8 +34,6 @@ class FrameToFrame(ABC):
     a row; then the chain continues from the newest frame as if the camera had not moved since.
     """
 
-    _started = False
-
     def __deepcopy__(self, memo: dict[int, Any]) -> FrameToFrame:
         """A tracker at the same frame; the alignment and the last good frame are shared, since neither changes."""
         return copy(self)
@@ -55,20 +53,13 @@ class FrameToFrame(ABC):
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; nothing here is random."""
         self.start(camera.undistorted())
-        self._started = True
         self._maps = undistortion_maps(camera)
         self._reference: Any = None
         self._pose: NDArray[np.float64] = np.eye(4)
         self._failures = 0
 
     def track(self, frame: Frame) -> TrackResult:
-        """``initialising`` until a frame has depth, then ``ok``, or ``lost`` where it cannot be aligned.
-
-        Raises:
-            TrackerError: `reset` was not called.
-        """
-        if not self._started:
-            raise TrackerError(f"{type(self).__name__} was given a frame before reset()")
+        """``initialising`` until a frame has depth, then ``ok``, or ``lost`` where it cannot be aligned."""
         start = time.perf_counter()
         rgb, depth = frame.rgb, np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
         if self._maps is not None:
