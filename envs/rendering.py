@@ -12,10 +12,9 @@ from dynslam_bench.contracts import Frame, Sequence, TrackResult
 from dynslam_bench.envs.slam_env import Episode
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import OnlineError
-from dynslam_bench.geometry import se3
+from dynslam_bench.geometry import Array, se3
 
 Image = NDArray[np.uint8]
-Array = NDArray[np.float64]
 
 HEIGHT = 480
 STRIP = 64

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation.protocol import Alignment
-from dynslam_bench.geometry import se3
-
-Array = NDArray[np.float64]
+from dynslam_bench.geometry import Array, se3
 
 
 @dataclass(frozen=True, eq=False)

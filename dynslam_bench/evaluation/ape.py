@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation.comparison import Comparison, compare, hold
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry import Trajectory, associate, se3
-
-Array = NDArray[np.float64]
+from dynslam_bench.geometry import Array, Trajectory, associate, se3
 
 
 def absolute_errors(estimate: Array, ground_truth: Array) -> tuple[Array, Array]:
@@ -38,7 +36,7 @@ def absolute_metrics(comparison: Comparison) -> dict[str, float]:
 # The seven statistics of an error series.
 
 
-def statistics(error: NDArray[np.float64]) -> dict[str, float]:
+def statistics(error: Array) -> dict[str, float]:
     """RMSE, mean, median, population standard deviation, minimum, maximum and sum of squares of errors ``[N]``.
 
     ``rmse**2 == mean**2 + std**2`` holds (a published table that breaks it is wrong). Empty input gives an empty dict.
@@ -57,7 +55,7 @@ def statistics(error: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def named(prefix: str, error: NDArray[np.float64], unit: str) -> dict[str, float]:
+def named(prefix: str, error: Array, unit: str) -> dict[str, float]:
     """The statistics under their metric names, e.g. ``ate_rmse_m``; the sum of squares has the unit squared."""
     return {f"{prefix}_{name}_{unit}{'2' if name == 'sse' else ''}": value for name, value in statistics(error).items()}
 

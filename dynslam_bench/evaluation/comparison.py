@@ -12,10 +12,9 @@ from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.core.records import Record
 from dynslam_bench.evaluation.alignment import Similarity, align
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry import Trajectory, associate, nearest_gap
+from dynslam_bench.geometry import Array, Trajectory, associate, nearest_gap
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, bonn_as_droid_w, bonn_camera, in_camera_axes
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.geometry import FileNotes, Trajectory, se3
+from dynslam_bench.geometry import Array, FileNotes, Trajectory, se3
 
 FARTHEST_M = 1e12
 """Squares of larger numbers are no numbers any more."""
@@ -273,7 +273,6 @@ def _jitter(positions: Array, order: int) -> float:
 
 # What hints are made from: poses between their stamps, and how well positions can be aligned.
 
-Array = NDArray[np.float64]
 HintId = Literal[
     "several-recordings",
     "inverted-poses",

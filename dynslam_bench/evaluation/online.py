@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dynslam_bench.geometry import Trajectory, se3
-
-Array = NDArray[np.float64]
+from dynslam_bench.geometry import Array, Trajectory, se3
 
 
 @dataclass(frozen=True)

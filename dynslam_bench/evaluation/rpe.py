@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.evaluation.ape import named, statistics
 from dynslam_bench.evaluation.comparison import Comparison, Index
 from dynslam_bench.evaluation.protocol import RPESpec
-from dynslam_bench.geometry import nearest_gap, se3
+from dynslam_bench.geometry import Array, nearest_gap, se3
 
-Array = NDArray[np.float64]
 _ANGLES = {"deg": 180 / np.pi, "rad": 1.0}
 """Units of rotation in a radian."""
 

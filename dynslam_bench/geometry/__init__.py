@@ -3,6 +3,7 @@
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry.se3 import Array
 from dynslam_bench.geometry.stamps import format_ns, from_seconds, ns_of, refuse_close
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 from dynslam_bench.geometry.trajectory_files import (
@@ -18,6 +19,7 @@ from dynslam_bench.geometry.trajectory_files import (
 )
 
 __all__ = [
+    "Array",
     "Camera",
     "FileNotes",
     "RepeatedStamps",

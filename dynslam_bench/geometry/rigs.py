@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.se3 import Array
 
-Array = NDArray[np.float64]
 Matrix = tuple[tuple[float, float, float], ...]
 
 # Bonn RGB-D Dynamic: the markers on the camera. The publisher states T_ROS and T_m; a camera pose is

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+"""Numbers; docstrings state the shape."""
 _SQUARES = 1e100
 """Numbers up to this, and down to its inverse, have squares and sums of squares that are numbers, too."""
 

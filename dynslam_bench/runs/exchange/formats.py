@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import RunError, TrajectoryError
 from dynslam_bench.core.files import temporary_folder, write_atomic
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.geometry import Camera, FileNotes, Trajectory, TumFile, is_number, load_trajectory, se3
+from dynslam_bench.geometry import Array, Camera, FileNotes, Trajectory, TumFile, is_number, load_trajectory, se3
 from dynslam_bench.sequences.bags import read_bag_poses
 from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.sequences.readers.lists import read_image_list
@@ -174,7 +173,7 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         TrajectoryError: A line is malformed, an image has no stamp, or there is no image.
     """
     path = folder / IMAGES if folder.is_dir() else folder
-    poses_by_stamp: dict[float, NDArray[np.float64]] = {}
+    poses_by_stamp: dict[float, Array] = {}
     held = False
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
         if line.startswith("#"):

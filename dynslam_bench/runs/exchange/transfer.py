@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 import dynslam_bench
 from dynslam_bench.contracts import Sequence, timestamps_ns
@@ -21,7 +20,7 @@ from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.envs.arguments import Frames, open_frames
 from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE
-from dynslam_bench.geometry import Trajectory, associate, nearest_gap, write_kitti, write_tum
+from dynslam_bench.geometry import Array, Trajectory, associate, nearest_gap, write_kitti, write_tum
 from dynslam_bench.runs.exchange.formats import read_trajectory, write_bag, write_colmap, write_euroc, write_vslam_lab
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
 from dynslam_bench.runs.record import RunRecord, TrackerInfo
@@ -373,7 +372,7 @@ def import_trajectory(
     return record
 
 
-def _join(trajectory: Trajectory, stamps: NDArray[np.float64], shares: str, name: str) -> tuple[int, int, int]:
+def _join(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> tuple[int, int, int]:
     """How many frames a trajectory covers, how many of its poses carry no frame's stamp, and the last frame it covers.
 
     Raises:
