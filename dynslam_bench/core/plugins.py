@@ -38,12 +38,10 @@ class Spec(Protocol):
     @property
     def id(self) -> str:
         """Unique name within its kind."""
-        ...
 
     @property
     def entry_point(self) -> str:
         """``"module:Attr"`` of the class or factory."""
-        ...
 
 
 P = TypeVar("P", bound=Spec)

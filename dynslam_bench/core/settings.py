@@ -343,7 +343,6 @@ class Reconfigurable(Protocol):
             settings: All settings of the part, of the class that it was built with; only fields marked ``online``
                 differ from those in force.
         """
-        ...
 
 
 def online_parameters(settings: Settings) -> list[Parameter]:
