@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Frame, Sequence, TrackResult
 from dynslam_bench.envs.slam_env import Episode
 from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.online import OnlineError
+from dynslam_bench.evaluation.online import truths_at
 from dynslam_bench.geometry import Array, se3
 
 Image = NDArray[np.uint8]
@@ -163,13 +163,11 @@ def main_view(positions: Array) -> str:
 
 def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
     """Ground truth of the frames, in the frame of the first of them."""
-    errors = OnlineError(sequence.ground_truth)
-    poses = {i: errors.truth_at(float(stamp)) for i, stamp in enumerate(sequence.timestamps)}
-    defined = {i: pose for i, pose in poses.items() if pose is not None}
-    if not defined:
+    poses = truths_at(sequence.ground_truth, sequence.timestamps)
+    if not poses:
         return {}
-    origin = se3.inverse(defined[min(defined)])
-    return {i: origin @ pose for i, pose in defined.items()}
+    origin = se3.inverse(next(iter(poses.values())))
+    return {i: origin @ pose for i, pose in poses.items()}
 
 
 def align_to_truth(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice], float | None]:

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import Frame
+from dynslam_bench.contracts import Frame, stage_seconds
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.envs.slam_env import SlamEnv
@@ -69,12 +69,10 @@ class RecordTimings(SlamWrapper):
 
     def summary(self) -> dict[str, dict[str, float]]:
         """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
-        frames = [frame for frame in self._base.timings if frame]
-        summary = {}
-        for stage in dict.fromkeys(stage for frame in frames for stage in frame):
-            seconds = [frame.get(stage, 0.0) for frame in frames]
-            summary[stage] = {"median": float(np.median(seconds)), "p95": float(np.percentile(seconds, 95))}
-        return summary
+        return {
+            stage: {"median": float(np.median(seconds)), "p95": float(np.percentile(seconds, 95))}
+            for stage, seconds in stage_seconds([frame for frame in self._base.timings if frame]).items()
+        }
 
 
 class RecordTrajectory(SlamWrapper):

@@ -45,6 +45,7 @@ from dynslam_bench.contracts.tracker import (
     TrackerSpec,
     TrackingState,
     TrackResult,
+    stage_seconds,
 )
 from dynslam_bench.geometry import Camera, Trajectory
 
@@ -83,5 +84,6 @@ __all__ = [
     "TrackingState",
     "Trajectory",
     "exact_stamps",
+    "stage_seconds",
     "timestamps_ns",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -156,6 +156,12 @@ class TrackResult:
     dynamic_mask: NDArray[np.bool_] | None = None
     keypoints_xy: NDArray[np.float32] | None = None
     keypoints_keep: NDArray[np.bool_] | None = None
+
+
+def stage_seconds(timings: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:
+    """Seconds ``[N]`` of every stage over N frames, 0 where it did not run."""
+    stages = dict.fromkeys(stage for frame in timings for stage in frame)
+    return {stage: np.array([frame.get(stage, 0.0) for frame in timings]) for stage in stages}
 
 
 # How closely a re-implementation follows its source.

@@ -35,6 +35,13 @@ class OnlineSample:
     lost_way_m: float = 0.0
 
 
+def truths_at(truth: Trajectory | None, stamps: Array) -> dict[int, Array]:
+    """The true pose ``[4, 4]`` nearest in time to each stamp ``[N]`` that has one, by the stamp's row."""
+    errors = OnlineError(truth)
+    poses = {row: errors.truth_at(float(stamp)) for row, stamp in enumerate(stamps)}
+    return {row: pose for row, pose in poses.items() if pose is not None}
+
+
 class OnlineError:
     """Follows the pose error of a running tracker; what is known at a frame never changes later.
 

@@ -16,7 +16,7 @@ from dynslam_bench.core.reading import read_npz
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.evaluation.online import OnlineError
+from dynslam_bench.evaluation.online import truths_at
 from dynslam_bench.geometry import Trajectory, se3
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_ply
@@ -316,14 +316,10 @@ def aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajecto
 
     Both are None without enough of it.
     """
-    if truth is None:
+    by_row = truths_at(truth, track.timestamps)
+    if len(by_row) < 3:
         return None, None
-    errors = OnlineError(truth)
-    poses = [errors.truth_at(float(stamp)) for stamp in track.timestamps]
-    rows = [row for row, pose in enumerate(poses) if pose is not None]
-    if len(rows) < 3:
-        return None, None
-    true = np.array([poses[row] for row in rows])
+    rows, true = list(by_row), np.array(list(by_row.values()))
     fit = align(track.T_world_cam[rows], true, "se3")
     move = np.eye(4)
     move[:3, :3], move[:3, 3] = fit.rotation, fit.translation

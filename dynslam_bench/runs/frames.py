@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator
 from pydantic.dataclasses import dataclass as validated
 
+from dynslam_bench.contracts import stage_seconds
 from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.sanitise import storable
@@ -214,14 +215,12 @@ class FrameLog:
 
     def timings(self) -> dict[str, StageTime]:
         """Median, p95 and mean of every stage over the frames that reached the tracker."""
-        frames = [row.timings for row in self.rows if row.timings]
-        times = {}
-        for stage in dict.fromkeys(stage for frame in frames for stage in frame):
-            values = np.array([frame.get(stage, 0.0) for frame in frames])
-            times[stage] = StageTime(
+        return {
+            stage: StageTime(
                 median_s=float(np.median(values)), p95_s=float(np.percentile(values, 95)), mean_s=float(values.mean())
             )
-        return times
+            for stage, values in stage_seconds([row.timings for row in self.rows if row.timings]).items()
+        }
 
     def mask_iou(self) -> float | None:
         """Mean overlap of the dynamic mask with the exact masks of people over the frames where either has pixels."""
