@@ -291,13 +291,13 @@ def apply_policy(
     input_timestamps: ArrayLike | None,
     diagnostics: list[str],
 ) -> tuple[Trajectory, NDArray[np.bool_] | None]:
-    """The estimate with its lost frames held, left out, or refused, as the protocol has it.
+    """The estimate with its lost frames held or left out, as the protocol has it.
 
     Returns:
         The estimate, and which input frames were tracked ``[N]``; None where the input frames are not known.
 
     Raises:
-        EvaluationError: The policy needs the input frames, or allows no lost frame.
+        EvaluationError: The policy needs the input frames.
     """
     if input_timestamps is None:
         if protocol.lost_frames != "exclude":
@@ -311,8 +311,6 @@ def apply_policy(
     if n_tracked == n_input:
         return estimate, tracked
     lost = f"{n_input - n_tracked} of {n_input} frames were lost (coverage {100 * n_tracked / n_input:.1f} %)"
-    if protocol.lost_frames == "fail":
-        raise EvaluationError(f"{lost}, {protocol.id} allows none")
     held = protocol.lost_frames == "hold"
     diagnostics.append(f"{lost} and {'held at the last tracked pose' if held else 'take no part'}")
     return (hold(estimate, input_timestamps) if held else estimate), tracked

@@ -33,11 +33,11 @@ class RPESpec(_Frozen):
 
     Attributes:
         delta: Distance between the poses of a pair; ignored by ``tum-random``.
-        unit: Its unit: ``f`` frames, ``s`` seconds, ``m`` metres of path, ``rad`` or ``deg`` of rotation.
+        unit: Its unit: ``f`` frames, ``s`` seconds, ``m`` metres of path, ``rad`` or ``deg`` of rotation. Pairs of
+            evo's are taken over frames alone.
         pairs: ``tum-fixed``: for every pose the one closest to `delta` further along the estimate, unless that is the
             last pose. ``tum-random``: `max_pairs` seeded random pairs (every pair of a trajectory shorter than the
             square root of that). ``consecutive`` and ``all``: evo's non-overlapping and overlapping pairs.
-        tolerance: Relative tolerance of `delta` in mode ``all`` (evo's is 0.1).
         max_pairs: At most so many pairs in the two TUM modes, a seeded sample of them; 0 for all.
         rate: Whether each error is divided by the time between its two poses: m/s and degrees/s.
     """
@@ -45,7 +45,6 @@ class RPESpec(_Frozen):
     delta: float = Field(default=1.0, gt=0)
     unit: DeltaUnit = "f"
     pairs: PairMode = "tum-fixed"
-    tolerance: float = Field(default=0.1, ge=0)
     max_pairs: int = Field(default=10000, ge=0)
     rate: bool = False
 
@@ -53,6 +52,8 @@ class RPESpec(_Frozen):
     def _whole_frames(self) -> RPESpec:
         if self.unit == "f" and self.delta != round(self.delta):
             raise ValueError(f"a delta in frames is a whole number, got {self.delta:g}")
+        if self.pairs in ("consecutive", "all") and self.unit != "f":
+            raise ValueError(f"{self.pairs} pairs are taken over frames, not over '{self.unit}'")
         if self.rate and self.unit != "s":
             raise ValueError(f"a rate is taken over seconds, not over '{self.unit}'")
         return self
@@ -96,7 +97,7 @@ class Protocol(_Frozen):
         segments_m: Lengths of KITTI's segments in metres; empty for none.
         trajectory: Whether the online or the final trajectory of a run is evaluated.
         lost_frames: ``exclude``: frames without a tracked pose take no part. ``hold``: the camera counts as not having
-            moved since the last tracked frame. ``fail``: any lost frame makes the evaluation an error.
+            moved since the last tracked frame.
         truth: ``as-is``; ``bonn-camera``: Bonn's positions moved from the markers to the camera (18.6 mm);
             ``bonn-droid-w``: Bonn's poses as WildGS-SLAM and DROID-W correct them, which makes them 5.6 % smaller.
         every: Only every so many of the frames that have a true pose are compared.
@@ -112,7 +113,7 @@ class Protocol(_Frozen):
     rpe: tuple[RPESpec, ...] = ()
     segments_m: tuple[float, ...] = ()
     trajectory: Literal["online", "final"] = "online"
-    lost_frames: Literal["exclude", "hold", "fail"] = "exclude"
+    lost_frames: Literal["exclude", "hold"] = "exclude"
     truth: Truth = "as-is"
     every: int = Field(default=1, ge=1)
     most_frames: int = Field(default=0, ge=0)
@@ -172,7 +173,6 @@ class Protocol(_Frozen):
         lost = {
             "exclude": "lost frames excluded",
             "hold": "lost frames held at the last pose",
-            "fail": "no lost frame allowed",
         }
         truths = {
             "bonn-camera": "Bonn's truth moved to the camera",
@@ -255,7 +255,8 @@ def _digest(protocol: Protocol) -> str:
     fields = protocol.model_dump(mode="json")
     defaults = {name: Protocol.model_fields[name].default for name in ("truth", "every", "most_frames", "only_for")}
     used = {name: value for name, value in fields.items() if name not in defaults or value != defaults[name]}
-    used["rpe"] = [spec.model_dump(mode="json", exclude=set() if spec.rate else {"rate"}) for spec in protocol.rpe]
+    rpe = [spec.model_dump(mode="json", exclude=set() if spec.rate else {"rate"}) for spec in protocol.rpe]
+    used["rpe"] = [spec | {"tolerance": 0.1} for spec in rpe]  # a field once: stored metrics keep their digest
     return digest(used)
 
 

@@ -102,10 +102,10 @@ def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
         return np.zeros((0, 2), dtype=np.intp)
     if spec.pairs == "tum-random":
         return random_pairs(len(poses), spec.max_pairs)
-    if spec.pairs == "consecutive":
-        return _consecutive(stamps, poses, spec)
-    if spec.pairs == "all":
-        return _all_pairs(stamps, poses, spec)
+    if spec.pairs in ("consecutive", "all"):
+        frames = round(spec.delta)
+        starts = np.arange(0, len(poses) - frames, frames if spec.pairs == "consecutive" else 1)
+        return np.stack([starts, starts + frames], axis=1).astype(np.intp)
     index = path_index(stamps, poses, spec)
     end = closest(index, index + spec.delta)
     keep = end != len(index) - 1  # as evaluate_rpe.py --fixed_delta: the last pose ends no pair
@@ -179,44 +179,6 @@ def _uniform(purpose: str, count: int) -> Array:
     """Numbers in [0, 1) from raw generator words, a function of the purpose only."""
     words = np.asarray(stream(0, purpose).bit_generator.random_raw(count), dtype=np.uint64)
     return np.asarray((words >> np.uint64(11)) * 2.0**-53, dtype=np.float64)
-
-
-def _consecutive(stamps: Array, poses: Array, spec: RPESpec) -> Index:
-    """Non-overlapping pairs: a new one begins where the path since the last reaches delta."""
-    if spec.unit == "f":
-        starts = np.arange(0, len(poses), max(1, round(spec.delta)))
-        return np.stack([starts[:-1], starts[1:]], axis=1).astype(np.intp)
-    ends = [0]
-    travelled = 0.0
-    for at, step in enumerate(np.diff(path_index(stamps, poses, spec)).tolist(), start=1):
-        travelled += step
-        if travelled >= spec.delta:
-            ends.append(at)
-            travelled = 0.0
-    return np.stack([ends[:-1], ends[1:]], axis=1).astype(np.intp)
-
-
-def _all_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
-    """Overlapping pairs whose distance is delta within the relative tolerance."""
-    n = len(poses)
-    if spec.unit == "f":
-        delta = max(1, round(spec.delta))
-        start = np.arange(max(0, n - delta))
-        return np.stack([start, start + delta], axis=1).astype(np.intp)
-    tolerance = spec.delta * spec.tolerance
-    least, most = spec.delta - tolerance, spec.delta + tolerance
-    index = path_index(stamps, poses, spec)
-    pairs: list[tuple[int, int]] = []
-    for i in range(n - 1):
-        if spec.unit in _ANGLES:  # the angle between the two poses, not the path between them
-            angle = se3.rotation_angle(se3.inverse(poses[i]) @ poses[i + 1 :]) * _ANGLES[spec.unit]
-            chosen = np.flatnonzero((angle >= least) & (angle <= most))
-        else:
-            off = np.abs(index[i + 1 :] - index[i] - spec.delta)
-            nearest = int(off.argmin())
-            chosen = np.array([nearest] if off[nearest] <= tolerance else [], dtype=np.intp)
-        pairs += [(i, i + 1 + int(at)) for at in chosen]
-    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
 # Errors over segments of fixed length, as the KITTI odometry benchmark takes them.

@@ -19,7 +19,6 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 REAL = [
     path for path in sorted(SHARED.glob("*/*/groundtruth.txt")) if path.parts[-3] != "fixed_camera"
 ]  # evo needs motion
-UNITS = {"f": metrics.Unit.frames, "m": metrics.Unit.meters, "deg": metrics.Unit.degrees, "rad": metrics.Unit.radians}
 
 
 def smooth(seed, n=240, start=1305031102.0):
@@ -94,11 +93,9 @@ def test_absolute_errors(estimate, truth, alignment, max_dt):
 @pytest.mark.parametrize(("estimate", "truth"), list(cases()))
 @pytest.mark.parametrize("alignment", ["none", "se3", "sim3"])
 @pytest.mark.parametrize("mode", ["consecutive", "all"])
-@pytest.mark.parametrize(
-    ("delta", "unit"), [(1, "f"), (7, "f"), (0.05, "m"), (0.2, "m"), (4.0, "deg"), (0.1, "rad"), (30.0, "deg")]
-)
-def test_relative_errors(estimate, truth, alignment, mode, delta, unit):
-    spec = RPESpec(delta=delta, unit=unit, pairs=mode)
+@pytest.mark.parametrize("delta", [1, 7])
+def test_relative_errors(estimate, truth, alignment, mode, delta):
+    spec = RPESpec(delta=delta, unit="f", pairs=mode)
     protocol = Protocol(id="x", max_dt=0.01, strict=False, one_to_one=False, alignment=alignment, rpe=(spec,))
     ours = evaluate(estimate, truth, protocol)
     pair = evo_pair(estimate, truth, alignment, 0.01)
@@ -106,7 +103,7 @@ def test_relative_errors(estimate, truth, alignment, mode, delta, unit):
         (metrics.PoseRelation.translation_part, "trans", "m"),
         (metrics.PoseRelation.rotation_angle_deg, "rot", "deg"),
     ):
-        rpe = metrics.RPE(relation, delta, UNITS[unit], rel_delta_tol=0.1, all_pairs=mode == "all")
+        rpe = metrics.RPE(relation, delta, metrics.Unit.frames, all_pairs=mode == "all")
         try:
             rpe.process_data(pair)
         except Exception as error:  # evo refuses where there is no such pair; we leave the metric out and say so

@@ -32,6 +32,8 @@ def test_unknown_protocol_has_a_did_you_mean():
 def test_a_delta_in_frames_is_whole():
     with pytest.raises(ValueError, match="whole number"):
         RPESpec(delta=1.5, unit="f")
+    with pytest.raises(ValueError, match="all pairs are taken over frames"):
+        RPESpec(delta=1.0, unit="m", pairs="all")
 
 
 def test_compare_protocols_shows_how_far_they_are_apart():
