@@ -229,7 +229,7 @@ def system(
     """
     title = "".join(word.capitalize() for word in re.findall(r"\w+", name))
     fields: dict[str, Any] = {group: (type(default), default) for group, default in groups.items()}
-    settings = create_model(f"{title}Settings", __base__=base, __module__=__name__, **fields)
+    settings: Any = create_model(f"{title}Settings", __base__=base, __module__=__name__, **fields)
     settings.filters = tuple(filters)
     globals()[settings.__name__] = settings  # pickle looks it up there
     stated = sentences(settings())
