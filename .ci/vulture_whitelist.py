@@ -20,6 +20,7 @@ build_oracle  # segmentation.registry
 build_embedded  # segmentation.registry
 build_coco  # segmentation.registry
 build_weights  # segmentation.registry
+build_detect_slam  # trackers.systems
 open_rendered  # sequences.catalogue
 run_loop  # runs.process.child.WORK
 ConstantVelocity  # trackers.adapters.specs
