@@ -13,9 +13,10 @@ from typing import Any
 import dynslam_bench
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.reading import read_json
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports import figures
-from dynslam_bench.reports.html.board_page import entries_of, side_content
+from dynslam_bench.reports.html.board_page import entries_of, ratios_content, side_content
 from dynslam_bench.reports.html.page import (
     ASSETS,
     Block,
@@ -176,6 +177,7 @@ def build_report(
     on_progress(0, None, "writing")
     paged_ids = {row.run_id for row in paged}
     write_side(output, "board", side_content(board, boards, protocol, paged_ids, pictured, pageless))
+    write_side(output, "ratios", ratios_content(board))
     return _write(
         sections, board, boards, protocol, output, title, _notes(board, protocol, loaded, pageless), loaded.trials
     )
@@ -525,6 +527,8 @@ def paper_section(board: Board, protocol: Protocol) -> Section:
 # -- the site that is published
 
 STUDY_PAGE = "index.html"
+README = "README.md"
+"""What hosts of repositories show of a folder: they show the source of HTML."""
 _PUBLISHED = ("*.html", "*.csv", "*.toml", "csv/*.csv", "data/*")
 """What of a study's folder is published; its runs and its journal are not."""
 
@@ -548,14 +552,14 @@ def publish(
     runs: Sequence[Path],
     output: Path,
     *,
-    study: Path | None = None,
+    studies: Sequence[Path] = (),
     title: str = "Visual SLAM in dynamic scenes",
     note: str = "",
     protocol: Protocol | str = "tum-rgbd/v1",
     most_pages: int | None = None,
     on_progress: OnProgress = no_progress,
 ) -> Site:
-    """Make the report of some results folders, take a study's page beside it, and write a first page for both.
+    """Make the report of some results folders, take the pages of studies beside it, and write a first page for all.
 
     The site needs nothing outside of its folder, and the command that it shows for itself names no path of this
     machine.
@@ -563,7 +567,7 @@ def publish(
     Args:
         runs: Results folders.
         output: The site's folder; what it holds of an earlier site is replaced, other files are left alone.
-        study: Folder of a study with its page; None for none.
+        studies: Folders of studies with their pages.
         title: Heading.
         note: What a reader should know, shown on the first page.
         protocol: How to evaluate.
@@ -571,35 +575,48 @@ def publish(
         on_progress: As in `build_report`.
 
     Raises:
-        ReportError: There are no runs, or the study's folder holds no page.
+        ReportError: There are no runs, or the folder of a study holds no page.
         DynslamError: The folder cannot be written.
     """
     output = output.expanduser().absolute()
-    if study is not None and not (study / STUDY_PAGE).is_file():
-        raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune report STUDY.toml")
+    for study in studies:
+        if not (study / STUDY_PAGE).is_file():
+            raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune report STUDY.toml")
     for part in ("leaderboard/data", "leaderboard/csv", "leaderboard/frames", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(
         list(runs), output / "leaderboard", protocol=protocol, title=title, command="dynslam-bench report RESULTS",
         most_pages=most_pages, on_progress=on_progress,
     )  # fmt: skip
-    for path in (report.data, report.markdown, report.latex):  # for work with the results, not for looking at them
+    for path in (report.data, report.latex):  # for work with the results, not for looking at them
         path.unlink()
-    pages = [("leaderboard/index.html", "Leaderboard", "Trackers, sequences, errors, speed and failures.")]
-    if study is not None:
-        inside = study.resolve()
-        sources = {path for pattern in _PUBLISHED for path in study.glob(pattern) if path.is_file()}
-        for source in sorted(path for path in sources if path.resolve().is_relative_to(inside)):  # no link to elsewhere
-            target = output / "study" / source.relative_to(study)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
-        page = output / "study" / STUDY_PAGE
-        shared = f"../leaderboard/{ASSETS}/"
-        page.write_text(page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', f'="{shared}'), encoding="utf-8")
-        pages.append((f"study/{STUDY_PAGE}", "Study", "What tuning the settings gained, and how sure that is."))
+    report.markdown.replace(output / "leaderboard" / README)
+    pages = [("leaderboard/index.html", "Leaderboard", report.headline)]
+    for study in studies:
+        pages.append(_publish_study(study, output))
     made = f"Made by dynslam-bench report publish, version {dynslam_bench.__version__}."
     site = sections_page([], title=title, pages=pages, protocol=note, footer=made)
     write_atomic(output / "index.html", site.replace(f'="{ASSETS}/', f'="leaderboard/{ASSETS}/'))
+    lines = [f"- [{prose(name)}]({Path(href).parent.as_posix()}): {prose(words)}" for href, name, words in pages]
+    how = "The pages are HTML: get the repository, and open `index.html` in a browser."
+    text = [f"# {prose(title)}", prose(note), *lines, how, made]
+    write_atomic(output / README, "\n\n".join(filter(None, text)) + "\n")
     write_atomic(output / ".nojekyll", "")
     sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
     return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)
+
+
+def _publish_study(study: Path, output: Path) -> tuple[str, str, str]:
+    """Copy the pages of a study into a site; returns the address of the first one, its name, and its verdict."""
+    folder, inside = output / "study" / study.name, study.resolve()
+    sources = {path for pattern in _PUBLISHED for path in study.glob(pattern) if path.is_file()}
+    for source in sorted(path for path in sources if path.resolve().is_relative_to(inside)):  # no link to elsewhere
+        target = folder / source.relative_to(study)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, target)
+    for page in folder.glob("*.html"):
+        shared = f'="../../leaderboard/{ASSETS}/'
+        page.write_text(page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', shared), encoding="utf-8")
+    summary = study / "summary.json"
+    words = read_json(summary)["conclusion"] if summary.is_file() else ""
+    return f"study/{study.name}/{STUDY_PAGE}", f"Study {study.name}", words

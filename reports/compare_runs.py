@@ -14,10 +14,10 @@ from dynslam_bench.core.errors import ReportError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.toml import setting_text
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.reports.html.board_page import pairs_content
-from dynslam_bench.reports.html.page import render, write_assets, write_side
-from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
-from dynslam_bench.reports.model.board import Cell, make_cell
+from dynslam_bench.reports.html.board_page import ratio_numbers
+from dynslam_bench.reports.html.page import render, write_side
+from dynslam_bench.reports.html.run_sets import write_runs
+from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
@@ -32,8 +32,8 @@ class Comparison:
     """What changed from A to B.
 
     Attributes:
-        overall: Tracker and what differs to the geometric mean over sequences of B's median ATE over A's; with an
-            interval from `FEWEST` sequences on.
+        overall: Tracker and what differs to the geometric mean over sequences of B's median ATE over A's, with an
+            interval from `FEWEST` sequences on; all categories weigh the same.
         table: Every tracker and sequence with both medians.
         only_a: Runs that only A has.
         only_b: Runs that only B has.
@@ -106,34 +106,45 @@ def compare(
             differences[name] = _differences(variants_a[one][0], variants_b[other][0])
     if not compared:
         raise ReportError("none of the runs in common has ground truth", "nothing can be compared")
-    overall = {name: ratio_interval(np.log([ratio_of(*pair) for pair in paired])) for name, paired in compared.items()}
+    overall = {name: overall_ratio(paired) for name, paired in compared.items()}
     changed = "; ".join(f"{name}: {', '.join(words)}" for name, words in differences.items() if words)
     caption = (
         f"{evaluated}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
-        "share none; failures count as a static camera, or worse. B / A below 1: B is better. Brackets: "
+        "share none; failures count as a static camera, or worse. B / A below 1: B is better; all categories weigh the "
+        "same. Brackets: "
         f"Student's 95 % interval over sequences, from {FEWEST} of them on. "
         + (f"What differs: {changed}." if changed else "The settings are the same.")
     )
-    page = None if output is None else _write_page(Path(output), protocol, evaluated, compared)
+    page = None if output is None else _write_page(Path(output), protocol, evaluated, compared, overall)
     table = _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall)
     return Comparison(overall, table, only_a, only_b, differences, page)
 
 
-def _write_page(output: Path, protocol: Protocol, evaluated: str, compared: Mapping[str, Sequence[Paired]]) -> Path:
+def _write_page(
+    output: Path,
+    protocol: Protocol,
+    evaluated: str,
+    compared: Mapping[str, Sequence[Paired]],
+    overall: Mapping[str, Interval],
+) -> Path:
     """Write the page: both sides of every tracker, with the pages of the runs that stand for a cell."""
     output = output.expanduser().absolute()
-    typical = {cell.typical.run_id: cell.typical for pairs in compared.values() for _, *c in pairs for cell in c}
-    runs = [row for row in typical.values() if row.folder.is_dir()]  # a report alone brings no files
-    paged = {row.run_id for row in runs}
-    write_run_pages(runs, paged, protocol, output)
-    write_side(output, "board", pairs_content(compared, evaluated, paged))
-    write_assets(output)
+    cells: dict[str, dict[str, Cell]] = {}
+    ratios = []
+    for name, pairs in compared.items():
+        ratios.append([len(cells), len(cells) + 1, *ratio_numbers(overall[name]), len(pairs), ""])
+        cells[f"A: {name}"] = {sequence: a for sequence, a, _ in pairs}
+        cells[f"B: {name}"] = {sequence: b for sequence, _, b in pairs}
+    typical = {cell.typical.run_id: cell.typical for some in cells.values() for cell in some.values()}
+    shown = [row for row in typical.values() if row.folder.is_dir()]  # a report alone brings no files
+    sides = [ratio[:2] for ratio in ratios]
+    write_runs(output, cells, shown, protocol, "Comparison", words=evaluated, pairs=sides)
+    write_side(output, "ratios", ratios)
     links = [("index.html", "Comparison")]
     page = render(
         "compare.html.j2", title="B against A", links=links, here="index.html", scripts=["run.js", "compare.js"]
     )
     write_atomic(output / "index.html", page)
-    write_atomic(output / RUN_PAGE, render("run.html.j2", title="Run", links=links, scripts=["run.js"]))
     return output / "index.html"
 
 
@@ -185,6 +196,12 @@ def _differences(first: RunRow, second: RunRow) -> list[str]:
 def ratio_of(_: str, a: Cell, b: Cell) -> float:
     """B's median error over A's."""
     return max(b.median or 0.0, FLOOR_M) / max(a.median or 0.0, FLOOR_M)
+
+
+def overall_ratio(paired: Sequence[Paired]) -> Interval:
+    """Geometric mean of the ratios over sequences, with its interval; categories weigh the same, as on a board."""
+    groups = [group_of(a.rows[0].sequence.tags) for _, a, _ in paired]
+    return ratio_interval(np.log([ratio_of(*pair) for pair in paired]), group_weights(groups))
 
 
 def _table(

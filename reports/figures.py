@@ -126,7 +126,7 @@ def ratio_figure(board: Board) -> go.Figure | None:
     traces = [
         go.Scatter(
             x=[significant(s.ratio.value)],
-            y=[wrapped(board.labels[s.key])],
+            y=[wrapped(board.names[s.key])],
             mode="markers",
             marker={
                 "size": 11,
@@ -176,7 +176,7 @@ def speed_figure(board: Board) -> go.Figure | None:
                 x=[significant(speed)],
                 y=[significant(ratio.value)],
                 mode="markers",
-                name=wrapped(board.labels[key] + mark),
+                name=wrapped(board.names[key] + mark),
                 marker={"size": 12, "color": look[key]["color"], "symbol": symbol},
                 error_y=error_bars(ratio),
                 hovertemplate="%{fullData.name}<br>%{x:.2f} × real time<br>ratio %{y:.3f}<extra></extra>",
@@ -210,7 +210,7 @@ def mask_figure(board: Board) -> go.Figure | None:
                     y=rounded([error_mm for error_mm, _, _ in points]),
                     text=[words for _, _, words in points],
                     mode="markers",
-                    name=wrapped(board.labels[key]),
+                    name=wrapped(board.names[key]),
                     marker={"size": 8, "opacity": 0.85, "color": look[key]["color"], "symbol": look[key]["symbol"]},
                     hovertemplate="%{text}<br>IoU %{x:.3f}<br>ATE %{y:.3g} mm<extra>%{fullData.name}</extra>",
                 )
@@ -237,7 +237,7 @@ def share_figure(board: Board, bins: Mapping[str, Sequence[Sequence[float | None
             y=[error_mm for error_mm, _ in bins[key]],
             customdata=[count for _, count in bins[key]],
             mode="lines+markers",
-            name=wrapped(board.labels[key]),
+            name=wrapped(board.names[key]),
             line={"color": look[key]["color"], "dash": look[key]["dash"]},
             marker={"symbol": look[key]["symbol"], "size": 8},
             hovertemplate="%{x} %: %{y:.3g} mm over %{customdata} frames<extra>%{fullData.name}</extra>",
@@ -275,7 +275,7 @@ def bar_figure(board: Board, statistic: str) -> go.Figure | None:
                 text=[LOST_MARK * has_lost(board.cells[key][name]) for name in names],
                 textposition="outside",
                 cliponaxis=False,
-                name=wrapped(board.labels[key]),
+                name=wrapped(board.names[key]),
                 marker={"color": look[key]["color"], "opacity": 1.0 if key in board.ranked else 0.45},
                 hovertemplate="%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,15 @@ from dynslam_bench.core.toml import setting_text
 from dynslam_bench.reports.build_report import sections_page
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, figure_of, guide
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
-from dynslam_bench.reports.model.row import SEEN, command_line
+from dynslam_bench.reports.html.run_sets import write_runs
+from dynslam_bench.reports.model.board import Cell, make_cell
+from dynslam_bench.reports.model.load import Loaded, rows_of
+from dynslam_bench.reports.model.names import name_columns
+from dynslam_bench.reports.model.row import SEEN, command_line, grouped
+from dynslam_bench.reports.tables.leaderboard import run_link
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict, preset_text, worth
+from dynslam_bench.tuning.objectives import held_protocol
 from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
 from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, errors_of
@@ -31,6 +37,8 @@ from dynslam_bench.tuning.study_file import ProblemInstance, scenes
 
 _LEVELS = {Verdict.PROVEN: "green", Verdict.WORSE: "red"}
 """Colour of the verdict; all others are amber."""
+_MOST_RUNS = 300
+"""Runs of trials that have a page beside the study's."""
 _CONTOURS = 4
 """Contours of so many parameters are drawn, the most important ones."""
 
@@ -46,7 +54,8 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
     spec = tuner.spec
-    candidates, trials = _candidates(summary), _trials(tuner, summary)
+    links = _write_runs(tuner, summary)
+    candidates, trials = _candidates(summary, links), _trials(tuner, summary, links)
     proven = summary.verdict == Verdict.PROVEN
     settings = settings_table(tuner.space, tuner.base, summary.best.params if summary.best else {}, proven)
     for table in (candidates, trials, settings):
@@ -73,6 +82,8 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         level=_LEVELS.get(summary.verdict, "amber"),
         protocol=f"{_asked(tuner, summary)} {summary.protocol}.",
         evaluates=True,
+        links=[("index.html", "Study"), *([(next(iter(links.values())), "Runs")] if links else [])],
+        here="index.html",
         footer=f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}. "
         f"Reproduce: {command_line(tuner.study.user_attrs.get('command', []))}",
     )
@@ -80,6 +91,33 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     write_assets(tuner.folder)
     write_atomic(path, html)
     return path
+
+
+def _write_runs(tuner: Study, summary: StudySummary) -> dict[int, str]:
+    """Write the pages of the runs of trials; returns a trial's link to its run with the median error.
+
+    The baseline and the candidates come first: of more than `_MOST_RUNS` runs the others have no page.
+    """
+    first, stored = [0, *(candidate.trial for candidate in summary.candidates)], set(tuner.store.ids())
+    runs = {
+        trial.number: [run_id for _, run_id, *_ in trial.user_attrs.get("instances", ()) if run_id in stored]
+        for trial in sorted(tuner.study.get_trials(deepcopy=False), key=lambda trial: trial.number not in first)
+    }
+    paged = list(dict.fromkeys(run_id for ids in runs.values() for run_id in ids))[:_MOST_RUNS]
+    protocol = held_protocol(tuner.spec.protocol)
+    rows = {row.run_id: row for row in rows_of(tuner.store, paged, protocol, Loaded())}
+    if not rows:
+        return {}
+    columns, links = name_columns([*rows.values()]), {}
+    cells: dict[str, dict[str, Cell]] = {}
+    for trial, ids in sorted(runs.items()):
+        own = sorted((rows[run_id] for run_id in ids if run_id in rows), key=lambda row: row.score_m or 0.0)
+        if own:
+            links[trial] = run_link(own[len(own) // 2])
+            by_sequence = grouped(own, lambda row: columns[row.column_id])
+            cells[f"trial {trial}"] = {name: make_cell(some) for name, some in by_sequence.items()}
+    write_runs(tuner.folder, cells, [*rows.values()], protocol, "Study")
+    return links
 
 
 def _asked(tuner: Study, summary: StudySummary) -> str:
@@ -261,7 +299,7 @@ def _seeds_change_nothing(tuner: Study) -> bool:
     return bool(repeats) and all(len(set(values)) == 1 for values in repeats)
 
 
-def _candidates(summary: StudySummary) -> Table:
+def _candidates(summary: StudySummary, links: Mapping[int, str]) -> Table:
     def ratio(value: Ratio | None) -> TableCell:
         if value is None:
             return TableCell("-")
@@ -277,6 +315,7 @@ def _candidates(summary: StudySummary) -> Table:
             TableCell(
                 str(candidate.trial),
                 value=float(candidate.trial),
+                link=links.get(candidate.trial, ""),
                 emphasis="best" if candidate is summary.best else "",
             ),
             number(math.exp(candidate.values[0]) if candidate.values else None, ".3f"),
@@ -317,11 +356,11 @@ def _marked(summary: StudySummary, *headings: tuple[str, str]) -> list[str]:
     return [f"{heading} {SEEN}" if split in summary.seen else heading for heading, split in headings]
 
 
-def _trials(tuner: Study, summary: StudySummary) -> Table:
+def _trials(tuner: Study, summary: StudySummary, links: Mapping[int, str]) -> Table:
     names = [parameter.name for parameter in tuner.space]
     rows = [
         [
-            number(float(trial.number), ".0f"),
+            TableCell(str(trial.number), value=float(trial.number), link=links.get(trial.number, "")),
             TableCell(
                 trial.state.name.lower(), tip=trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, "")
             ),
@@ -336,7 +375,8 @@ def _trials(tuner: Study, summary: StudySummary) -> Table:
     headings = _marked(summary, *((f"ratio of {objective.what}", "tune") for objective in tuner.objectives))
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings, "coverage", "fps", *names)]
     caption = (
-        "Behind the state stand the reasons of pruned and failed trials, and the study that an earlier trial is of."
+        "Behind the state stand the reasons of pruned and failed trials, and the study that an earlier trial is of. A "
+        f"trial's number leads to its runs; of more than {_MOST_RUNS} runs the first ones have pages."
     )
     return Table("trials", "All trials", caption + fewer_starts(tuner.design) + _cautions(summary), columns, rows)
 

@@ -101,8 +101,8 @@ def publish(
     results: Annotated[list[Path], typer.Argument(help="Results folders.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The site's folder, e.g. docs/example.")],
     study: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="Folder of a study with its page, as `tune report` names it."),
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option(help="Folder of a study with its page, as `tune report` names it; once for each study."),
     ] = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     remark: Annotated[str, typer.Option(help="What a reader should know, for the first page.")] = "",
@@ -115,7 +115,7 @@ def publish(
 
     with progress("site") as advance:
         site = publish_site(
-            results, output, study=study, title=title, note=remark, protocol=protocol, most_pages=most_pages,
+            results, output, studies=study or [], title=title, note=remark, protocol=protocol, most_pages=most_pages,
             on_progress=advance,
         )  # fmt: skip
     present(site, f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")

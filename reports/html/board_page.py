@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy
 from markupsafe import Markup
 
 from dynslam_bench.core.toml import setting_text
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.figures import significant
-from dynslam_bench.reports.model.board import Board, Cell
+from dynslam_bench.reports.model.board import Board, Cell, compare_pairs
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
+from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Standing, Verdict
 from dynslam_bench.reports.tables.leaderboard import leaderboard, middle, rank_cell, run_link, timed
 from dynslam_bench.reports.tables.table import TableCell, number
 
+_OPPOSITE: dict[Verdict, Verdict] = {"better": "worse", "worse": "better", "cannot tell": "cannot tell"}
 MOST_LISTED = 5000
 """Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
 
@@ -80,11 +80,12 @@ def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol
         start = next((runs[name].typical for name in board.sequences if name in runs), first)
         kind = TableCell("imported") if first.imported else cells["provenance"]
         ended = [run for run in board.runs(key) if not run.failed]
+        marks = cells["tracker"].text.removeprefix(board.labels[key])
         entries.append(
             Entry(
                 at=keys.index(key),
                 group=2 if first.tracker.provenance == "control" else int(key not in board.ranked),
-                name=replace(cells["tracker"], link=run_link(start)),
+                name=replace(cells["tracker"], text=board.names[key] + marks, link=run_link(start)),
                 kind=kind,
                 rank=TableCell("–") if standing is None else rank_cell(standing),
                 ratio=_ratio_cell(board, key, standing),
@@ -205,7 +206,7 @@ def side_content(
         ],
         "categories": {category: sorted(members) for category, members in categories.items()},
         "cells": [
-            _cell(cell, place[key], column[name], metrics, board.rank_seen)
+            cell_content(cell, place[key], column[name], metrics, rank_seen=board.rank_seen)
             for key in keys
             for name, cell in board.cells[key].items()
         ],
@@ -215,10 +216,33 @@ def side_content(
             for row in ordered
         ],
         "unlisted": len(board.rows) - len(listed),
-    } | _quantiles(len(names))  # fmt: skip
+    }  # fmt: skip
 
 
-def _cell(cell: Cell, tracker: int, sequence: int, metrics: Sequence[Mapping[str, str]], rank_seen: bool) -> list[Any]:
+def ratios_content(board: Board) -> list[list[Any]]:
+    """What ``data/ratios.js`` holds of every two trackers: their numbers, and the second against the first."""
+    keys = [*board.trackers, *board.final_only]
+    place = {key: at for at, key in enumerate(keys)}
+    verdicts = {standing.key: standing.verdict for standing in board.standings}
+    ratios = []
+    for pair in compare_pairs(board, keys[::-1]):  # of the later one over the earlier one
+        verdict = pair.verdict
+        if pair.other == board.reference:  # as on the board, which asks it of fewer pairs
+            verdict = verdicts.get(pair.one, "")
+        elif pair.one == board.reference:
+            verdict = _OPPOSITE.get(verdicts.get(pair.other, ""), verdict)
+        ratios.append([place[pair.other], place[pair.one], *ratio_numbers(pair.ratio), pair.sequences, verdict])
+    return ratios
+
+
+def ratio_numbers(ratio: Interval) -> list[float | None]:
+    """A ratio and the ends of its interval."""
+    return [significant(value) for value in (ratio.value, ratio.low, ratio.high)]
+
+
+def cell_content(
+    cell: Cell, tracker: int, sequence: int, metrics: Sequence[Mapping[str, str]], *, rank_seen: bool
+) -> list[Any]:
     """Place, runs, failures, what speaks against it, the median of every number, typical run, the error's quartiles."""
     doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.in_training and not rank_seen)
     medians = [significant(middle(_value(row, metric) for row in cell.kept)) for metric in metrics]
@@ -230,17 +254,14 @@ def _cell(cell: Cell, tracker: int, sequence: int, metrics: Sequence[Mapping[str
 def _tracker(board: Board, key: str) -> dict[str, Any]:
     first = board.first(key)
     return {
-        "label": board.labels[key],
-        "id": first.tracker.id,
+        "label": board.names[key],
         "ranked": key in board.ranked,
-        "imported": first.imported,
-        "control": first.tracker.provenance == "control",
         "settings": {name: setting_text(value) for name, value in first.variant.items()},
     }
 
 
 def _metrics(protocol: Protocol) -> list[dict[str, str]]:
-    """The numbers to choose from: of the online and of the final trajectory."""
+    """The numbers to choose from, the one that ranks first."""
     numbers = [("ATE", "m", "ate_rmse_m")]
     for spec in protocol.rpe:
         numbers.append((f"RPE over {spec.describe()}", "m/s" if spec.rate else "m", spec.metric("trans")))
@@ -249,7 +270,7 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     numbers.append(("absolute rotation", "deg", "ape_rot_rmse_deg"))
     return [
         {"name": name, "unit": unit, "key": key, "which": which}
-        for which in ("online", "final")
+        for which in dict.fromkeys([protocol.trajectory, "final"])
         for name, unit, key in numbers
     ]
 
@@ -257,50 +278,7 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
 def _value(row: RunRow, metric: Mapping[str, str]) -> float | None:
     """A run's number; only the ATE that ranks counts failures."""
     if metric["which"] != row.trajectory:
-        return None if row.failed else row.final_metrics.get(metric["key"])
+        return None if row.failed or metric["which"] == "online" else row.final_metrics.get(metric["key"])
     if metric["key"] == "ate_rmse_m":
         return row.score_m
     return None if row.failed else row.metrics.get(metric["key"])
-
-
-def pairs_content(
-    compared: Mapping[str, Sequence[tuple[str, Cell, Cell]]], protocol: str, paged: set[str]
-) -> dict[str, Any]:
-    """What ``data/board.js`` of two results folders side by side holds: two trackers for every one that is compared.
-
-    Args:
-        compared: Tracker to its sequences with the runs of both sides.
-        protocol: How errors were computed, in words.
-        paged: Ids of the runs that have a page.
-    """
-    names = sorted({name for pairs in compared.values() for name, *_ in pairs})
-    trackers: list[dict[str, Any]] = []
-    cells, runs = [], []
-    metric = {"name": "ATE", "unit": "m", "key": "ate_rmse_m", "which": "online"}
-    for label, pairs in compared.items():
-        for side, letter in enumerate("AB"):
-            first = pairs[0][1:][side].rows[0]
-            settings = {name: setting_text(value) for name, value in first.variant.items()}
-            for name, *sides in pairs:
-                cell, place = sides[side], (len(trackers), names.index(name))
-                cells.append(_cell(cell, *place, [metric | {"which": cell.rows[0].trajectory}], True))
-                row = cell.typical
-                runs.append([row.run_id, *place, row.repeat, row.ending, 3 * (row.run_id in paged)])
-            trackers.append({"label": f"{letter}: {label}", "id": first.tracker.id, "settings": settings})
-    return {
-        "protocol": protocol,
-        "pageless": "",
-        "unlisted": 0,
-        "pairs": [[at, at + 1] for at in range(0, len(trackers), 2)],
-        "trackers": trackers,
-        "sequences": [{"name": name, "short": name, "tags": []} for name in names],
-        "cells": cells,
-        "runs": runs,
-    } | _quantiles(len(names))
-
-
-def _quantiles(sequences: int) -> dict[str, Any]:
-    """Student's quantiles for intervals over up to so many sequences, and how many an interval needs."""
-    freedom = np.maximum(np.arange(sequences + 1) - 1, 1)
-    quantiles = np.asarray(scipy.stats.t.ppf(0.975, freedom))
-    return {"fewest": FEWEST, "quantiles": [significant(quantile) for quantile in quantiles.tolist()]}

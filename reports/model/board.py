@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from operator import attrgetter
 from pathlib import Path
 from statistics import geometric_mean, median
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,11 +20,13 @@ from dynslam_bench.core.errors import ReportError, did_you_mean
 from dynslam_bench.core.toml import assignments
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
-from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.reports.model.names import OUR_BACK_END, make_labels, name_columns, shortened
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import (
     FLOOR_M,
+    Interval,
     Standing,
+    Verdict,
     log_medians,
     ratio_interval,
     separable,
@@ -113,6 +116,13 @@ class Board:
     def _by_key(self) -> dict[str, list[RunRow]]:
         return grouped(self.rows, lambda row: row.variant_key)
 
+    @cached_property
+    def names(self) -> dict[str, str]:
+        """Labels as sentences, headings and figures say them: without `OUR_BACK_END`, unless two would be alike."""
+        short = {key: label.replace(OUR_BACK_END, "") for key, label in self.labels.items()}
+        counts = Counter(short.values())
+        return {key: label if counts[short[key]] > 1 else short[key] for key, label in self.labels.items()}
+
     @property
     def categories(self) -> dict[str, list[str]]:
         """Category to its sequences, of those categories that hold some of the sequences and not all."""
@@ -124,8 +134,8 @@ class Board:
     @property
     def weights(self) -> dict[str, float]:
         """Weights of the common sequences: on an overall board all groups weigh the same, elsewhere all sequences."""
-        sizes = Counter(self.groups[name] for name in self.common)
-        return {name: 1.0 / sizes[self.groups[name]] if self.category == OVERALL else 1.0 for name in self.common}
+        groups = [self.groups[name] for name in self.common] if self.category == OVERALL else [""] * len(self.common)
+        return dict(zip(self.common, group_weights(groups).tolist(), strict=True))
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
@@ -302,7 +312,7 @@ def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None
             candidates.append(key)
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
-        board.reference_name = board.labels[board.reference]
+        board.reference_name = board.names[board.reference]
 
 
 def rank(
@@ -337,30 +347,58 @@ def rank(
     ]
 
 
-def ranked_logs(board: Board) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
-    """Logarithms of the median errors of the ranked trackers on the common sequences, and these sequences' weights."""
+def group_of(tags: Collection[str]) -> str:
+    """What moves in a scene, by the tags of its sequence."""
+    return next((group for tag, group in _GROUPS.items() if tag in tags), _OTHER)
+
+
+def group_weights(groups: Sequence[str]) -> NDArray[np.float64]:
+    """Weights of sequences of these groups: all groups weigh the same."""
+    sizes = Counter(groups)
+    return np.array([1.0 / sizes[group] for group in groups])
+
+
+def common_logs(board: Board, keys: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+    """Logarithms of some trackers' median errors on the common sequences, nan for none, and the weights of these."""
     logs = {
-        key: log_medians({name: board.cells[key][name].scores for name in board.common}, board.common)
-        for key in board.ranked
+        key: log_medians({name: cell.scores for name, cell in board.cells[key].items()}, board.common) for key in keys
     }
     return logs, np.array([*board.weights.values()])
 
 
-def pair_frame(board: Board) -> pd.DataFrame:
-    """How every ranked tracker compares with every other one, Holm-corrected over all pairs.
+class Pair(NamedTuple):
+    """Two trackers on the common sequences that both have.
 
-    Returns:
-        One line a pair: tracker, other (labels), ratio (geometric mean of the errors of the first over those of the
-        second), low, high (95 % interval, NaN for few sequences), p_value (corrected), verdict (of the first).
+    Attributes:
+        one: Variant key of the first tracker.
+        other: That of the second.
+        ratio: Geometric mean of the errors of the first over those of the second.
+        sequences: Sequences that both have.
+        p_value: Holm-corrected over all pairs of ranked trackers; None unless both are ranked.
+        verdict: Of the first; empty unless both are ranked.
     """
-    logs, weights = ranked_logs(board)
-    lines = []
-    for (a, b), (apart, p_value) in separable(logs, weights).items():
-        ratio = ratio_interval(logs[a] - logs[b], weights)
-        verdict = "cannot tell" if not apart else "better" if ratio.value < 1 else "worse"
-        names = board.labels[a], board.labels[b]
-        lines.append((*names, ratio.value, ratio.low, ratio.high, p_value, verdict))
-    return pd.DataFrame(lines, columns=["tracker", "other", "ratio", "low", "high", "p_value", "verdict"])
+
+    one: str
+    other: str
+    ratio: Interval
+    sequences: int
+    p_value: float | None
+    verdict: Verdict
+
+
+def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
+    """Compare every two of some trackers that have a common sequence in common, in their order."""
+    logs, weights = common_logs(board, keys)
+    tests = separable({key: logs[key] for key in keys if key in board.ranked}, weights)
+    pairs = []
+    for a, b in combinations(keys, 2):
+        differences = logs[a] - logs[b]
+        ratio, (apart, p_value) = ratio_interval(differences, weights), tests.get((a, b), (False, None))
+        verdict: Verdict = "" if p_value is None else "cannot tell"
+        if apart:
+            verdict = "better" if ratio.value < 1 else "worse"
+        pairs.append(Pair(a, b, ratio, int(np.isfinite(differences).sum()), p_value, verdict))
+    return [pair for pair in pairs if pair.sequences]
 
 
 def _order_sequences(board: Board) -> None:
@@ -373,7 +411,7 @@ def _order_sequences(board: Board) -> None:
             board.unscored.append(name)
         board.tags[name] = {tag for row in rows for tag in row.sequence.tags}
         board.tags[name].add("rendered" if rows[0].sequence.id.startswith("synthetic/") else "recorded")
-        board.groups[name] = next((group for tag, group in _GROUPS.items() if tag in board.tags[name]), _OTHER)
+        board.groups[name] = group_of(board.tags[name])
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
     order = ["static", "low dynamic", "high dynamic", "unknown objects", _OTHER, ""]

@@ -123,10 +123,10 @@ def _place(protocol: Protocol) -> tuple[str, str]:
     return f"report {protocol.digest()}", digest([dynslam_bench.__version__, package_digest(_CODE)])
 
 
-def _unchanged_rows(store: RunStore, protocol: Protocol) -> dict[str, RunRow]:
-    """The rows of unchanged runs, by run id; damaged rows, and rows of other runs, count as missing."""
+def _unchanged_rows(store: RunStore, protocol: Protocol, run_ids: Sequence[str]) -> dict[str, RunRow]:
+    """The rows of those runs that are unchanged, by run id; damaged rows, and rows of other runs, count as missing."""
     rows = {}
-    for run_id, text in store.index.read(*_place(protocol), store.ids(), check_links=True).items():
+    for run_id, text in store.index.read(*_place(protocol), run_ids, check_links=True).items():
         with suppress(ValidationError):
             row = RunRow.model_validate_json(text)
             if (row.run_id, row.protocol_digest) == (run_id, protocol.digest()):
@@ -208,7 +208,7 @@ def load_runs(
     loaded = Loaded()
     everything = []
     for store in stores:
-        everything += _all_rows(store, protocol, loaded, on_progress, pool)
+        everything += rows_of(store, store.ids(), protocol, loaded, on_progress, pool)
     ended = [row for row in everything if row.status != "stopped"]
     scaled = [row for row in ended if protocol.finds_scale or row.tracker.sensors != "rgb"]
     rows = [row for row in scaled if trials or not row.trial_of]
@@ -231,12 +231,26 @@ def load_runs(
     return loaded
 
 
-def _all_rows(
-    store: RunStore, protocol: Protocol, loaded: Loaded, on_progress: OnProgress, pool: Executor | None
+def rows_of(
+    store: RunStore,
+    run_ids: Sequence[str],
+    protocol: Protocol,
+    loaded: Loaded,
+    on_progress: OnProgress = no_progress,
+    pool: Executor | None = None,
 ) -> list[RunRow]:
-    """The rows of all runs of a store: those of unchanged runs, and those that are read now."""
-    rows = _unchanged_rows(store, protocol)
-    unread = [run_id for run_id in store.ids() if run_id not in rows]
+    """The rows of some runs of a store: those of unchanged runs, and those that are read now.
+
+    Args:
+        store: The store.
+        run_ids: The runs.
+        protocol: How to evaluate.
+        loaded: Is told of unreadable runs.
+        on_progress: As in `build_report`.
+        pool: Workers that score the runs; None to score them here.
+    """
+    rows = _unchanged_rows(store, protocol, run_ids)
+    unread = [run_id for run_id in run_ids if run_id not in rows]
     size = 1 if pool is None else JOB
     jobs = [(store, protocol, unread[first : first + size]) for first in range(0, len(unread), size)]
     scored: list[tuple[RunRow, str]] = []

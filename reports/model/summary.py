@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 
-from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, ranked_logs
+from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, common_logs
 from dynslam_bench.reports.model.statistics import FEWEST, Standing, mean_rank_test
 
 _MOST_NAMED = 3
@@ -22,10 +22,10 @@ def headline(board: Board) -> str:
     best = ranked[0]
     ratio = "" if best.key == board.reference else f", {_ratio_words(board, best)}"
     if len(ranked) == 1:
-        return f"{where}{board.labels[best.key]} alone is ranked{ratio}."
+        return f"{where}{board.names[best.key]} alone is ranked{ratio}."
     if len(board.common) < FEWEST:
         return (
-            f"{where}{board.labels[best.key]} has the smallest error{ratio}; below {FEWEST} sequences "
+            f"{where}{board.names[best.key]} has the smallest error{ratio}; below {FEWEST} sequences "
             "no tracker is called better than another."
         )
     first = [standing for standing in ranked if standing.group is not None and standing.group[0] == 1]
@@ -67,7 +67,7 @@ def explanation(board: Board) -> str:
 
 def mean_rank_note(board: Board) -> str:
     """Friedman's test and Nemenyi's critical difference in a sentence; empty where there are too few trackers."""
-    test = mean_rank_test(ranked_logs(board)[0])
+    test = mean_rank_test(common_logs(board, board.ranked)[0])
     if test is None:
         return ""
     return (
@@ -99,7 +99,7 @@ def _are(number: int) -> str:
 
 
 def _names(board: Board, standings: list[Standing]) -> str:
-    names = [board.labels[standing.key] for standing in standings]
+    names = [board.names[standing.key] for standing in standings]
     if len(names) > _MOST_NAMED:
         return f"{names[0]} and {len(names) - 1} others"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

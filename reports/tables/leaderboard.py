@@ -14,8 +14,8 @@ import numpy as np
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, Cell, mean_skipped, pair_frame, rank
-from dynslam_bench.reports.model.published import ReportedCell, lines_of
+from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, Cell, compare_pairs, mean_skipped, rank
+from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
 from dynslam_bench.reports.tables.table import (
@@ -258,21 +258,22 @@ def pair_table(board: Board) -> Table | None:
     """Every ranked tracker against every other; None below `FEWEST` sequences or for fewer than three trackers."""
     if len(board.common) < FEWEST or len(board.ranked) < 3:
         return None
-    pairs = {(line.tracker, line.other): line for line in lines_of(pair_frame(board))}
+    pairs = {}
+    for pair in compare_pairs(board, board.ranked):
+        pairs[pair.one, pair.other] = pair.ratio.value, pair
+        pairs[pair.other, pair.one] = 1.0 / pair.ratio.value, pair
     rows = []
     for key in board.ranked:
-        label = board.labels[key]
-        cells = [TableCell(label)]
-        for other in (board.labels[other] for other in board.ranked):
-            line = pairs.get((label, other)) or pairs.get((other, label))
-            if line is None:
+        cells = [TableCell(board.labels[key])]
+        for other in board.ranked:
+            if other == key:
                 cells.append(TableCell("–", emphasis="muted"))
                 continue
-            ratio = line.ratio if line.tracker == label else 1.0 / line.ratio
-            apart = line.verdict != "cannot tell"
+            ratio, pair = pairs[key, other]
+            apart = pair.verdict != "cannot tell"
             colour = shade(0.5 if ratio < 1 else 2.0) if apart else None
             cells.append(
-                TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {line.p_value:.3f}")
+                TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {pair.p_value:.3f}")
             )
         rows.append(cells)
     caption = (

@@ -14,6 +14,7 @@ from typing import Literal
 import pandas as pd
 
 from dynslam_bench.core.sanitise import printable
+from dynslam_bench.reports.model.names import OUR_BACK_END
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]
 MOST_ROWS = 1000
@@ -241,7 +242,6 @@ _DIGIT_PT = 4.3
 _LETTER_PT = 4.6
 _NAMES_PT = 92.0
 _HEADING = 11
-OUR_BACK_END = " (our back end)"
 _STAR = r"\rlap{$^*$}"
 _LATEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},

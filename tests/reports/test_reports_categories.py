@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from reports_rows import row
 
-from dynslam_bench.reports.model.board import OVERALL, category_boards, make_board, pair_frame
+from dynslam_bench.reports.html.board_page import ratios_content
+from dynslam_bench.reports.model.board import OVERALL, category_boards, compare_pairs, make_board
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
 from dynslam_bench.reports.tables import leaderboard as tables
 
@@ -70,16 +71,33 @@ def test_the_headline_names_the_best_and_whether_they_can_be_told_apart():
     assert "2 are better, 1 is worse" in explanation(boards["high dynamic"])
 
 
-def test_all_pairs_stand_in_a_frame_and_a_matrix():
+def test_all_pairs_stand_in_a_matrix():
     board = make_board(rows_of_truth(SIZES, {"high-dynamic": 12}))
-    pairs = pair_frame(board).set_index(["tracker", "other"])
+    pairs = compare_pairs(board, board.ranked)
     assert len(pairs) == 6
-    apart = {frozenset(names): line.verdict != "cannot tell" for names, line in pairs.iterrows()}
+    apart = {frozenset((board.labels[p.one], board.labels[p.other])): p.verdict != "cannot tell" for p in pairs}
     assert not apart[frozenset({"MASKS", "FLOW"})] and sum(apart.values()) == 5
     table = tables.pair_table(board)
     assert [len(cells) for cells in table.rows] == [5] * 4
     assert "critical" not in mean_rank_note(board) and "Nemenyi" in mean_rank_note(board)
     assert tables.pair_table(make_board(rows_of_truth(SIZES, {"high-dynamic": 4}))) is None
+
+
+def test_two_trackers_side_by_side_have_the_numbers_of_the_board():
+    board = make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6}))
+    keys = [*board.trackers, *board.final_only]
+    assert len(set(board.weights.values())) == 2, "the categories have unequal sizes"
+    reference, shown = keys.index(board.reference), ratios_content(board)
+    assert len(shown) == len(keys) * (len(keys) - 1) // 2
+    for standing in board.standings:
+        place = keys.index(standing.key)
+        for a, b, *ratio, sequences, verdict in shown:
+            if {a, b} == {place, reference}:
+                value, low, high = ratio if a == reference else (1 / ratio[0], 1 / ratio[2], 1 / ratio[1])
+                expected = standing.ratio
+                assert (value, low, high) == pytest.approx((expected.value, expected.low, expected.high), rel=1e-3)
+                turned = {"better": "worse", "worse": "better"}.get(verdict, verdict)
+                assert standing.verdict == (verdict if a == reference else turned) and sequences == 18
 
 
 def test_exact_masks_are_a_bound_and_never_rank_beside_others():

@@ -84,25 +84,25 @@ def test_a_site_needs_nothing_outside_of_it(store, tmp_path, capsys):
     (output / "mine.txt").write_text("stays")
     told = []
     site = publish(
-        [store.root], output, study=study, title="A <b> title", on_progress=lambda *what: told.append(what[2])
+        [store.root], output, studies=[study], title="A <b> title", on_progress=lambda *what: told.append(what[2])
     )
     assert {"looking for what has changed", "writing the pages of the runs", "writing"} <= set(told)
     for name in ("paper_ape", "paper_rpe", "paper_accuracy"):
         assert len(rows_of(output / "leaderboard" / "csv" / f"{name}.csv")) >= 3
     places = {str(path.relative_to(output)) for path in output.rglob("*") if path.is_file()}
-    assert {"index.html", ".nojekyll", "mine.txt", "leaderboard/index.html", "study/index.html"} <= places
-    assert "study/csv/trials.csv" in places and "study/journal.log" not in places
-    assert not any(place.startswith("study/assets") for place in places), "those of the report are used"
-    assert 'src="../leaderboard/assets/page.js"' in (output / "study" / "index.html").read_text()
+    assert {"index.html", ".nojekyll", "mine.txt", "leaderboard/index.html", "study/study/index.html"} <= places
+    assert "study/study/csv/trials.csv" in places and "study/study/journal.log" not in places
+    assert not any(place.startswith("study/study/assets") for place in places), "those of the report are used"
+    assert 'src="../../leaderboard/assets/page.js"' in (output / "study" / "study" / "index.html").read_text()
     assert site.files == len(places) and 0 < site.size_mb < 8
     page = (output / "index.html").read_text()
     assert "A &lt;b&gt; title" in page
     links = re.findall(r'(?:src|href)="([^"]+)"', page)
-    assert {"leaderboard/index.html", "study/index.html"} <= set(links)
+    assert {"leaderboard/index.html", "study/study/index.html"} <= set(links)
     assert all((output / link).is_file() for link in links)
     assert str(tmp_path) not in (output / "leaderboard" / "index.html").read_text()
     with pytest.raises(ReportError, match=r"holds no index\.html"):
-        publish([store.root], output, study=tmp_path)
+        publish([store.root], output, studies=[tmp_path])
     with pytest.raises(SystemExit) as ended:
         start(["report", "publish", str(store.root), "-o", str(output)])
     assert not ended.value.code and "index.html (" in capsys.readouterr().out

@@ -12,23 +12,18 @@ function pairsOf(board, a, b) {
   }).sort((p, q) => Math.abs(q.change) - Math.abs(p.change));
 }
 
-/** Geometric mean of the ratios with Student's 95 % interval, as in the tables. */
-function overall(board, pairs) {
-  const n = pairs.length, mean = pairs.reduce((sum, { change }) => sum + change, 0) / n;
-  const spread = Math.sqrt(pairs.reduce((sum, { change }) => sum + (change - mean) ** 2, 0) / Math.max(n - 1, 1) / n);
-  const half = n < board.fewest ? NaN : board.quantiles[n] * spread;
-  return [mean, mean - half, mean + half].map(Math.exp);
-}
-
-function sentenceOf(board, a, b, pairs) {
-  const names = [board.trackers[a].label, board.trackers[b].label];
-  if (!pairs.length) return `${names[1]} and ${names[0]} have no sequence in common.`;
-  const [ratio, low, high] = overall(board, pairs), n = pairs.length, count = `${n} sequence${n > 1 ? "s" : ""}`;
-  if (Math.abs(ratio - 1) < 1e-9) return `${names[1]} and ${names[0]} have the same error on ${count}.`;
+/** B against A, in the board's numbers. */
+function sentenceOf(ratios, a, b, names) {
+  const entry = ratios.find(([one, other]) => (one === a && other === b) || (one === b && other === a));
+  if (!entry) return `${names[1]} and ${names[0]} have no ranked sequence in common.`;
+  const turned = entry[0] === b, [, , value, from, to, n, verdict] = entry;
+  const [ratio, low, high] = turned ? [1 / value, 1 / to, 1 / from] : [value, from, to], count = `${n} sequence${n > 1 ? "s" : ""}`;
+  if (Math.abs(ratio - 1) < 1e-6) return `${names[1]} and ${names[0]} have the same error on ${count}.`;
   const head = `${names[1]} against ${names[0]}: ${percentText(ratio)} on ${count}`;
-  if (n < board.fewest) return `${head}, too few scenes to tell.`;
-  const range = `ratio ${ratio.toFixed(3)}, 95 % interval ${low.toFixed(3)} to ${high.toFixed(3)}`;
-  return high < 1 || low > 1 ? `${head} (${range}).` : `${head}, but that may be chance (${range}).`;
+  if (from === null) return `${head}, too few scenes to tell.`;
+  const range = `ratio ${ratio.toFixed(3)}, 95 % interval ${low.toFixed(3)} to ${high.toFixed(3)}`, apart = low > 1 || high < 1;
+  if (verdict === "cannot tell" && apart) return `${head}, but among all pairs of the board one may differ so by chance (${range}).`;
+  return apart ? `${head} (${range}).` : `${head}, but that may be chance (${range}).`;
 }
 
 function dumbbells(board, pairs, names) {
@@ -74,7 +69,7 @@ async function showPair(board, pair, names) {
 }
 
 async function startCompare() {
-  const board = await side("board"), view = address.read();
+  const [board, ratios] = await Promise.all([side("board"), side("ratios")]), view = address.read();
   const sides = board.pairs, usual = sides ? sides[0] : [board.referenceAt ?? 0, board.trackers.findIndex((_, at) => at !== (board.referenceAt ?? 0))];
   const [a, b] = [+(view.get("a") ?? usual[0]), +(view.get("b") ?? usual[1])];
   const names = [board.trackers[a]?.label ?? "", board.trackers[b]?.label ?? ""];
@@ -85,7 +80,7 @@ async function startCompare() {
     ? [chooser("Tracker", sides.map(([one, other]) => [`${one}.${other}`, board.trackers[one].label.replace(/^A: /, "")]), `${a}.${b}`, (key) => go(...key.split(".")))]
     : ["A: ", chooser("A", all, a, (key) => go(key, b)), " B: ", chooser("B", all, b, (key) => go(a, key))]));
   const pairs = board.trackers[b] ? pairsOf(board, a, b) : [];
-  byId("sentence").textContent = board.trackers[b] ? sentenceOf(board, a, b, pairs) : "There is only one tracker.";
+  byId("sentence").textContent = board.trackers[b] ? sentenceOf(ratios, a, b, names) : "There is only one tracker.";
   const settings = board.trackers[b] ? [...new Set([...Object.keys(board.trackers[a].settings), ...Object.keys(board.trackers[b].settings)])].map((name) => [name, board.trackers[a].settings[name] ?? "default", board.trackers[b].settings[name] ?? "default"]).filter(([, one, other]) => one !== other) : [];
   byId("differences").replaceChildren(settings.length ? rowsOf(["setting that differs", "A", "B"], settings) : make("p", { className: "caption", textContent: "The settings that were asked for are the same." }));
   await draw(byId("dumbbells"), dumbbells(board, pairs, names));
