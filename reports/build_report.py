@@ -16,7 +16,7 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.reading import read_json
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports import figures
-from dynslam_bench.reports.html.board_page import entries_of, ratios_content, side_content
+from dynslam_bench.reports.html.board_page import MEANINGS, entries_of, ratios_content, side_content
 from dynslam_bench.reports.html.page import (
     ASSETS,
     Block,
@@ -57,7 +57,7 @@ from dynslam_bench.reports.model.published import (
 )
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, RunRow, command_line, grouped
 from dynslam_bench.reports.model.statistics import FEWEST
-from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
+from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note, reservations
 from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
@@ -322,6 +322,7 @@ def _first_page(
         sentences={name: headline(some) for name, some in boards.items()},
         facts=facts,
         categories={name: entries_of(some, board, boards, protocol) for name, some in boards.items()},
+        meanings=MEANINGS,
         reference=board.reference_name,
         explanation=how_to_read(board),
         notes=notes,
@@ -359,6 +360,7 @@ def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
     repeats = sorted({len(cell.rows) for cells in board.cells.values() for cell in cells.values()})
     failed = [row for row in board.rows if row.failed]
     endings = [f"{board.labels[row.variant_key]} on {board.sequence(row)}: {row.ending}" for row in failed]
+    doubts = reservations(board.rows)
     several = f"{repeats[0]}–{repeats[-1]}" if len(repeats) > 1 else str(repeats[0])
     return [
         (str(len(names)), "sequence" + "s" * (len(names) != 1), sequences),
@@ -366,6 +368,7 @@ def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
         (several, "run a cell" if several == "1" else "runs a cell", []),
         (str(len(board.rows)), "run" + "s" * (len(board.rows) != 1), []),
         (str(len(failed)), "failed", first_of(endings, _MOST_NOTES, "and {} more, see Diagnostics")),
+        (str(len(doubts)), "reservation" + "s" * (len(doubts) != 1) + " when quoting", [*doubts, "Name the protocol."]),
         (protocol.id, "protocol", [protocol.describe()]),
     ]
 
@@ -439,7 +442,7 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
             f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
             "are of the whole recordings is not checked."
         )
-    section.blocks.append(Block("table", "Absolute trajectory error", tables.per_sequence(board, protocol, published)))
+    section.blocks += table_blocks(tables.per_sequence(board, protocol, published), folded=True)
     lost = any(row.coverage < 1 and not row.failed for row in board.rows)
     section.blocks += table_blocks(
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,

@@ -160,7 +160,9 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             figures["Importances"] = visualization.plot_param_importances(tuner.study, evaluator=evaluator, **target)
         if len(names) == 1:
-            figures["Intermediate values"] = visualization.plot_intermediate_values(tuner.study)
+            figures["Intermediate values"] = steps = visualization.plot_intermediate_values(tuner.study)
+            steps.for_each_trace(lambda trace: trace.update(y=np.exp(np.asarray(trace.y, float))))
+            steps.update_yaxes(title=names[0])
         elif len(names) < 4:
             figures["Pareto front"] = visualization.plot_pareto_front(
                 tuner.study, targets=lambda trial: list(map(math.exp, trial.values)), target_names=names

@@ -24,6 +24,15 @@ MOST_LISTED = 5000
 """Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
 
 
+MEANINGS = {
+    "static": "nothing moves",
+    "low dynamic": "people sit",
+    "high dynamic": "people walk",
+    "unknown objects": "objects of no class",
+}
+"""Categories in everyday words."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """A row of the board.
@@ -81,6 +90,10 @@ def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol
         kind = TableCell("imported") if first.imported else cells["provenance"]
         ended = [run for run in board.runs(key) if not run.failed]
         marks = cells["tracker"].text.removeprefix(board.labels[key])
+        failure = next((run for run in board.runs(key) if run.failed), None)
+        if failure is not None:
+            tip = f"{board.sequence(failure)}: {failure.ending}"
+            cells["success"] = replace(cells["success"], link=run_link(failure), tip=tip)
         entries.append(
             Entry(
                 at=keys.index(key),
@@ -153,7 +166,7 @@ def _by_category(key: str, boards: Mapping[str, Board]) -> Markup:
     words = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios)
     dots = []
     for at, (_, ratio) in enumerate(ratios):
-        y = 12 + 9 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0)
+        y = 12 + 8 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0)
         kind = "worse" if ratio >= 1 else "better"
         dots.append(f'<circle cx="{8 + 14 * at}" cy="{24 - y:.1f}" r="3.6" class="{kind}"/>')
     width = 14 * len(ratios) + 4

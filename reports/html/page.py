@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
@@ -88,8 +89,8 @@ def render(template: str, **values: Any) -> str:
 
 
 def _breakable(name: str) -> Markup:
-    """A name that may be broken behind its dots, underlines and slashes."""
-    return Markup(re.sub(r"(?<=[/_.])(?=.)", "<wbr>", str(escape(name))))
+    """A name that may be broken behind its dots, underlines, slashes and question marks."""
+    return Markup(re.sub(r"(?<=[/_.?])(?=.)", "<wbr>", str(escape(name))))
 
 
 @cache
@@ -138,18 +139,26 @@ def figure_json(figure: go.Figure) -> Markup:
     return Markup(str(figure.to_json()).replace("<", "\\u003c"))
 
 
-def write_side(output: Path, name: str, value: Any) -> None:
+def read_remark(output: Path, name: str) -> Any:
+    """What stands in the first line of ``data/<name>.js``, see `write_side`; None without that file."""
+    with suppress(OSError, ValueError), (output / FOLDER / f"{name}.js").open(encoding="utf-8") as file:
+        return json.loads(file.readline().removeprefix("//"))
+    return None
+
+
+def write_side(output: Path, name: str, value: Any, remark: Any = None) -> None:
     """Write ``data/<name>.js``, a script that hands a value to the page: a page opened from a folder loads no JSON.
 
     Args:
         output: Folder of the page.
         name: What the page asks for.
         value: Anything that JSON can hold; no NaN.
+        remark: Likewise; stands before it, for `read_remark`.
 
     Raises:
         DynslamError: It cannot be written.
     """
     path = output / FOLDER / f"{name}.js"
-    content = f"keep({json.dumps(name)},{to_script(value)});\n".encode()
+    content = f"//{to_script(remark)}\nkeep({json.dumps(name)},{to_script(value)});\n".encode()
     if not path.is_file() or path.read_bytes() != content:  # to replace a file takes longer than to read it
         write_atomic(path, content)

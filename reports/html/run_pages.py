@@ -18,19 +18,23 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
+from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.evaluate import pose_errors
 from dynslam_bench.evaluation.protocol import Protocol, RPESpec
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
-from dynslam_bench.reports.html.page import write_side
+from dynslam_bench.reports.html.page import read_remark, write_side
 from dynslam_bench.reports.model.load import JOB, run_jobs
 from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
+from dynslam_bench.reports.model.summary import reservations
 from dynslam_bench.reports.tables.table import mm, significant_text
 from dynslam_bench.runs.artifacts import VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import CSV_FILE
 from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.store import file_stamp, part_words
 
 Array = NDArray[np.float64]
 
@@ -43,26 +47,29 @@ MOST_FRAMES = 400
 """About how many frames of a run its page shows."""
 WORST = 6
 """Frames that a page offers to jump to, those with the largest frame-to-frame error."""
+_APART = 15
+"""Frames between two of these at least."""
 _LOG_BYTES = 20_000
+_CODE = ("evaluation", "geometry", "reports", "runs")
+"""Packages whose code makes a page."""
 _WHOLE = ("total_s", "processor_s", "read_s")
 """Times of a frame that are no stage of it: the figure stacks stages."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class RunPage:
     """What the report needs of a run whose page was written.
 
     Attributes:
-        run_id: The run.
         variant_key: Its tracker and settings.
-        share: Share of dynamic pixels ``[N]`` of its frames, of a successful run where exact masks tell it.
-        errors_m: Frame-to-frame translational errors ``[N]`` of these frames.
+        squares: Sum of the squared frame-to-frame errors (translation, m²) of its frames in every bin of `SHARE_EDGES`,
+            of a successful run where exact masks tell the share.
+        frames: Number of these frames.
     """
 
-    run_id: str
     variant_key: str
-    share: Array
-    errors_m: Array
+    squares: list[float]
+    frames: list[int]
 
 
 def write_run_pages(
@@ -102,16 +109,28 @@ def write_run_pages(
 def _write_pages(
     rows: Sequence[RunRow], pictured: Collection[str], share: Mapping[int, float], protocol: Protocol, output: Path
 ) -> list[RunPage]:
-    """Write the pages of some runs of one column, whose frames have these exact shares of dynamic pixels."""
-    pages = []
+    """Write the pages of some runs of one column, whose frames have these exact shares of dynamic pixels.
+
+    A page whose inputs are as they were stays as it is.
+    """
+    pages, common = [], [package_digest(_CODE), protocol.digest(), *share.items()]
     for row in rows:
+        name, files = f"run-{row.run_id}", _files(row, output)
+        stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
+        state = row.store.index.state(row.run_id, row.sequence.part)
+        made_of = digest([common, state, stamps, files, row.run_id in pictured, row.notes, row.failed])
+        earlier = read_remark(output, name)
+        if earlier and earlier[0] == made_of:
+            pages.append(RunPage(row.variant_key, *earlier[1:]))
+            continue
         record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
         pictures = _copy_pictures(row, output) if row.run_id in pictured else []
         content = run_content(row, record, frames, protocol, pictures)
-        write_side(output, f"run-{row.run_id}", content | {"files": _files(row, output)})
         exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share)
         exact &= (frames.share_source == EXACT) & (not row.failed)
-        pages.append(RunPage(row.run_id, row.variant_key, frames.share[exact], frames.errors_m[exact]))
+        sums = share_sums(frames.share[exact], frames.errors_m[exact])
+        write_side(output, name, content | {"files": files}, remark=[made_of, *sums])
+        pages.append(RunPage(row.variant_key, *sums))
     return pages
 
 
@@ -141,22 +160,25 @@ def _files(row: RunRow, output: Path) -> list[tuple[str, str]]:
     return [(name, f"{folder}/{file}") for name, file in names.items() if (row.folder / file).is_file()]
 
 
+def share_sums(share: Array, errors_m: Array) -> tuple[list[float], list[int]]:
+    """Sums of the squared errors ``[N]``, and numbers of frames, in every bin of `SHARE_EDGES`."""
+    squares, counts = (np.histogram(share, SHARE_EDGES, weights=weights)[0] for weights in (errors_m**2, None))
+    return squares.tolist(), counts.tolist()
+
+
 def error_by_share(pages: Sequence[RunPage]) -> list[list[float | None]]:
     """RMSE in mm and number of frames of each bin between `SHARE_EDGES`, over some runs; empty for no frame.
 
     Not the median: a tracker that follows people errs grossly on few frames, and best of all on most.
     """
-    share = np.concatenate([np.zeros(0), *(page.share for page in pages)])
-    errors_m = np.concatenate([np.zeros(0), *(page.errors_m for page in pages)])
-    if not len(share):
+    squares, counts = (np.sum(sums, axis=0) for sums in ([p.squares for p in pages], [p.frames for p in pages]))
+    if not counts.any():
         return []
-    at = np.clip(np.searchsorted(SHARE_EDGES, share, side="right") - 1, 0, len(SHARE_EDGES) - 2)
-    bins: list[list[float | None]] = []
-    for number in range(len(SHARE_EDGES) - 1):
-        inside = errors_m[at == number]
-        rmse_mm = 1000 * float(np.sqrt(np.mean(inside**2))) if len(inside) >= FEWEST_FRAMES else None
-        bins.append([significant(rmse_mm, 4), len(inside)])
-    return bins
+    rmse_mm = 1000 * np.sqrt(squares / np.maximum(counts, 1))
+    return [
+        [significant(error, 4) if count >= FEWEST_FRAMES else None, count]
+        for error, count in zip(rmse_mm.tolist(), counts.tolist(), strict=True)
+    ]
 
 
 # -- what the page of a run shows
@@ -194,6 +216,7 @@ def run_content(
         "level": level,
         "verdict": verdict,
         "numbers": _numbers(row, protocol.rpe),
+        "quote": _quote(row, protocol),
         "more": _more_numbers(row, record),
         "settings": [[name, settings[name], name in changed] for name in dict.fromkeys([*changed, *settings])],
         "stages": [
@@ -283,6 +306,17 @@ def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
     return [[name, text or "–"] for name, text in numbers.items()]
 
 
+def _quote(row: RunRow, protocol: Protocol) -> list[str]:
+    """The error with everything that it depends on, then what speaks against quoting it."""
+    if row.score_m is None:
+        return []
+    part = part_words(row)
+    words = [f"{row.label} on {row.sequence.id}{part and f' [{part}]'}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm"]
+    words += ["lost frames held at the last pose", f"coverage {100 * row.coverage:.1f} %", protocol.describe()]
+    words += [f"revision {row.git.revision[:10]}"] if row.git else []
+    return [f"{', '.join(words)}.", *reservations([row])]
+
+
 def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
     """What else is known of a run."""
     numbers = [
@@ -309,9 +343,13 @@ def _log(row: RunRow) -> str:
 
 def _worst(frames: RunFrames) -> list[list[float | None]]:
     """Index and error in mm of the frames with the largest frame-to-frame error."""
-    errors = np.nan_to_num(frames.errors_m, nan=-1.0)
-    order = [at for at in np.argsort(-errors, kind="stable")[:WORST].tolist() if errors[at] >= 0]
-    return [[int(frames.columns["index"][at]), significant(1000 * errors[at], 3)] for at in order]
+    worst: list[list[float | None]] = []
+    errors = frames.errors_m.copy()
+    while len(worst) < WORST and np.isfinite(errors).any():
+        at = int(np.nanargmax(errors))
+        worst.append([int(frames.columns["index"][at]), significant(1000 * errors[at], 3)])
+        errors[max(at - _APART, 0) : at + _APART + 1] = np.nan
+    return worst
 
 
 def _rotation_doubt(row: RunRow) -> str:
@@ -401,7 +439,7 @@ def _time_figure(
                         ("frame-to-frame error", "t", "frame_error", COLOURS[0], {"line": {"dash": "dot"}})]),
         ("features", [("inliers", "t", "inliers", COLOURS[2], {}),
                       ("dynamic (culled)", "t", "culled", COLOURS[1], {"line": {"dash": "dash"}})]),
-        ("people (%)", [(frames.share_source, "t", "share", COLOURS[4], {"fill": "tozeroy"})]),
+        ("people (%)", [(f"share of people: {frames.share_source}", "t", "share", COLOURS[4], {"fill": "tozeroy"})]),
     ]  # fmt: skip
     columns = series | track
     shown = [

@@ -20,7 +20,7 @@ from dynslam_bench.core.errors import ReportError, did_you_mean
 from dynslam_bench.core.toml import assignments
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
-from dynslam_bench.reports.model.names import OUR_BACK_END, make_labels, name_columns, shortened
+from dynslam_bench.reports.model.names import OUR_BACK_END, OUR_OWN, make_labels, name_columns, shortened
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import (
     FLOOR_M,
@@ -118,8 +118,8 @@ class Board:
 
     @cached_property
     def names(self) -> dict[str, str]:
-        """Labels as sentences, headings and figures say them: without `OUR_BACK_END`, unless two would be alike."""
-        short = {key: label.replace(OUR_BACK_END, "") for key, label in self.labels.items()}
+        """Labels as sentences, headings and figures say them: without whose they are, unless two would be alike."""
+        short = {key: label.replace(OUR_BACK_END, "").replace(OUR_OWN, "") for key, label in self.labels.items()}
         counts = Counter(short.values())
         return {key: label if counts[short[key]] > 1 else short[key] for key, label in self.labels.items()}
 

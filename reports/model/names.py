@@ -96,8 +96,8 @@ def _camera_words(row: RunRow) -> str:
     return "camera {:g}x{:g}, f {:g} {:g}".format(*values)
 
 
-OUR_BACK_END = " (our back end)"
-"""Behind the labels of re-implementations."""
+OUR_BACK_END, OUR_OWN = " (our back end)", ", our own"
+"""Behind the labels of re-implementations, and of compositions of this project."""
 ALWAYS = ("map", "backend.map.localisation_only")
 """Named in any table: a run that begins in a map knows more than one that begins without."""
 OF_ALL = {"device", "threads"}

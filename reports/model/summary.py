@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 
 from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, common_logs
+from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, Standing, mean_rank_test
+from dynslam_bench.runs.store import part_words
 
 _MOST_NAMED = 3
 
@@ -63,6 +66,25 @@ def explanation(board: Board) -> str:
         else "",
     ]
     return " ".join(filter(None, sentences))
+
+
+def reservations(rows: Sequence[RunRow]) -> list[str]:
+    """What somebody should say, or wait for, who quotes numbers of these runs; in sentences."""
+    cells = {(row.variant_key, row.column_id) for row in rows}
+    rendered = any(row.sequence.id.startswith("synthetic/") for row in rows)
+    computers = {row.machine.cpu for row in rows if row.machine}
+    sentences = {
+        "One run of a tracker on a sequence: how far repeats lie apart is not known.": len(cells) == len(rows),
+        "Parts of sequences: errors on the whole ones differ.": any(part_words(row) for row in rows),
+        "Rendered scenes: not comparable with recordings.": rendered,
+        "Frame times come from the stage cache, not from the runs.": any(row.cached for row in rows),
+        f"Frame times of {len(computers)} kinds of processors are not comparable.": len(computers) > 1,
+        "Made by code with changes that no revision holds.": any(row.git and row.git.dirty for row in rows),
+        f"{SEEN} Masks of a network that was trained on the very scene.": any(row.seen_in_training for row in rows),
+        f"{HINTED} Trajectories that are probably faulty, see Reproduce.": any(row.hints for row in rows),
+        "Failures, which count as a static camera or worse.": any(row.failed for row in rows),
+    }
+    return [sentence for sentence, holds in sentences.items() if holds]
 
 
 def mean_rank_note(board: Board) -> str:

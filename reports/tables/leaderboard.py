@@ -247,7 +247,7 @@ def category_table(boards: Mapping[str, Board]) -> Table | None:
     ]
     caption = (
         "Geometric mean of the median ATE over that of the reference, by category; brackets are 95 % intervals from "
-        f"{FEWEST} sequences on. Green: better than the reference; red: worse; no colour: cannot tell, or not ranked. "
+        f"{FEWEST} sequences on. Blue: better than the reference; orange: worse; no colour: cannot tell or not ranked. "
         "A sequence may be in several categories: what moves there, how the camera moves, recorded or rendered."
     )
     muted, separators = overall.unranked_rows(overall.trackers), overall.separators()
@@ -369,7 +369,7 @@ def metric_table(
         words = text(values[place]) + DOUBT * bool(doubts[place]) + SEEN * cell.in_training
         mark: Emphasis = "muted" if doubts[place] else marks.get(place, "")
         tip = doubts[place] or (SEEN_NOTE if cell.in_training else cell.ending)
-        return TableCell(words, skipped_words(cell), values[place], mark, tip=tip)
+        return TableCell(words, value=values[place], emphasis=mark, tip=tip)
 
     return _sequence_table(board, {"": values}, shown, name, title, caption, f"{title} ({unit})")
 

@@ -2,10 +2,12 @@
 
 import base64
 import contextlib
+import importlib.util
 import json
 import os
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -20,6 +22,9 @@ globalThis.choose = (select) => {
 };
 globalThis.slide = (input, value) => { input.value = value; input.dispatchEvent(new Event("input")); };
 """
+AXE_PACKAGE = importlib.util.find_spec("axe_playwright_python")
+AXE = AXE_PACKAGE and Path(AXE_PACKAGE.origin).with_name("axe.min.js")
+needs_axe = pytest.mark.skipif(AXE is None, reason="axe-core is not installed: pip install axe-playwright-python")
 needs_browser = pytest.mark.skipif(EXECUTABLE is None, reason=f"no browser is installed: {', '.join(NAMES)}")
 
 
@@ -141,6 +146,12 @@ class Browser:
                 return
             self.run("new Promise(done => setTimeout(done, 50))")
         raise AssertionError(f"never true: {expression}")
+
+    def violations(self):
+        """What axe-core finds against accessibility: rule, first element, and why."""
+        self.run(AXE.read_text(encoding="utf-8") + ";0")
+        first = "[rule.id, rule.nodes.length, rule.nodes[0].html.slice(0, 200), rule.nodes[0].failureSummary]"
+        return self.run(f"axe.run({{preload: false}}).then(({{violations}}) => violations.map((rule) => {first}))")
 
     def prefer(self, scheme):
         """Colour scheme of the system: ``light`` or ``dark``."""

@@ -18,7 +18,7 @@ def rows_of(path):
 def page_data(folder, name):
     """What a side file of a report hands to its page."""
     text = (folder / "data" / f"{name}.js").read_text()
-    return json.loads(text[text.index(",") + 1 : text.rindex(")")])
+    return json.loads(text[text.index(",", text.index("keep(")) + 1 : text.rindex(")")])
 
 
 SEQUENCE = {"block", "tags", "content", "noise", "duration_s"}

@@ -37,6 +37,16 @@ def test_fifty_known_runs_cost_no_file_each(store, tmp_path, opened):
     assert len(load_runs([store], PROTOCOL).rows) == 50 and opened == []
     build_report(store, tmp_path / "report", most_pages=7)
     assert opened.count("run.json") == 7  # those that have a page, and every one once
+    opened.clear()
+    pages = {path: path.read_text() for path in (tmp_path / "report" / "data").glob("*.js")}
+    build_report(store, tmp_path / "report", most_pages=7)
+    assert opened.count("run.json") == 0, "nothing has changed"
+    assert pages == {path: path.read_text() for path in pages}
+    victim = next(store.folder(path.stem[4:]) for path in pages if path.stem.startswith("run-"))
+    (victim / "log.txt").write_text("another log\n")
+    build_report(store, tmp_path / "report", most_pages=7)
+    assert "another log" in (tmp_path / "report" / "data" / f"run-{victim.name}.js").read_text()
+    assert opened.count("run.json") == 1
 
 
 def test_of_very_many_runs_few_have_a_page():

@@ -9,7 +9,7 @@ from reports_fake_store import add_frames, add_run
 from reports_rows import PROTOCOL, cell_of, crashed, row, rows_of
 
 from dynslam_bench.reports import build_report, load_frame
-from dynslam_bench.reports.html.run_pages import RunPage, error_by_share
+from dynslam_bench.reports.html.run_pages import RunPage, error_by_share, share_sums
 from dynslam_bench.reports.model.board import make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.published import is_excerpt
@@ -295,7 +295,7 @@ def test_the_frame_holds_all_runs_with_types_and_units(store, tmp_path):
 def test_who_follows_people_on_few_frames_is_not_shown_as_the_better_one():
     """The exploring page's error by the share of dynamic pixels; the follower is best on most frames."""
     share, errors_mm = np.full(100, 0.35), np.r_[np.full(90, 0.9), np.full(10, 40.0)]
-    (rmse_mm,) = (mm for mm, _ in error_by_share([RunPage("", "", share, 1e-3 * errors_mm)]) if mm)
+    (rmse_mm,) = (mm for mm, _ in error_by_share([RunPage("", *share_sums(share, 1e-3 * errors_mm))]) if mm)
     assert rmse_mm == pytest.approx(np.sqrt(np.mean(errors_mm**2)), rel=1e-3)
 
 

@@ -1,7 +1,7 @@
 // Two trackers, or two sides of one: the change on every sequence, and both runs of a sequence on top of each other.
-const SIDES = ["#0072b2", "#d55e00"];
+const SIDES = ["#0072b2", "#d55e00"], MOST = 60;
 const safe = (text) => text.replace(/[&<>]/g, (character) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[character]); // plotly reads markup
-const percentText = (ratio) => (ratio > 2 ? `${ratio.toPrecision(2)} times the error` : `${+Math.abs(100 * (ratio - 1)).toPrecision(2)} % ${ratio < 1 ? "better" : "worse"}`);
+const percentText = (ratio) => (ratio > 2 ? `${ratio.toPrecision(2)} times the error` : `${+Math.abs(100 * (ratio - 1)).toPrecision(2)} % ${ratio < 1 ? "less" : "more"} error`);
 
 function pairsOf(board, a, b) {
   const of = (tracker) => new Map(board.cells.filter((cell) => cell[0] === tracker && cell[5][0] !== null).map((cell) => [cell[1], cell]));
@@ -27,7 +27,7 @@ function sentenceOf(ratios, a, b, names) {
 }
 
 function dumbbells(board, pairs, names) {
-  const shown = pairs.slice(0, 60), labels = shown.map(({ sequence }) => safe(board.sequences[sequence].name));
+  const shown = pairs.slice(0, MOST), labels = shown.map(({ sequence }) => safe(board.sequences[sequence].short));
   const line = { type: "scatter", mode: "lines", x: [], y: [], line: { color: "#8a8a8a", width: 2 }, hoverinfo: "skip", showlegend: false };
   shown.forEach(({ cells }, at) => { line.x.push(1000 * cells[0][5][0], 1000 * cells[1][5][0], null); line.y.push(labels[at], labels[at], null); });
   const dots = [0, 1].map((side) => {
@@ -35,7 +35,7 @@ function dumbbells(board, pairs, names) {
     const reach = (end) => shown.map(({ cells }, at) => (cells[side][7].length ? Math.abs(1000 * cells[side][7][end] - value[at]) : 0));
     return { type: "scatter", mode: "markers", name: safe(names[side]), x: value, y: labels, marker: { size: 11, color: SIDES[side], symbol: ["circle", "diamond"][side] }, error_x: { type: "data", symmetric: false, array: reach(1), arrayminus: reach(0), thickness: 1.2 }, hovertemplate: "%{y}: %{x:.3g} mm<extra>%{fullData.name}</extra>" };
   });
-  return { data: [line, ...dots], layout: { height: 110 + 26 * shown.length, legend: { orientation: "h", y: 1, yanchor: "bottom" }, xaxis: { type: "log", title: { text: "ATE (mm), lost frames held" } }, yaxis: { autorange: "reversed", type: "category", automargin: true } } };
+  return { data: [line, ...dots], layout: { height: 110 + 26 * shown.length, legend: { orientation: "h", y: 1, yanchor: "bottom" }, xaxis: { type: "log", dtick: "D2", title: { text: "ATE (mm), lost frames held" } }, yaxis: { autorange: "reversed", type: "category", automargin: true } } };
 }
 
 /** Both runs of a sequence: pictures with a divider, tracks in space, errors over time and their difference. */
@@ -82,11 +82,12 @@ async function startCompare() {
   const pairs = board.trackers[b] ? pairsOf(board, a, b) : [];
   byId("sentence").textContent = board.trackers[b] ? sentenceOf(ratios, a, b, names) : "There is only one tracker.";
   const settings = board.trackers[b] ? [...new Set([...Object.keys(board.trackers[a].settings), ...Object.keys(board.trackers[b].settings)])].map((name) => [name, board.trackers[a].settings[name] ?? "default", board.trackers[b].settings[name] ?? "default"]).filter(([, one, other]) => one !== other) : [];
-  byId("differences").replaceChildren(settings.length ? rowsOf(["setting that differs", "A", "B"], settings) : make("p", { className: "caption", textContent: "The settings that were asked for are the same." }));
+  byId("differences").replaceChildren(settings.length ? rowsOf(["setting that differs", "A", "B"], settings) : make("p", { className: "caption", textContent: "Neither has other settings than the other: both run with those that they ship with, or with the same ones." }));
+  byId("hidden-pairs").textContent = pairs.length > MOST ? ` Drawn are ${MOST} of ${pairs.length} sequences; the sentence counts all that rank.` : "";
   await draw(byId("dumbbells"), dumbbells(board, pairs, names));
   const has = (pair) => pair.cells.every((cell) => board.runs.some((run) => run[0] === cell[6] && run[5] & 1));
   byId("dumbbells").removeAllListeners("plotly_click");
-  byId("dumbbells").on("plotly_click", ({ points }) => { const pair = pairs.find(({ sequence }) => safe(board.sequences[sequence].name) === points[0].y); if (pair && has(pair)) showPair(board, pair, names); });
+  byId("dumbbells").on("plotly_click", ({ points }) => { const pair = pairs.find(({ sequence }) => safe(board.sequences[sequence].short) === points[0].y); if (pair && has(pair)) showPair(board, pair, names); });
   const wanted = pairs.find(({ sequence }) => String(sequence) === view.get("sequence"));
   if (wanted && has(wanted)) await showPair(board, wanted, names);
 }

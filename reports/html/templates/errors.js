@@ -29,9 +29,9 @@ async function startErrors() {
     const metric = known.find(({ at }) => at === +view.number) ?? known[0];
     const sequences = data.sequences.map((sequence, at) => ({ ...sequence, at })).filter(({ tags: own }) => !view.kind || own.includes(view.kind));
     const trackers = data.trackers.map((tracker, at) => ({ ...tracker, at })).filter(({ ranked }) => ranked || !view.ranked);
-    const base = metric.key === "ate_rmse_m" && metric.which === "online" ? data.referenceAt : data.referenceAt ?? -1;
+    const base = metric.at === 0 ? data.referenceAt : data.referenceAt ?? -1;
     table?.destroy();
-    const head = make("thead", {}, make("tr", {}, make("th", { textContent: "tracker" }), ...sequences.map(({ name, short }) => make("th", { className: "n", title: name, textContent: short }))));
+    const head = make("thead", {}, make("tr", {}, make("th", { textContent: "tracker" }), ...sequences.map(({ name, short }) => make("th", { className: "n", title: name }, ...short.split(/(?<=[/_.?])/).flatMap((part) => [part, make("wbr")])))));
     const body = make("tbody", {}, ...trackers.map(({ label, at, ranked }) => make("tr", { className: ranked ? "" : "muted" }, make("td", { className: "name", textContent: label }),
       ...sequences.map((sequence) => {
         const { text, value, link, bad, small, shade } = cellOf(at, sequence.at, metric, base);

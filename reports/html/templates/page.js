@@ -37,6 +37,7 @@ const scheme = () => document.documentElement.dataset.theme || (matchMedia("(pre
 async function draw(element, figure) {
   drawn.set(element, figure);
   const layout = { ...figure.layout, template: THEMES[scheme()], autosize: true };
+  if (element.clientWidth < 500) layout.font = { size: 10 };
   if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: -0.3, yanchor: "top", ...layout.legend };
   const options = { format: "png", scale: 2, filename: element.id };
   await Plotly.react(element, figure.data, layout, { responsive: true, displaylogo: false, toImageButtonOptions: options });

@@ -111,8 +111,9 @@ function showFolds(run) {
   const figure = (name) => make("div", { className: "figure", id: name });
   const times = run.stages.map(([name, ...values]) => [name, ...values.map((value) => value?.toPrecision(3))]);
   const parts = [
+    ...(run.quote.length ? [fold(`Quote it (${run.quote.length - 1} reservation${run.quote.length === 2 ? "" : "s"})`, make("ul", { className: "plain" }, ...run.quote.map((textContent) => make("li", { textContent }))))] : []),
     fold("Make it again", make("pre", { tabIndex: 0, textContent: run.command || "It was imported." }), make("p", { className: "caption", textContent: `Started ${run.started}. ${run.machine}. ${run.asked ? `Asked for by: ${run.asked}` : ""}` })),
-    fold(`Settings (${run.settings.filter(([, , changed]) => changed).length} changed)`, rowsOf(["setting", "value", ""], run.settings.map(([name, value, changed]) => [name, String(value), changed ? "changed" : ""]))),
+    fold(`Settings (${run.settings.filter(([, , changed]) => changed).length} changed)`, rowsOf(["setting", "value", "changed"], run.settings.map(([name, value, changed]) => [name, String(value), changed ? "changed" : ""]))),
     fold("More numbers and diagnostics", rowsOf(["number", "value"], run.more), make("ul", { className: "plain" }, ...run.notes.map((note) => make("li", { textContent: note }))), make("p", { className: "caption", textContent: run.protocol })),
     ...(run.figures.poses ? [fold("Position and rotation", figure("poses"))] : []),
     ...(times.length ? [fold("Time by stage", ...(run.figures.stages ? [figure("stages")] : []), rowsOf(["stage", "median ms", "p95 ms", "mean ms"], times))] : []),
