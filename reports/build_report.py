@@ -56,7 +56,6 @@ from dynslam_bench.reports.model.published import (
     spans,
 )
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, RunRow, command_line, grouped
-from dynslam_bench.reports.model.statistics import FEWEST
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note, reservations
 from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
@@ -303,14 +302,12 @@ def _first_page(
     footer: str,
 ) -> str:
     """The board: the sentence first, then the data, the ranking by category, and accuracy against speed."""
-    captions = {
-        "ratio": f"Geometric-mean ATE ratio; bars: 95 % interval over sequences, from {FEWEST} on. Open: not ranked.",
-        "speed": "Lower right is better. The dotted line joins ranked trackers that no other beats in both. Frame "
-        "times hold for the machine named under Reproduce."
-        + f" {tables.CACHED_NOTE}"
-        * any(r.cached for r in board.rows),
-    }
-    shown = {"ratio": figures.ratio_figure(board), "speed": figures.speed_figure(board)}
+    caption = (
+        "Lower right is better. The dotted line joins ranked trackers that no other beats in both; open ones are not "
+        "ranked. Frame times hold for the machine named under Reproduce."
+    )
+    caption += f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
+    speed = figures.speed_figure(board)
     return render(
         "board.html.j2",
         title=title,
@@ -326,8 +323,8 @@ def _first_page(
         reference=board.reference_name,
         explanation=how_to_read(board),
         notes=notes,
-        captions=captions,
-        figures={name: figure for name, figure in shown.items() if figure is not None},
+        caption=caption,
+        figures={} if speed is None else {"speed": speed},
     )
 
 

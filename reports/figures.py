@@ -23,8 +23,6 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "cross", "x", "star", "pentagon", "hexagon", "bowtie")
 DASHES = ("solid", "dash", "dot", "dashdot")
 NEUTRAL = "#8a8a8a"
-MOST_ROWS = 40
-"""Trackers in the figure of ratios; the table beside it has all."""
 MOST_POINTS = 400
 """Points of one tracker in the figure of masks; of more runs as many, from the best to the worst."""
 
@@ -115,38 +113,6 @@ def guide(figure: go.Figure, x: float | None = None, y: float | None = None) -> 
         figure.add_vline(x, line=line, layer="below")
     if y is not None:
         figure.add_hline(y, line=line, layer="below")
-
-
-def ratio_figure(board: Board) -> go.Figure | None:
-    """Geometric-mean ATE ratios of the first trackers with their intervals, best on top; None for nothing scored."""
-    standings = [s for s in board.standings if np.isfinite(s.ratio.value) and s.key not in board.hopeless]
-    if not standings:
-        return None
-    look, standings = looks(board), standings[:MOST_ROWS]
-    traces = [
-        go.Scatter(
-            x=[significant(s.ratio.value)],
-            y=[wrapped(board.names[s.key])],
-            mode="markers",
-            marker={
-                "size": 11,
-                "color": look[s.key]["color"],
-                "symbol": look[s.key]["symbol"] + "-open" * (s.key not in board.ranked),
-            },
-            error_x=error_bars(s.ratio),
-            hovertemplate="%{y}<br>ratio %{x:.3f}<extra></extra>",
-        )
-        for s in standings
-    ]
-    figure = figure_of(
-        traces,
-        70 + 30 * len(standings),
-        showlegend=False,
-        xaxis=log_axis("ATE ratio (left is better)"),
-        yaxis={"autorange": "reversed"},
-    )
-    guide(figure, x=1.0)
-    return figure
 
 
 def speed_figure(board: Board) -> go.Figure | None:

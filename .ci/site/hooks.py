@@ -114,6 +114,8 @@ def _outside(file: File) -> list[Path]:
 
 def _on_site(target: Path | None, link: str) -> str:
     """Where a file of the repository is on the site, from its top; the link as it stands where it is nowhere."""
+    if target is not None and target.parts[:2] == ("docs", "example"):  # on the site its HTML, on GitHub its README
+        target = target.with_name(target.name.replace("README.md", "index.html"))
     if target is None or not (ROOT / target).is_file():
         return link if target is None or target.parts[:1] != ("docs",) else target.relative_to("docs").as_posix()
     name = target.as_posix()

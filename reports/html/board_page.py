@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -33,43 +34,12 @@ MEANINGS = {
 """Categories in everyday words."""
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A row of the board.
+def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol: Protocol) -> list[dict[str, Any]]:
+    """The rows of one category, cells by the names that `board.html.j2` calls them by.
 
-    Attributes:
-        at: Number of the tracker on all pages.
-        group: 0 for ranked trackers, 1 for others, 2 for controls (bounds), which stand below the line.
-        name: Name; leads to its run with the median error on the first sequence that it has.
-        kind: How it was made, in a word or two.
-        rank: Ranks that the data leave open.
-        ratio: Error as a ratio to the reference, with its interval.
-        bar: The same drawn.
-        verdict: Whether it is better than the reference.
-        success: Runs that succeeded of all.
-        coverage: Share of tracked frames.
-        time: Milliseconds of a frame.
-        memory: Peak memory in MB.
-        by_category: Its ratio in each category, drawn.
-    """
-
-    at: int
-    group: int
-    name: TableCell
-    kind: TableCell
-    rank: TableCell
-    ratio: TableCell
-    bar: Markup
-    verdict: TableCell
-    success: TableCell
-    coverage: TableCell
-    time: TableCell
-    memory: TableCell
-    by_category: Markup
-
-
-def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol: Protocol) -> list[Entry]:
-    """The rows of one category.
+    ``at`` numbers the tracker on all pages; ``group`` is 0 for ranked trackers, 1 for others, 2 for controls (bounds).
+    The name leads to the tracker's run with the median error on the first sequence that it has, and the successes lead
+    to its first failure.
 
     Args:
         board: Of the category.
@@ -95,25 +65,25 @@ def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol
             tip = f"{board.sequence(failure)}: {failure.ending}"
             cells["success"] = replace(cells["success"], link=run_link(failure), tip=tip)
         entries.append(
-            Entry(
-                at=keys.index(key),
-                group=2 if first.tracker.provenance == "control" else int(key not in board.ranked),
-                name=replace(cells["tracker"], text=board.names[key] + marks, link=run_link(start)),
-                kind=kind,
-                rank=TableCell("–") if standing is None else rank_cell(standing),
-                ratio=_ratio_cell(board, key, standing),
-                bar=Markup("") if standing is None else interval_bar(standing.ratio, limits),
-                verdict=cells["better?"]
+            {
+                "at": keys.index(key),
+                "group": 2 if first.tracker.provenance == "control" else int(key not in board.ranked),
+                "name": replace(cells["tracker"], text=board.names[key] + marks, link=run_link(start)),
+                "kind": kind,
+                "rank": TableCell("–") if standing is None else rank_cell(standing),
+                "ratio": _ratio_cell(board, key, standing),
+                "bar": Markup("") if standing is None else interval_bar(standing.ratio, limits),
+                "verdict": cells["better?"]
                 if key not in board.no_better
                 else TableCell("no", "no better than a static camera"),
-                success=cells["success"],
-                coverage=cells["coverage"],
-                time=number(middle(run.frame_ms for run in timed(ended)), ".1f"),
-                memory=cells["MB"],
-                by_category=_by_category(key, boards),
-            )
+                "success": cells["success"],
+                "coverage": cells["coverage"],
+                "time": number(middle(run.frame_ms for run in timed(ended)), ".1f"),
+                "memory": cells["MB"],
+                "by_category": _by_category(key, boards),
+            }
         )
-    return sorted(entries, key=lambda entry: entry.group)
+    return sorted(entries, key=itemgetter("group"))
 
 
 def _ratio_cell(board: Board, key: str, standing: Standing | None) -> TableCell:

@@ -389,16 +389,18 @@ class Pair(NamedTuple):
 def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
     logs, weights = common_logs(board, keys)
-    tests = separable({key: logs[key] for key in keys if key in board.ranked}, weights)
+    tests = separable({key: logs[key] for key in keys if key in board.ranked}, weights) if board.common else {}
     pairs = []
     for a, b in combinations(keys, 2):
         differences = logs[a] - logs[b]
+        if not np.isfinite(differences).any():
+            continue
         ratio, (apart, p_value) = ratio_interval(differences, weights), tests.get((a, b), (False, None))
         verdict: Verdict = "" if p_value is None else "cannot tell"
         if apart:
             verdict = "better" if ratio.value < 1 else "worse"
         pairs.append(Pair(a, b, ratio, int(np.isfinite(differences).sum()), p_value, verdict))
-    return [pair for pair in pairs if pair.sequences]
+    return pairs
 
 
 def _order_sequences(board: Board) -> None:

@@ -35,7 +35,7 @@ function dumbbells(board, pairs, names) {
     const reach = (end) => shown.map(({ cells }, at) => (cells[side][7].length ? Math.abs(1000 * cells[side][7][end] - value[at]) : 0));
     return { type: "scatter", mode: "markers", name: safe(names[side]), x: value, y: labels, marker: { size: 11, color: SIDES[side], symbol: ["circle", "diamond"][side] }, error_x: { type: "data", symmetric: false, array: reach(1), arrayminus: reach(0), thickness: 1.2 }, hovertemplate: "%{y}: %{x:.3g} mm<extra>%{fullData.name}</extra>" };
   });
-  return { data: [line, ...dots], layout: { height: 110 + 26 * shown.length, legend: { orientation: "h", y: 1, yanchor: "bottom" }, xaxis: { type: "log", dtick: "D2", title: { text: "ATE (mm), lost frames held" } }, yaxis: { autorange: "reversed", type: "category", automargin: true } } };
+  return { data: [line, ...dots], layout: { height: 110 + 26 * shown.length, legend: { orientation: "h", y: 1, yanchor: "bottom" }, xaxis: { type: "log", dtick: "D2", title: { text: "ATE (mm)" } }, yaxis: { autorange: "reversed", type: "category", automargin: true } } };
 }
 
 /** Both runs of a sequence: pictures with a divider, tracks in space, errors over time and their difference. */
@@ -82,7 +82,7 @@ async function startCompare() {
   const pairs = board.trackers[b] ? pairsOf(board, a, b) : [];
   byId("sentence").textContent = board.trackers[b] ? sentenceOf(ratios, a, b, names) : "There is only one tracker.";
   const settings = board.trackers[b] ? [...new Set([...Object.keys(board.trackers[a].settings), ...Object.keys(board.trackers[b].settings)])].map((name) => [name, board.trackers[a].settings[name] ?? "default", board.trackers[b].settings[name] ?? "default"]).filter(([, one, other]) => one !== other) : [];
-  byId("differences").replaceChildren(settings.length ? rowsOf(["setting that differs", "A", "B"], settings) : make("p", { className: "caption", textContent: "Neither has other settings than the other: both run with those that they ship with, or with the same ones." }));
+  byId("differences").replaceChildren(settings.length ? rowsOf(["setting that differs", "A", "B"], settings) : make("p", { className: "caption", textContent: "Both ran with their default settings, or with the same changes of them." }));
   byId("hidden-pairs").textContent = pairs.length > MOST ? ` Drawn are ${MOST} of ${pairs.length} sequences; the sentence counts all that rank.` : "";
   await draw(byId("dumbbells"), dumbbells(board, pairs, names));
   const has = (pair) => pair.cells.every((cell) => board.runs.some((run) => run[0] === cell[6] && run[5] & 1));
