@@ -69,7 +69,7 @@ def explanation(board: Board) -> str:
 
 
 def reservations(rows: Sequence[RunRow]) -> list[str]:
-    """What somebody should say, or wait for, who quotes numbers of these runs; in sentences."""
+    """What speaks against quoting numbers of these runs, or has to be said with them; in sentences."""
     cells = {(row.variant_key, row.column_id) for row in rows}
     rendered = any(row.sequence.id.startswith("synthetic/") for row in rows)
     computers = {row.machine.cpu for row in rows if row.machine}
