@@ -48,7 +48,7 @@ def test_figures_are_plotly_figures(made):
         for figure in json.loads(text).values():
             assert go.Figure(figure).data and figure["layout"]["height"] > 100
             found += 1
-    assert found >= 7  # ratio, speed, masks, and four of the paper
+    assert found >= 6  # speed, masks, and four of the paper
     for path in (folder / "data").glob("run-*.js"):
         run = page_data(folder, path.stem)
         for figure in run["figures"].values():
