@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 from pydantic import Field, create_model
 
@@ -229,7 +229,8 @@ def system(
     """
     title = "".join(word.capitalize() for word in re.findall(r"\w+", name))
     fields: dict[str, Any] = {group: (type(default), default) for group, default in groups.items()}
-    settings: Any = create_model(f"{title}Settings", __base__=base, __module__=__name__, **fields)
+    made = create_model(f"{title}Settings", __base__=base, __module__=__name__, **fields)
+    settings = cast("type[UnfilteredSystemSettings]", made)
     settings.filters = tuple(filters)
     globals()[settings.__name__] = settings  # pickle looks it up there
     stated = sentences(settings())
