@@ -5,8 +5,6 @@
 Needs the extra: ``pip install '.[gtsam]'``.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -12,8 +12,6 @@ Bars: less than 1 MB of growth a 1,000 frames after the first fifth, and in the 
 (processor time, median of a tenth of the frames) that it was at a tenth of the way.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -23,8 +23,6 @@ Published class, from the product's own table of reported numbers, by the same r
 and clear if exactly one of the two holds. Sim(3)-aligned numbers and ablations do not count.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterable

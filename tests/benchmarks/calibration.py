@@ -9,8 +9,6 @@ shutter was taken for a rolling one. `--readouts` renders the `fast_*` families 
 26 ms, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there is named.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

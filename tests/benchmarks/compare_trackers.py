@@ -14,8 +14,6 @@ cores, which is the only limit that ORB-SLAM3's own threads know. Vary nothing b
 load hits both alike because the runs alternate.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json

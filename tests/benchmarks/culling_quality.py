@@ -17,8 +17,6 @@ the back end did not get, after the starvation guard. ATE is the online one in m
 sequences.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -9,8 +9,6 @@ is an id or a folder; masks are those of `segmentation.source`. `--write` puts t
 which `dynslam-bench trackers info` shows.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

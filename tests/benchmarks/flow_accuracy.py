@@ -6,8 +6,6 @@ Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by 
 the KITTI pair. Every row uses the default settings but for what it names.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 

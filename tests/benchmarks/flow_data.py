@@ -1,7 +1,5 @@
 """Image pairs with known correspondences for the flow measurements: exact warps, real frames with depth and pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

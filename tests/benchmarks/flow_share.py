@@ -8,8 +8,6 @@ to `emfoa+propagation` with Student's 95 % interval over the units. A unit is a 
 offsets averaged.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable, Sequence
 

@@ -8,8 +8,6 @@
 for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import time

@@ -9,8 +9,6 @@ what the study's best trial takes back of that. The loss is looked at first: whe
 there is nothing to recover, and no study is run. Scenes are rendered; results are kept, so that a second call goes on.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import time

@@ -15,8 +15,6 @@ Bars: every disturbed folder, gone on from, holds the same runs with the same tr
 gone within 2 s; nothing left in shared memory.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

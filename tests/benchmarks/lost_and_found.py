@@ -14,8 +14,6 @@ the known ones all are `ok` within ten frames. A frame that is `ok` is wrong if 
 from the true one in the world of the first frame, beyond what it was before the loss; a black one always is.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

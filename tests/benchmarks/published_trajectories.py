@@ -6,8 +6,6 @@ The folder holds ``rgbd-vo/SEQUENCE/`` (EdwardjkFeng/rgbd-vo, commit 49ff0b8): t
 the author's tables of ``evo_ape -as`` as ``published.csv``. It holds ``authors/NAME/`` too: single trajectories.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 from pathlib import Path

@@ -6,8 +6,6 @@
 `dynslam-bench run emfoa-oft 'synthetic/walking_xyz?scene=100' --frames 0:60`. Headless Chromium draws both.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -11,8 +11,6 @@ the culled features of every frame, and the names of the stats. Bits depend on p
 recorded too: on another machine, record at the revision to compare with first.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

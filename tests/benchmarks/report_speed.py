@@ -10,8 +10,6 @@ first contentful paint and to the load event, with the bytes that were loaded un
 Bars for 2000 runs on two cores: made in 30 s, opened in 1 s, 3 MB loaded first.
 """
 
-from __future__ import annotations
-
 import argparse
 import resource
 import shutil

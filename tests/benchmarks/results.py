@@ -20,8 +20,6 @@ What follows that line, up to the next heading, is replaced by what the commands
 written again, `data` stays as it is. A new table is a section without the line: ``--data`` says what it is made of.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import os

@@ -4,8 +4,6 @@ Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--thread
 medians; user CPU time stands beside them, because wall times of a busy machine mean little.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

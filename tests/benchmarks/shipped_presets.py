@@ -10,8 +10,6 @@ named. Ratios are preset : default, with 95 % intervals over scenes (over starts
 worse" is said where the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in
 anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes hundreds of runs."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

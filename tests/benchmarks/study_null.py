@@ -10,8 +10,6 @@ fifteen lines of plain Optuna with the same runs and the same bound at the end. 
 extended twice. A run is one of a configuration on one instance; `all` are those of baseline, choice and judgement too.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

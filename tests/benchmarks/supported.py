@@ -12,8 +12,6 @@ there, too, as the project's workflow does. `--into` keeps the environments, and
 Bar: every pair resolves, compiles and passes.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

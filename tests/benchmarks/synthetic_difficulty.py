@@ -10,8 +10,6 @@ of everything while it moves) and fills their pixels smoothly from outside, so t
 `persons` does so with people alone, which is what a class label gives.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

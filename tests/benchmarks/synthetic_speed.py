@@ -5,8 +5,6 @@ Usage: python tests/benchmarks/synthetic_speed.py [ID] [--frames 120] [--threads
 Prints wall and CPU time a frame: on a machine shared with others only the CPU time says something.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time

@@ -1,8 +1,11 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
 import json
+import os
 import re
 import shutil
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -12,9 +15,13 @@ import pytest
 from cli_helpers import one_line
 from envs_toys import write_folder
 
-from dynslam_bench.cli import output, running, runs
+from dynslam_bench.cli import app, demo, output, running, runs
+from dynslam_bench.cli.demo import compiled_ahead, tell
+from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
+from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.trajectory_files import read_tum
+from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.runs import RunEvent, RunSpec
 from dynslam_bench.segmentation.networks import checkpoints
 
@@ -63,21 +70,6 @@ def test_a_folder_whose_camera_is_not_known_names_the_choices(cli, walk, tmp_pat
         assert cli(*command, "--camera", "cam.toml")[0] == 0
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("mask-rcnn", "--set", "segmentation.source=onnx:none.onnx"),
-        ("mask-rcnn", "--set", "segmentation.source=oracle"),
-        ("replay:none.txt",),
-        ("orb-slam2", "--map", "none.npz"),
-        ("orb-slam2", "--localisation-only"),
-    ],
-)
-def test_a_mistake_is_one_line_and_leaves_nothing(cli, walk, tmp_path, arguments):
-    code, _, err = cli("run", arguments[0], walk, *arguments[1:])
-    assert code == 1 and one_line(err) and not list(tmp_path.glob("results/runs/*"))
-
-
 @pytest.fixture
 def fetched(tmp_path, monkeypatch):
     """Where the COCO checkpoint lies once it is fetched; a copy of the embedded network takes its place."""
@@ -99,8 +91,8 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetche
         assert code == 1 - agrees and "170 MB" in err and fetched.is_file() is agrees
     fetched.unlink()
     monkeypatch.setattr(running, "is_interactive", lambda: False)
-    assert cli(*command, "--frames", "0:3", "--yes")[0] == 0 and fetched.is_file()
-    assert cli(*command, "--frames", "0:2")[0] == 0, "nobody is asked again"
+    assert cli(*command, "--frames", "0:2", "--yes")[0] == 0 and fetched.is_file()
+    assert cli(*command, "--frames", "0:2", "--seed", "1")[0] == 0, "nobody is asked again"
 
 
 def test_bench_has_limits(cli, walk, tmp_path):
@@ -205,3 +197,141 @@ def test_progress_names_what_is_written_behind_the_last_frame():
         for done in (8, 9)
     ]
     assert texts[0].endswith(", frame 8 of 9") and texts[1].endswith(", writing trajectories, video.webm, sheet.png")
+
+
+# Ctrl-C, SIGTERM and SIGHUP in long commands: they stop at once, say how to go on, and exit with the shell's code.
+
+
+HERE = Path(__file__).resolve().parents[1]
+SUITE = (
+    "trackers = [{tracker!r}]\nsequences = [{folder!r}]\nframes = [0, 4]\n"
+    '[settings]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
+)
+STUDY = (
+    "tracker = {tracker!r}\ntune = [{folder!r}]\ntrials = 4\nseeds = [0]\noffsets = [0]\n"
+    '[space.fixed]\nmode = "hang"\nat = 0\npids = {pids!r}\n'
+)
+
+
+def attentive():
+    """Programs that a script starts in the background ignore Ctrl-C, below `nohup` the end of the terminal too."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.mark.parametrize(
+    ("verb", "text", "number"),
+    [("bench", SUITE, signal.SIGHUP), ("bench", SUITE, signal.SIGTERM), ("tune run", STUDY, signal.SIGINT)],
+)
+def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
+    tracker = tmp_path / "waits.py"
+    tracker.write_text(
+        f"import sys; sys.path.insert(0, {str(HERE / 'runs')!r})\n"
+        "from pathlib import Path\n"
+        "from dynslam_bench.core.settings import tunable\n"
+        "from dynslam_bench.trackers import TrackerSpec\n"
+        "import hostile, os\n"
+        "class WaitsSettings(hostile.HostileSettings):\n"
+        "    patience: float = tunable(0.5, low=0.1, high=1.0, meaning='of no use')\n"
+        "class Waits(hostile.Hostile):\n"
+        "    def act(self, mode):\n"
+        "        self.note(os.getpid())\n"
+        "        super().act(mode)\n"
+        "SPEC = TrackerSpec('waits', f'{__file__}:Waits', 'Waits', settings=WaitsSettings)\n"
+    )
+    pids = tmp_path / "pids"
+    values = {"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}
+    (tmp_path / "what.toml").write_text(text.format(**values).replace("'", '"'))
+    command = [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"]
+    program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive)
+    try:
+        deadline = time.monotonic() + 300
+        while not (pids.is_file() and pids.read_text().endswith("\n")):
+            assert program.poll() is None, program.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        program.send_signal(number)
+        began = time.monotonic()
+        _, err = program.communicate(timeout=60)
+        took = time.monotonic() - began
+    finally:
+        program.kill()
+    assert program.returncode == 128 + number and "the same command goes on from there" in err, err
+    assert took < 2 + 10 * _crowded(), f"{took:.1f} s"
+    assert not Path(f"/proc/{pids.read_text().split()[0]}").exists()
+    assert not list(tmp_path.glob("results/runs/*")), "what was interrupted is no outcome"
+
+
+def _crowded():
+    """Whether many processes wait for a processor: two seconds are no measure then."""
+    return float(Path("/proc/loadavg").read_text().split()[0]) > 1.5 * (os.cpu_count() or 1)
+
+
+@pytest.mark.parametrize("error", [ValueError("schema: KeyboardInterrupt"), RunError("cannot load")])
+def test_an_error_that_a_library_makes_of_an_interrupt_is_an_interrupt(monkeypatch, capsys, error):
+    def fails(**_):
+        raise error
+
+    monkeypatch.setattr(app, "app", fails)
+    monkeypatch.setattr(app, "interrupted", lambda: True)
+    with pytest.raises(SystemExit, match="130"):
+        app.start(["eval"])
+    assert capsys.readouterr().err.startswith("interrupted")
+
+
+# The demonstration: its closing sentences, and kernels compiled ahead.
+
+
+def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene=100&frames=100") -> RunRow:
+    return RunRow.model_validate({
+        "run_id": digest([tracker, sequence], 16), "status": "ok", "n_frames": 100, "n_tracked": 100, "coverage": 1.0,
+        "tracker": {"id": tracker, "label": tracker},
+        "sequence": {"id": sequence, "part": "0" * 16, "frames": 100, "duration_s": 3, "fps": 30, "ground_truth": True,
+                     "block": "0" * 16},
+        "protocol_id": "p", "protocol_digest": "d", "hold_last_pose_ate_m": ate_m,
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("culled_m", "verdict"), [(0.004, "5.0 times smaller"), (0.018, ""), (0.06, "3.0 times larger")]
+)
+def test_the_verdict_is_that_of_the_numbers(culled_m: float, verdict: str) -> None:
+    rows = [row("orb-slam2", 0.02), row("mask-rcnn", culled_m), row("never-move", 0.1)]
+    first, *rest = tell([*rows, row("orb-slam2", 0.003, "synthetic/sitting_xyz?scene=104")])
+    assert "20.0 mm" in first and f"{1e3 * culled_m:.1f} mm" in first and verdict in first
+    assert ("times" in first) == bool(verdict) and len(rest) == 1, "no sentence where nothing was culled"
+
+
+NOTHING_IS_LEFT = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from dynslam_bench.cli.demo import compile_kernels
+from dynslam_bench.envs import SlamEnv
+from dynslam_bench.testing import CornerSequence
+
+def ready():
+    modules = [module for name, module in sys.modules.items() if name.startswith("dynslam_bench")]
+    kernels = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
+    return {(kernel.py_func.__qualname__, signature) for kernel in kernels for signature in kernel.signatures}
+
+compile_kernels()
+before = ready()
+env = SlamEnv(CornerSequence(12), "emfoa-oft", settings={"segmentation.source": "oracle"})
+env.reset(seed=0)
+while not env.step(env.neutral_action)[3]:
+    pass
+print(len(before) > 20, sorted(name for name, _ in ready() - before))
+"""
+
+
+def test_nothing_is_left_for_the_first_run_to_compile() -> None:
+    done = subprocess.run([sys.executable, "-c", NOTHING_IS_LEFT], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["True []"], done.stdout + done.stderr
+
+
+def test_the_compiling_process_ends_when_rendering_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demo.subprocess, "Popen", lambda *_, popen=subprocess.Popen, **__: popen(["sleep", "60"]))
+    began = time.monotonic()
+    with pytest.raises(KeyError), compiled_ahead():
+        raise KeyError
+    assert time.monotonic() - began < 30

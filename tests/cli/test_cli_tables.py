@@ -1,11 +1,19 @@
 """What a terminal shows: tables as wide as it is, no Markdown, a leaderboard, grouped help, completion."""
 
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 from cli_helpers import one_line
 
 from dynslam_bench.cli import output, runs
 from dynslam_bench.cli.output import report_table, table
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
+from dynslam_bench.runs import RunSpec, run_many
 
 ROWS = [
     ["run", "tracker", "sequence", "ATE (m)", "masks"],
@@ -111,3 +119,105 @@ def test_published_numbers_are_listed_with_whose_they_are(cli, facts):
     ):
         code, _, err = cli("published", *arguments)
         assert code == 1 and text in one_line(err)
+
+
+# Terminals that cannot show every character: output with question marks, and no traceback.
+
+
+LABEL = "caf\xe9 \u2013 \U0001f600"
+
+
+@pytest.fixture(scope="module")
+def foreign(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results")
+    truth = walk / "groundtruth.txt"
+    done = program(
+        "import", truth, "--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online", "--results", folder
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def program(*arguments: object, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-m", "dynslam_bench", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, env={**os.environ, **environment}, check=False)
+
+
+ENCODINGS = {
+    "latin-1": {"PYTHONIOENCODING": "latin-1"},
+    "ascii": {"PYTHONIOENCODING": "ascii"},
+    "C": {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_report_is_shown_on_every_terminal(encoding: str, foreign: Path, tmp_path: Path) -> None:
+    done = program("report", foreign, "-o", tmp_path, **ENCODINGS[encoding])
+    assert done.returncode == 0 and not done.stderr
+    assert "caf" in done.stdout.decode("latin-1") and b"?" in done.stdout
+    assert LABEL in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(("--help",), 0), (("run", "nobody", "nowhere\u2013"), 1)])
+def test_help_and_errors_are_shown_too(arguments: tuple[str, ...], code: int) -> None:
+    done = program(*arguments, **ENCODINGS["ascii"])
+    assert done.returncode == code and b"Traceback" not in done.stderr and (done.stdout or done.stderr)
+
+
+# Records that somebody else made, on a terminal: no escape sequence, no traceback, and the others are shown.
+
+
+HOSTILE = "\x1b[2J\x1b]0;owned\x07\u202egnp\n"
+
+
+@pytest.fixture(scope="module")
+def stored(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs, the latest of which holds escape sequences in all of its texts."""
+    folder = tmp_path_factory.mktemp("results")
+    specs = [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)]
+    _, last = run_many(specs, results=folder)
+    path = folder / "runs" / last.run_id / "run.json"
+    record = json.loads(path.read_text())
+    record |= {"reason": HOSTILE, "notes": [HOSTILE], "command": [HOSTILE], "overrides": {HOSTILE: HOSTILE}}
+    record["tracker"] |= {"id": HOSTILE, "label": HOSTILE}
+    record["sequence"] |= {"id": HOSTILE}
+    path.write_text(json.dumps(record))
+    return folder
+
+
+@pytest.fixture
+def results(stored: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(stored, tmp_path / "results", symlinks=True)
+
+
+def hostile_run(results: Path) -> str:
+    return next(path.parent.name for path in results.glob("runs/*/run.json") if "owned" in path.read_text())
+
+
+def harmless(text: str) -> bool:
+    return not set(text) & {"\x1b", "\x07", "\u202e"}
+
+
+@pytest.mark.parametrize("arguments", [("list",), ("show", "RUN"), ("list", "--json"), ("show", "RUN", "--json")])
+def test_names_are_shown_as_text(cli, results: Path, arguments: tuple[str, ...]) -> None:
+    run = hostile_run(results)
+    code, out, err = cli("runs", *[run if word == "RUN" else word for word in arguments], "--results", results)
+    assert code == 0 and harmless(out + err) and "owned" in out
+
+
+def test_errors_are_shown_as_text(cli, results: Path) -> None:
+    code, out, err = cli("runs", "show", HOSTILE, "--results", results)
+    assert code == 1 and harmless(out + err) and err.startswith("error: there is no run")
+    assert err.count("\n") == 1
+
+
+def test_one_unreadable_record_is_named_and_the_others_are_listed(cli, results: Path) -> None:
+    (results / "runs" / hostile_run(results) / "run.json").write_bytes(b"\xff\xfe")
+    code, out, err = cli("runs", "list", "--results", results)
+    assert code == 0 and "never-move" in out
+    assert err.startswith("unreadable: ") and err.count("\n") == 1 and "is not a text file" in err
+
+
+def test_half_characters_of_the_command_line_end_in_one_line(cli, results: Path) -> None:
+    code, _, err = cli("run", "caf\udce9", "synthetic/walking_xyz", "--results", results)
+    assert code == 1 and "caf\\udce9" in err and err.count("\n") == 1

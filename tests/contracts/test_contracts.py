@@ -18,15 +18,29 @@ from dynslam_bench.contracts.checks import (
 )
 from dynslam_bench.geometry import se3
 
-HEAVY = ("torch", "cv2", "numba", "scipy", "gymnasium", "optuna", "pandas")
+ALL = ("torch", "cv2", "numba", "scipy", "gymnasium", "optuna", "pandas")
+LIGHT = {
+    "import dynslam_bench": (*ALL, "numpy", "typer", "pydantic"),
+    "import dynslam_bench.contracts": ALL,
+    "import dynslam_bench.sequences.synthetic": ("numba", "cv2", "torch"),
+    "import dynslam_bench.testing.pytest_plugin": ("cv2", "torch"),
+    "import dynslam_bench.segmentation.build_segmenter": ("cv2", "torch"),
+    "import dynslam_bench.segmentation.training.settings, dynslam_bench.segmentation.networks.checkpoints": (
+        "cv2",
+        "torch",
+    ),
+    "from dynslam_bench.trackers import TRACKERS; assert len(TRACKERS.all()) > 30": ("torch", "cv2", "gtsam", "numba"),
+}
+"""What people run often, and what it may not load."""
+ROOT = Path(__file__).resolve().parents[2]
 FRAME = Frame(3, 0.1, np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6), np.float32))
 
 
-def test_importing_the_contracts_loads_nothing_heavy() -> None:
-    code = f"import sys, dynslam_bench.contracts; print([name for name in {HEAVY} if name in sys.modules])"
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True)
-    assert done.stdout.strip() == "[]"
+@pytest.mark.parametrize("code", LIGHT)
+def test_what_is_run_often_loads_nothing_heavy(code: str) -> None:
+    command = f"{code}; import sys; print([name for name in {LIGHT[code]} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout == "[]\n"
 
 
 def given(**changes: object) -> TrackResult:

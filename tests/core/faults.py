@@ -5,8 +5,6 @@ operation and once more to go on from there. What is disturbed is a fork of this
 the tests: late in a session a fork of pytest's own process takes fifty times as long.
 """
 
-from __future__ import annotations
-
 import builtins
 import errno
 import functools

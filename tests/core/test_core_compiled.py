@@ -1,7 +1,5 @@
 """How kernels are compiled: one way for all rooms, which needs no folder to cache in."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numba

@@ -1,7 +1,5 @@
 """Files, the stage cache and downloads: whole or absent, under a fault at every file operation and odd addresses."""
 
-from __future__ import annotations
-
 import contextlib
 import http.server
 import os

@@ -1,7 +1,5 @@
 """Constructed scenes: exact flow and depth of static and moving points seen by a moving camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """What pages and docstrings name in backticks, and everything that the code knows by a name."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

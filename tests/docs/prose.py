@@ -3,8 +3,6 @@
 python tests/docs/prose.py      # words, median and longest sentence of every page
 """
 
-from __future__ import annotations
-
 import re
 import statistics
 from pathlib import Path

@@ -1,11 +1,12 @@
 """What the distribution holds: every package, and nothing that is none."""
 
-from __future__ import annotations
-
+import re
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -39,3 +40,22 @@ def test_the_recipe_names_what_the_package_needs(project: dict) -> None:
     assert len(needed) > 10
     wanted = [f"- {other.get(name, name)} >={number}" for name, number in zip(needed, versions, strict=True)]
     assert [line for line in wanted if f"    {line}\n" not in recipe] == []
+
+
+# The hosted workflows, as far as they can be read here: steps are shell, and name files that exist.
+
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+A_FILE = re.compile(r"(?<![\w./-])(?:tests|\.ci)/[\w./-]+")
+
+
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda workflow: workflow.stem)
+def test_every_command_is_shell_and_names_files_that_exist(workflow: Path) -> None:
+    jobs = yaml.safe_load(workflow.read_text(encoding="utf-8"))["jobs"]
+    commands = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    assert commands
+    for command in commands:
+        plain = re.sub(r"\$\{\{.*?\}\}", "value", command)
+        checked = subprocess.run(["bash", "-n", "-c", plain], capture_output=True, text=True)
+        assert checked.returncode == 0, checked.stderr
+        assert [name for name in A_FILE.findall(plain) if not (ROOT / name).exists()] == []

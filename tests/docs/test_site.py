@@ -1,7 +1,5 @@
 """The documentation site: built strictly, complete, and nothing in it is fetched from elsewhere."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,9 +1,9 @@
 """The pages' blocks of code: Python is run as it stands but for the lengths of sequences, TOML is read by readers."""
 
-from __future__ import annotations
-
+import ast
 import contextlib
 import doctest
+import importlib
 import io
 import os
 import re
@@ -13,12 +13,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from documented_names import PAGES, ROOT
+from documented_names import PAGES, ROOT, sources
 
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.core.toml import parse_toml
 from dynslam_bench.sequences.cameras import read_camera
 from dynslam_bench.suites import load_suite
+from dynslam_bench.testing.template import write_tracker_template
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import read_study
 
@@ -155,3 +156,49 @@ def test_the_entry_point_on_the_page_is_of_a_group_that_is_read() -> None:
     (text,) = blocks("docs/reference/plugins.md", "toml")
     (group,) = parse_toml(text, "docs/reference/plugins.md")["project"]["entry-points"]
     assert group == f"dynslam_bench.{TRACKERS.kind}"
+
+
+# The examples in docstrings are true.
+
+
+def module_of(file: Path) -> str:
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    inside = parts if parts[0] == "dynslam_bench" else ("dynslam_bench", *parts)
+    return ".".join(inside).removesuffix(".__init__")
+
+
+WITH_EXAMPLES = [module_of(file) for file in sources() if ">>> " in file.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_examples_give_what_they_say(name: str) -> None:
+    outcome = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)
+    assert outcome.attempted > 0 and outcome.failed == 0
+
+
+# What the pages and the template of a new tracker import from this package: contracts, settings and errors.
+
+
+PLUGIN_PAGES = ("reference/plugins.md", "how-to/dataset.md", "how-to/filter.md", "how-to/segmenter.md")
+OPEN = {"dynslam_bench.contracts", "dynslam_bench.core.settings", "dynslam_bench.core.errors"}
+COMPOSING = "dynslam_bench.trackers.systems.composition"
+"""Puts filters on our back end: the one thing that a plug-in may take from us that is no contract."""
+
+RULES = "dynslam_bench.culling.semantic"
+"""The filter that an own one is put beside."""
+
+
+def imports(code: str) -> list[tuple[str, str]]:
+    """Module and name of everything that a text takes from this package."""
+    nodes = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
+    taken = [(node.module or "", alias.name) for node in nodes for alias in node.names]
+    return [(module, name) for module, name in taken if module.startswith("dynslam_bench")]
+
+
+def test_plug_ins_import_from_the_contracts_only(tmp_path: Path) -> None:
+    page = "\n".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in PLUGIN_PAGES)
+    texts = re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M)
+    taken = [pair for text in texts for pair in imports(text)]
+    assert len(taken) > 10 and {module for module, _ in taken} <= OPEN | {COMPOSING, RULES}
+    template = imports(write_tracker_template("my-slam", tmp_path).read_text())
+    assert ("dynslam_bench.contracts", "TrackerSpec") in template and {module for module, _ in template} <= OPEN

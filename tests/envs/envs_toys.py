@@ -1,7 +1,5 @@
 """A small world for the tests of environments and runs: a textured plane in TUM layout, and simple trackers."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Mapping
 from dataclasses import replace

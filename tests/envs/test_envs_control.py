@@ -1,7 +1,5 @@
 """Actions and the settings they stand for."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import gymnasium as gym

@@ -1,5 +1,8 @@
 """What must hold whatever the numbers: invariances, statistics, policies, holes, and clear refusals."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from evaluation_walks import moved, noisy, turned, walk
@@ -7,7 +10,9 @@ from evaluation_walks import moved, noisy, turned, walk
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation import (
     PROTOCOLS,
+    OnlineError,
     Protocol,
+    RPESpec,
     compare_masks,
     evaluate,
     evaluate_files,
@@ -16,14 +21,15 @@ from dynslam_bench.evaluation import (
     pose_errors,
     static_camera,
 )
-from dynslam_bench.evaluation.alignment import align
+from dynslam_bench.evaluation.alignment import RELIABLE_DEG, align
 from dynslam_bench.evaluation.ape import ate_rmse_m
 from dynslam_bench.evaluation.comparison import nearest_match
+from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.rpe import segment_errors
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.rigs import bonn_as_droid_w, bonn_camera
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
 
 TRUTH = walk()
 ESTIMATE = noisy(TRUTH)
@@ -296,3 +302,198 @@ def test_masks_without_anything_are_not_scored_and_shapes_must_agree():
     assert (counts.iou, counts.precision, counts.recall) == (None, None, None)
     with pytest.raises(EvaluationError, match=r"\(3, 3\) and \(2, 3\)"):
         compare_masks(nothing, nothing[:2])
+
+
+# Rotational errors on almost straight paths: a warning there, none on ordinary paths with ordinary errors.
+
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def straight(side_m: float, frames: int = 300) -> np.ndarray:
+    """Poses ``[N, 4, 4]`` along 1.5 m of a line that swings to the sides by so much."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    u = np.linspace(0, 1, frames)
+    poses[:, :3, 3] = np.stack([1.5 * u, side_m * np.sin(6 * u), side_m * np.cos(4 * u)], axis=1)
+    return poses
+
+
+def disturbed(poses: np.ndarray, sigma_m: float, seed: int, frames: float = 20.0) -> np.ndarray:
+    """Errors that last for so many frames: a first-order autoregression; orientations are off by 0.5 degrees."""
+    rng = np.random.default_rng(seed)
+    keep = np.exp(-1 / frames)
+    errors = np.zeros((len(poses), 6))
+    for row in range(1, len(poses)):
+        errors[row] = keep * errors[row - 1] + np.sqrt(1 - keep**2) * rng.normal(size=6)
+    errors *= [sigma_m] * 3 + [np.deg2rad(0.5)] * 3
+    return np.array([pose @ se3.exp(error) for pose, error in zip(poses, errors, strict=True)])
+
+
+def judged(truth: np.ndarray, estimate: np.ndarray) -> Evaluation:
+    stamps = np.arange(len(truth)) / 30.0
+    return evaluate(Trajectory(stamps, estimate), Trajectory(stamps, truth))
+
+
+@pytest.mark.parametrize("sigma_m", [0.003, 0.03])
+def test_a_straight_path_gives_the_warning(sigma_m: float) -> None:
+    found = [judged(truth, disturbed(truth, sigma_m, seed)) for seed in range(12) for truth in [straight(0.001)]]
+    wrong = [each for each in found if each.metrics["ape_rot_rmse_deg"] > 15]
+    assert len(wrong) >= 6, "the case is there"
+    for each in wrong:
+        assert each.alignment.uncertainty_deg > RELIABLE_DEG
+        assert any("ape_rot) is unreliable" in line for line in each.diagnostics)
+        assert each.metrics["ate_rmse_m"] < 3 * sigma_m, "while the positions fit"
+
+
+def path_of(name: str) -> np.ndarray:
+    file = SHARED / name / "groundtruth.txt"
+    if not file.is_file():
+        pytest.skip(f"{file} is not here")
+    poses = read_tum(file).T_world_cam
+    return poses[:: max(1, len(poses) // 300)]
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma_m"),
+    [
+        ("tum/rgbd_dataset_freiburg1_xyz", 0.002),
+        ("bonn/rgbd_bonn_crowd", 0.003),
+        ("synthetic/walking_xyz?scene=100-3f02d1f6", 0.01),
+        ("synthetic/walking_halfsphere?scene=100-3f02d1f6", 0.02),
+    ],
+)
+def test_ordinary_paths_do_not(name: str, sigma_m: float) -> None:
+    truth = path_of(name)
+    for seed in range(6):
+        found = judged(truth, disturbed(truth, sigma_m, seed))
+        assert found.alignment.uncertainty_deg <= RELIABLE_DEG
+        assert not any("unreliable" in line for line in found.diagnostics)
+        assert found.metrics["ape_rot_rmse_deg"] < 10
+
+
+def test_the_uncertainty_is_that_of_repetition() -> None:
+    """Where errors are small, it is the spread of the rotations that independent errors give."""
+    truth = straight(0.1)
+    fits = [align(disturbed(truth, 0.005, seed, frames=1.0), truth, "se3") for seed in range(40)]
+    turned = se3.with_rotation(np.tile(np.eye(4), (len(fits), 1, 1)), np.array([fit.rotation for fit in fits]))
+    spread = np.sqrt((np.rad2deg(se3.rotation_angle(turned)) ** 2).mean())
+    assert 0.6 * spread < np.median([fit.uncertainty_deg for fit in fits]) < 1.8 * spread
+
+
+def test_an_exact_estimate_and_a_short_one() -> None:
+    assert align(straight(0.05), straight(0.05), "se3").uncertainty_deg == pytest.approx(0.0, abs=1e-5)
+    assert align(straight(0.05, 23), straight(0.05, 23), "se3").uncertainty_deg == pytest.approx(0.0, abs=1e-5)
+    assert align(straight(0.05, 2), straight(0.05, 2), "se3").uncertainty_deg is None
+    assert align(straight(0.05), straight(0.05), "origin").uncertainty_deg is None
+
+
+# The causal pose error: joined at the first frame with both, honest about holes, and quitting never pays.
+
+
+def estimate_of(truth, seed=1):
+    rng = np.random.default_rng(seed)
+    return se3.exp(rng.normal(size=6)) @ (truth.T_world_cam @ se3.exp(rng.normal(0, 0.01, (len(truth), 6))))
+
+
+SHORT = walk(n=60)
+POSES = estimate_of(SHORT)
+
+
+def run(error, truth, poses, ok):
+    return [error.update(t, p if o else None) for t, p, o in zip(truth.timestamps, poses, ok, strict=True)]
+
+
+def test_cumulative_error_is_the_origin_aligned_ape():
+    samples = run(OnlineError(SHORT), SHORT, POSES, [True] * len(SHORT))
+    result = evaluate(Trajectory(SHORT.timestamps, POSES), SHORT, Protocol(id="x", alignment="origin"))
+    assert np.sqrt(np.mean([s.trans_m**2 for s in samples])) == pytest.approx(result.metrics["ate_rmse_m"], abs=1e-12)
+    assert max(s.rot_deg for s in samples) == pytest.approx(result.metrics["ape_rot_max_deg"], abs=1e-9)
+    assert samples[0].trans_m == pytest.approx(0, abs=1e-12)
+    assert samples[0].frame_trans_m is None
+
+
+def test_frame_to_frame_error_is_eq_26_over_one_frame():
+    samples = run(OnlineError(SHORT), SHORT, POSES, [True] * len(SHORT))
+    protocol = Protocol(id="x", rpe=(RPESpec(delta=1, unit="f", pairs="all"),))
+    metrics = evaluate(Trajectory(SHORT.timestamps, POSES), SHORT, protocol).metrics
+    frame = np.array([s.frame_trans_m for s in samples[1:]])
+    assert np.sqrt((frame**2).mean()) == pytest.approx(metrics["rpe_1f_trans_rmse_m"], abs=1e-12)
+    rotation = np.array([s.frame_rot_deg for s in samples[1:]])
+    assert rotation.max() == pytest.approx(metrics["rpe_1f_rot_max_deg"], abs=1e-9)
+
+
+def test_a_lost_frame_counts_as_the_last_tracked_pose_repeated():
+    ok = np.ones(len(SHORT), dtype=bool)
+    ok[20:30] = False
+    samples = run(OnlineError(SHORT), SHORT, POSES, ok)
+    way = np.linalg.norm((se3.inverse(SHORT.T_world_cam[:-1]) @ SHORT.T_world_cam[1:])[:, :3, 3], axis=1)
+    for i in range(20, 30):
+        assert samples[i].frame_trans_m == pytest.approx(way[i - 1], abs=1e-12)
+    assert [s.lost_way_m for s in samples[19:32]] == pytest.approx([0, *np.cumsum(way[19:29]), way[19:29].sum(), 0])
+    held = hold(Trajectory(SHORT.timestamps, POSES).select(ok), SHORT.timestamps)
+    expected = run(OnlineError(SHORT), SHORT, held.T_world_cam, [True] * len(SHORT))
+    assert [s.trans_m for s in samples] == pytest.approx([s.trans_m for s in expected], abs=1e-12)
+    jumps = [[s.frame_trans_m for s in found[1:]] for found in (samples, expected)]
+    assert jumps[0] == pytest.approx(jumps[1], abs=1e-12)
+
+
+def test_a_predicted_pose_of_a_lost_frame_counts_for_nothing():
+    ok = np.arange(len(SHORT)) < 25
+    without = [pose if good else None for pose, good in zip(POSES, ok, strict=True)]
+    assert run(OnlineError(SHORT), SHORT, POSES, ok) == run(OnlineError(SHORT), SHORT, without, ok)
+
+
+def test_a_tracker_that_never_starts_stands_at_the_first_true_pose():
+    samples = run(OnlineError(SHORT), SHORT, [None] * len(SHORT), [False] * len(SHORT))
+    way = np.linalg.norm(SHORT.positions - SHORT.positions[0], axis=1)
+    assert [s.trans_m for s in samples] == pytest.approx(way.tolist(), abs=1e-12)
+
+
+def test_joined_at_the_first_frame_that_has_both():
+    samples = run(OnlineError(SHORT), SHORT, POSES, np.arange(len(SHORT)) >= 5)
+    assert samples[5].trans_m == pytest.approx(0, abs=1e-12)
+    joined = run(OnlineError(SHORT.select(slice(10, None))), SHORT, POSES, [True] * len(SHORT))
+    assert joined[:10] == [None] * 10
+    assert joined[10].trans_m == pytest.approx(0, abs=1e-12)
+    assert joined[10].frame_trans_m is None
+    assert joined[11].frame_trans_m is not None
+
+
+def test_holes_give_none_and_the_pose_goes_on():
+    hole = SHORT.select(np.r_[0:20, 30 : len(SHORT)])
+    whole = run(OnlineError(SHORT), SHORT, POSES, [True] * len(SHORT))
+    samples = run(OnlineError(hole), SHORT, POSES, [True] * len(SHORT))
+    assert samples[20:30] == [None] * 10
+    assert samples[30].frame_trans_m is None
+    assert samples[30].trans_m == pytest.approx(whole[30].trans_m, abs=1e-12)
+    assert replace(samples[31], way_m=0.0) == replace(whole[31], way_m=0.0)
+
+
+def test_the_true_way_goes_straight_across_holes():
+    seen = np.r_[0:20, 30 : len(SHORT)]
+    samples = run(OnlineError(SHORT.select(seen)), SHORT, estimate_of(SHORT), [True] * len(SHORT))
+    steps = np.linalg.norm(np.diff(SHORT.positions[seen], axis=0), axis=1)
+    ways = [samples[index].way_m for index in seen]
+    assert ways == pytest.approx([0.0, *np.cumsum(steps)], abs=1e-12)
+    assert ways[-1] < run(OnlineError(SHORT), SHORT, estimate_of(SHORT), [True] * len(SHORT))[-1].way_m
+
+
+def test_without_ground_truth_there_is_no_error():
+    truth = walk(n=5)
+    for ground_truth in (None, truth.select(slice(0, 0))):
+        assert run(OnlineError(ground_truth), truth, truth.T_world_cam, [True] * 5) == [None] * 5
+
+
+def test_causal_and_repeatable():
+    error = OnlineError(SHORT)
+    whole = run(error, SHORT, POSES, [True] * len(SHORT))
+    error.reset()
+    other = POSES.copy()
+    other[30:] = np.eye(4)
+    assert run(error, SHORT, other, [True] * len(SHORT))[:30] == whole[:30]
+
+
+def test_the_tolerance_is_strict():
+    truth = Trajectory(np.array([0.0, 1.0]), np.tile(np.eye(4), (2, 1, 1)))
+    assert OnlineError(truth, max_dt=0.5).update(0.5, np.eye(4)) is None
+    assert OnlineError(truth, max_dt=0.5).update(0.499, np.eye(4)) is not None

@@ -1,18 +1,21 @@
 """The example scripts, run as they stand but for fewer frames."""
 
-from __future__ import annotations
-
+import ast
+import json
 import runpy
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
-from notebooks import EXAMPLES
 
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TRACKERS
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
 def main_of(script: str):
@@ -55,3 +58,66 @@ def test_ppo_trains_and_is_judged(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("stable_baselines3", reason="the extra [rl] is not installed")
     main_of("ppo.py")(8, frames=4, scenes=1)
     assert "default settings:" in (text := capsys.readouterr().out) and "after 8 steps" in text
+
+
+# The notebooks run from the first cell to the last, on less data, and are stored without outputs.
+
+
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "examples" / "notebooks").glob("*.ipynb"))
+SHORTER = {
+    "leaderboard": {"FRAMES = 60": "FRAMES = 4", "range(100, 106)": "range(100, 102)", ', "mask-rcnn"': ""},
+    "culling": {},
+    "study": {"FRAMES, ROOMS, TRIALS = 40, 6, 12": "FRAMES, ROOMS, TRIALS = 8, 1, 2"},
+}
+SHOWN = {
+    "leaderboard": ["never move", "droid-w/v1", "'ok': 4"],
+    "culling": ["epipolar_f_judged", "precision 70%, recall 35%"],
+    "study": ["features.fast_threshold", "default"],
+}
+"""Texts in the outputs of a notebook, from its first cells to its last one."""
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
+def test_they_hold_no_outputs(notebook: Path) -> None:
+    code = [cell for cell in cells(notebook) if cell["cell_type"] == "code"]
+    assert len(code) >= 5
+    assert [(cell["outputs"], cell["execution_count"]) for cell in code] == [([], None)] * len(code)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
+def test_they_run(
+    notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shown = play(notebook, SHORTER[notebook.stem])
+    output = capsys.readouterr().out + "".join(v.to_json() if hasattr(v, "to_json") else repr(v) for v in shown)
+    output = output.replace("\\/", "/")  # as JSON writes it
+    assert [text for text in SHOWN[notebook.stem] if text not in output] == []
+
+
+def cells(notebook: Path) -> list[dict[str, Any]]:
+    """All cells of a notebook."""
+    return json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+
+
+def play(notebook: Path, changes: Mapping[str, str]) -> list[Any]:
+    """Run a notebook and return the values that its cells show.
+
+    Args:
+        notebook: The file.
+        changes: Texts of its code and their replacements, for shorter runs; each has to occur.
+    """
+    code = ["".join(cell["source"]) for cell in cells(notebook) if cell["cell_type"] == "code"]
+    for old, new in changes.items():
+        assert any(old in text for text in code), f"{notebook.name} has no {old!r}"
+        code = [text.replace(old, new) for text in code]
+    names: dict[str, Any] = {}
+    shown = []
+    for text in code:
+        *before, last = ast.parse(text).body
+        if not isinstance(last, ast.Expr):
+            before.append(last)
+        exec(compile(ast.Module(before, []), str(notebook), "exec"), names)
+        if isinstance(last, ast.Expr):
+            shown.append(eval(compile(ast.Expression(last.value), str(notebook), "eval"), names))
+    return [value for value in shown if value is not None]

@@ -4,8 +4,6 @@ Rectified directional derivatives, blurred at full resolution with the Gaussian 
 a point on a pattern that is scaled and rotated on demand, each histogram normalised on its own.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates

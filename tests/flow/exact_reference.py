@@ -1,7 +1,5 @@
 """Orientation maps, rotated descriptors and matching costs in plain numpy: the exact reference of the kernels."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

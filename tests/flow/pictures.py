@@ -1,7 +1,5 @@
 """Random textures, warps of them, and grids of points, shared by the tests of the flow."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

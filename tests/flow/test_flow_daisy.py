@@ -1,7 +1,5 @@
 """DAISY: against its definition, against scikit-image, and its behaviour under rotation and scale."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from daisy_reference import describe

@@ -1,7 +1,5 @@
 """The moth-flame equations: against loops that follow the paper, and against stored results."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

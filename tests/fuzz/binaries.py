@@ -1,7 +1,5 @@
 """Readers of images, archives and networks."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import lzma

@@ -1,7 +1,5 @@
 """A reader to attack, and the attack: damaged files for a while, and what escaped."""
 
-from __future__ import annotations
-
 import io
 import os
 import resource
@@ -10,7 +8,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
@@ -72,52 +70,35 @@ WATCHED = 16
 """The memory is measured every so many inputs, which may take longer than the reading."""
 
 
-@dataclass
-class Result:
-    """What came of one reader.
-
-    Attributes:
-        inputs: Inputs that were read.
-        refused: How many of them ended in a documented error; all others were read.
-        findings: What escaped, with the input, one of a kind.
-    """
-
-    inputs: int = 0
-    refused: int = 0
-    findings: dict[str, bytes | None] = field(default_factory=dict)
-
-
-def attack(target: Target, *, seconds: float = float("inf"), inputs: float = float("inf"), seed: int = 0) -> Result:
-    """Read damaged files until the time or the number is reached; the seeds and a missing file come first.
+def attack(target: Target, inputs: int, seed: int = 0) -> dict[str, bytes | None]:
+    """Read so many files, of which the seeds and a missing one come first.
 
     Args:
         target: The reader.
-        seconds: Processor time.
         inputs: Number of inputs.
         seed: Of the damage.
+
+    Returns:
+        What escaped, with the input, one of a kind.
     """
-    random = Random(f"{target.name} {seed}")
-    result = Result()
-    corpus = target.seeds()
+    random, corpus = Random(f"{target.name} {seed}"), target.seeds()
     first: list[bytes | None] = [*corpus, None, b"", b"\xff\xfe\x00", b"{}", b"[" * 100_000]
-    end = time.process_time() + seconds
+    findings: dict[str, bytes | None] = {}
     recent: list[bytes | None] = []
     peak = _peak_mb()
-    while result.inputs < inputs and (time.process_time() < end or result.inputs < len(first)):
-        data = first[result.inputs] if result.inputs < len(first) else _damaged(target, corpus, random)
-        fault, refused = _one(target, data)
-        result.inputs += 1
-        result.refused += refused
+    for number in range(inputs):
+        data = first[number] if number < len(first) else _damaged(target, corpus, random)
+        fault = _one(target, data)
         recent.append(data)
-        if result.inputs < len(first) or result.inputs % WATCHED == 0:
+        if number < len(first) or number % WATCHED == 0:
             before, peak = peak, _peak_mb()
             if peak - before > MOST_MB:
                 data = next((each for each in recent if _is_hungry(target, each)), data)
                 fault = f"takes more than {MOST_MB} MB"
             recent.clear()
         if fault:
-            result.findings.setdefault(fault, data)
-    return result
+            findings.setdefault(fault, data)
+    return findings
 
 
 def _damaged(target: Target, corpus: list[bytes], random: Random) -> bytes:
@@ -127,17 +108,15 @@ def _damaged(target: Target, corpus: list[bytes], random: Random) -> bytes:
     return mutate(data, corpus, random)
 
 
-def _one(target: Target, data: bytes | None) -> tuple[str, bool]:
-    """What escaped (empty for nothing), and whether the input was refused."""
-    began = time.process_time()
-    refused, fault = False, ""
+def _one(target: Target, data: bytes | None) -> str:
+    """What escaped; empty for nothing."""
+    began, fault = time.process_time(), ""
     signal.signal(signal.SIGPROF, _hangs)
     signal.setitimer(signal.ITIMER_PROF, HANGS_S)
     try:
         with tempfile.TemporaryDirectory(prefix="dynslam-fuzz-", dir=_MEMORY, ignore_cleanup_errors=True) as folder:
             target.read(data, Path(folder))
     except target.allowed as error:
-        refused = True
         if "\n" in str(error) or len(str(error)) > LONGEST_MESSAGE:
             fault = f"a message of {len(str(error))} characters or several lines"
     except KeyboardInterrupt:
@@ -149,7 +128,7 @@ def _one(target: Target, data: bytes | None) -> tuple[str, bool]:
         signal.setitimer(signal.ITIMER_PROF, 0)
     if not fault and time.process_time() - began > MOST_S:
         fault = f"takes more than {MOST_S:g} s"
-    return fault, refused
+    return fault
 
 
 def _is_hungry(target: Target, data: bytes | None) -> bool:

@@ -1,7 +1,5 @@
 """Readers of trajectories and maps in the formats of other tools and in our own, and of an export's provenance."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Readers of recorded sequences, one folder layout each: one of its files is damaged, the others are sound."""
 
-from __future__ import annotations
-
 import re
 import sys
 import tempfile

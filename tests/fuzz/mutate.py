@@ -1,7 +1,5 @@
 """Damage to files: bytes, numbers and words of any format, nodes of JSON, chunks of PNG; repeatable by its seed."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

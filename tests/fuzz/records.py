@@ -1,7 +1,5 @@
 """Readers of what this package has stored: records, tables, packed runs, studies, cache entries."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Readers of text that people and other programs write: trajectories, lists, settings, labels, answers, addresses."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

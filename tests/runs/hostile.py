@@ -1,7 +1,5 @@
 """A tracker that behaves badly in ways that concern the process and not the poses, for the tests of supervision."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -1,7 +1,5 @@
 """A results folder of somebody else's: whatever a record says, nothing is written outside, and the rest is read."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

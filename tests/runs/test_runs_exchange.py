@@ -1,7 +1,5 @@
 """Runs in the formats of others, read back by evo, by each format's own reader and by our import: equal to 1e-6."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

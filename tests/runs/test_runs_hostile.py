@@ -1,7 +1,5 @@
 """Trackers that exit, hang, leave processes or hoard memory, and faults around a run: one clear end, none survives."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -1,7 +1,5 @@
 """What makes another run: every change of data, program, plug-in, weights or library that could change a result."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys
@@ -84,13 +82,6 @@ def test_changed_data_is_another_run(name: str, tmp_path: Path) -> None:
     assert resolve(spec).run_id == before
     change()
     assert resolve(spec).run_id != before
-
-
-def test_one_content_has_one_identity_wherever_it_lies(tmp_path: Path) -> None:
-    folder = sequence(tmp_path)
-    copy = shutil.copytree(folder, tmp_path / "copy" / "toy")
-    first, second = (resolve(RunSpec(tracker="never-move", sequence=str(each))) for each in (folder, copy))
-    assert first.run_id == second.run_id
 
 
 def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:

@@ -1,9 +1,10 @@
 """Many runs: resuming, retrying, parallel and elsewhere, under a jumping clock; imported trajectories; suites."""
 
-from __future__ import annotations
-
 import io
+import json
 import multiprocessing
+import subprocess
+import sys
 import time
 import zipfile
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -15,10 +16,11 @@ import pytest
 from envs_toys import TARGET, truth
 from hostile import until
 
+from dynslam_bench.api import dask_executor
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
-from dynslam_bench.runs import RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
+from dynslam_bench.runs import RunEvent, RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
 from dynslam_bench.runs.running import pack, unpack
 from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -349,3 +351,42 @@ def test_rows_are_of_trackers_of_the_suite(tmp_path: Path) -> None:
         load_suite(stranger).specs()
     with pytest.raises(RunError, match=r"rows\.0\.settings"):
         load_suite(write(tmp_path / "b.toml", text.format("never-move", "{}")))
+
+
+# A real Dask cluster: runs come back as bytes, and its end is one clear line. Skipped without `distributed`.
+
+
+def start(program: str, *arguments: str) -> subprocess.Popen:
+    command = [sys.executable, "-m", f"distributed.cli.{program}", "--no-dashboard", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def test_a_scheduler_that_is_killed_in_the_middle_is_one_clear_line(
+    tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setenv("PYTHONPATH", ":".join(path for path in sys.path if path))
+    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")  # no fork server for one run in the worker
+    place, store = tmp_path / "scheduler.json", RunStore(tmp_path / "results")
+    file = ("--scheduler-file", str(place))
+    with start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", *file) as scheduler:
+        deadline = time.monotonic() + 300
+        while not (place.is_file() and place.read_text()):
+            assert scheduler.poll() is None and time.monotonic() < deadline
+            time.sleep(0.02)
+        executor = dask_executor(json.loads(place.read_text())["address"])
+        private = ("--local-directory", str(tmp_path))
+        with start("dask_worker", *file, "--nthreads", "1", "--no-nanny", *private) as worker:
+
+            def told(event: RunEvent) -> None:
+                if event.kind == "finished":
+                    scheduler.kill()
+
+            specs = [RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(9)]
+            with pytest.raises(InfrastructureError, match=r"^the executor gave up: CancelledError") as error:
+                run_many(specs, results=store, executor=executor, on_event=told)
+            worker.kill()
+    assert "\n" not in str(error.value) and "Traceback" not in capfd.readouterr().err
+    records, unreadable = store.all()
+    assert 1 <= len(records) < len(specs) and unreadable == []  # what came back stays
+    assert {record.status for record in records} == {"ok"}

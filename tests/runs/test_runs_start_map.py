@@ -1,7 +1,5 @@
 """Runs that keep their map, and runs that begin in one: which map it was is part of what they are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

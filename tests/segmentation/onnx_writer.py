@@ -1,7 +1,5 @@
 """Writes tiny ONNX files for tests: outputs that are constants, without the onnx package."""
 
-from __future__ import annotations
-
 import numpy as np
 
 FLOAT, INT64 = 1, 7

@@ -10,13 +10,15 @@ import torch
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.build_segmenter import build_segmenter
+from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
 from dynslam_bench.segmentation.networks import boxes as box_ops
 from dynslam_bench.segmentation.networks.backbone import RESNET18, NetworkConfig
+from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network, save_network
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter, paste
 from dynslam_bench.segmentation.networks.network import MaskRCNN, levels_of, roi_align
 from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences.catalogue import open_sequence
 
 SMALL = NetworkConfig(
     blocks=(1, 1, 1, 1), bottleneck=False, stem=8, channels=16, classes=("person", "chair"), box_hidden=16,
@@ -279,3 +281,109 @@ def test_pasted_masks_fill_their_box():
     moved = paste(half, box + np.float32(0.4), 100, 100, 0.5, exact=True)
     assert not moved[:, :30].any() and moved[21:80, 31:50].all()
     assert not paste(plane, np.array([-30, -30, -5, -5], np.float32), 100, 100, 0.5).any()
+
+
+# The network in the package: it is found, small, runs offline, and sees rendered people.
+
+
+AUTO = SegmentationSettings()
+
+
+def test_auto_means_embedded_on_rendered_sequences():
+    assert embedded_weights().stat().st_size < 15e6
+    assert resolve_source(AUTO, "synthetic/walking_xyz?scene=0&frames=60") == "embedded"
+    assert len(weights_digest(AUTO, "synthetic/walking_xyz")) == 12
+    assert f'"{weights_digest(AUTO, "synthetic/walking_xyz")}"' in embedded_weights().with_suffix(".json").read_text()
+
+
+def test_it_finds_people_of_a_held_out_instance(tmp_path):
+    segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz", threads=1)
+    sequence = open_sequence("synthetic/sitting_xyz?scene=120&frames=30", data_root=tmp_path)
+    frame, masks = sequence[5], sequence.masks[5]
+    people = np.isin(masks.instances, [k for k, name in masks.class_names.items() if name == "person"])
+    found, again = segmenter.segment(frame), segmenter.segment(frame)
+    union = found.union()
+    assert set(found.class_names) == {"person"} and len(found) == 2
+    assert (union & people).sum() / (union | people).sum() > 0.85
+    assert np.array_equal(found.masks, again.masks) and np.array_equal(found.scores, again.scores)
+
+
+@pytest.mark.parametrize("shape", [(480, 640, 3), (97, 211, 3)])
+def test_nobody_there(shape):
+    segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz")
+    found = segmenter.segment(Frame(0, 0.0, np.full(shape, 128, np.uint8), np.zeros(shape[:2], np.float32)))
+    assert found.masks.shape == (0, *shape[:2])
+
+
+# Whole models against torchvision's own, on random weights; skipped where torchvision cannot be imported.
+
+
+@pytest.fixture(scope="module")
+def torchvision():
+    """Torchvision, with Python operators where its compiled ones do not load beside this torch."""
+    library = torch.library.Library("torchvision", "DEF")
+    try:
+        torch.ops.torchvision.nms  # noqa: B018  # asks whether the compiled operators are there
+    except (AttributeError, RuntimeError):
+        library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    module = pytest.importorskip("torchvision", reason="torchvision is not installed")
+    from torchvision.ops import boxes
+
+    def nms(dets, scores, threshold):
+        iou = boxes.box_iou(dets, dets)
+        kept: list[int] = []
+        for index in scores.argsort(descending=True, stable=True).tolist():
+            kept += [] if (iou[index, kept] > threshold).any() else [index]
+        return torch.tensor(kept, dtype=torch.long)
+
+    boxes.nms = nms
+    return module
+
+
+def make(torchvision, seed, size):
+    import torch._dynamo
+
+    torch._dynamo.config.disable = True
+    torch.manual_seed(seed)
+    model = torchvision.models.detection.maskrcnn_resnet50_fpn(
+        weights=None, weights_backbone=None, min_size=size[0], max_size=size[1], rpn_pre_nms_top_n_test=60,
+        rpn_post_nms_top_n_test=40, box_score_thresh=0.008,
+    ).eval()  # fmt: skip
+    with torch.no_grad():
+        for name, module in model.named_modules():
+            if "bn" in name or "downsample.1" in name:
+                module.running_var.uniform_(0.8, 1.5)
+                module.running_mean.normal_(0, 0.1)
+                module.weight.mul_(0.5 if "bn3" in name else 1.0)
+        model.rpn.head.cls_logits.weight.mul_(20)
+        model.rpn.head.bbox_pred.weight.mul_(5)
+        model.roi_heads.box_predictor.bbox_pred.weight.mul_(3)
+    return model
+
+
+@pytest.mark.parametrize(("seed", "shape", "size"), [(0, (120, 160), (128, 171)), (1, (100, 90), (96, 128))])
+def test_outputs_equal_torchvisions(torchvision, tmp_path, seed, shape, size):
+    model = make(torchvision, seed, size)
+    state = model.state_dict()
+    torch.save(state, tmp_path / "theirs.pth")
+    ours = load_network(tmp_path / "theirs.pth")
+    ours.config = ours.config.model_copy(update={"min_side": size[0], "max_side": size[1]})
+    ours.rpn.config = ours.rpn.config.model_copy(update={"pre_nms": 60, "post_nms": 40})
+    image = torch.rand(3, *shape, generator=torch.Generator().manual_seed(seed))
+    with torch.inference_mode():
+        theirs = model([image])[0]
+        levels = model.backbone(model.transform([image])[0].tensors)
+    x, _ = ours.prepare(image)
+    for mine, level in zip(ours.backbone(x)[0], levels.values(), strict=True):
+        assert torch.allclose(mine, level, atol=1e-4)
+    found = ours.detect(image, score=0.008)
+    assert len(found.boxes) == len(theirs["boxes"]) >= 20
+    assert torch.equal(found.labels, theirs["labels"])
+    assert torch.allclose(found.scores, theirs["scores"], atol=1e-4)
+    assert torch.allclose(found.boxes, theirs["boxes"], atol=1e-3)
+    for k in range(len(found.boxes)):
+        mask = paste(found.masks[k].numpy(), found.boxes[k].numpy(), *shape, 0.5)
+        soft = theirs["masks"][k, 0].numpy()
+        unsure = np.abs(soft - 0.5) < 2e-3
+        assert ((mask == (soft >= 0.5)) | unsure).all()

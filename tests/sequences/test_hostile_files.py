@@ -1,7 +1,5 @@
 """Images and archives that claim to be huge, lists that name files elsewhere, text of ten million lines."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import resource

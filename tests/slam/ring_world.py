@@ -1,7 +1,5 @@
 """Four corridors around a block, as points with known descriptors: a lap comes back to where it began."""
 
-from __future__ import annotations
-
 import numpy as np
 from point_world import PointWorld, make_backend, track_all, without_depth
 

@@ -5,10 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from point_world import make_backend, observed, track_all, without_depth
+from scipy.optimize import least_squares
 
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam import tracking
+from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
 from dynslam_bench.slam.local_mapping import triangulate
 from dynslam_bench.slam.map import Map
+from dynslam_bench.slam.tracking import LocalMap, unconnected, weakly_connected
 
 
 def keyframe_of(room, world, pose, index, octave=0):
@@ -101,3 +106,93 @@ def test_a_coarse_feature_needs_a_larger_parallax(room, octaves, sigmas, triangu
     features, _, position = triangulate(world, one, other, sigmas)
     assert (len(features) > 30) is triangulated and (triangulated or not len(features))
     assert np.allclose(position[:, 2], 3.0, rtol=0.01)
+
+
+# The local map: with loop closing it ends where the covisibility graph does.
+
+
+SHARED = 10
+"""Points that each keyframe of the chain shares with the next one."""
+
+
+@pytest.fixture
+def chain(room):
+    """Six keyframes in a row; each shares ten points with the next, and with no other."""
+    world, observations = Map(room.camera, np.ones(1)), observed(room.see(np.eye(4), 0), room.camera, levels=1)
+    last = np.zeros(0, np.int64)
+    for index in range(6):
+        slot = world.add_keyframe(observations, np.eye(4), index, float(index))
+        world.observe(slot, np.arange(len(last)), last)
+        fresh = np.arange(SHARED, 2 * SHARED)
+        last = world.add_points(np.ones((SHARED, 3)), np.zeros((SHARED, 3), np.uint8), slot, fresh)
+    return world
+
+
+@pytest.mark.parametrize(
+    ("keyframe", "gap", "expected"), [(5, 2, [0, 1, 2]), (5, 4, [0, 1]), (0, 4, [4, 5]), (2, 3, [5])]
+)
+def test_unconnected_keyframes_are_old_and_share_no_covisible_keyframe(chain, keyframe, gap, expected):
+    assert unconnected(chain, keyframe, gap).tolist() == expected
+
+
+def test_keyframes_that_share_few_points_may_be_recognised_anew(chain, monkeypatch):
+    assert weakly_connected(chain, 5, 1).tolist() == [0, 1, 2, 3, 4]
+    monkeypatch.setattr(tracking, "STRONG_COVISIBILITY", SHARED)
+    assert weakly_connected(chain, 5, 1).tolist() == [0, 1, 2]
+    assert weakly_connected(chain, 5, 4).tolist() == [0, 1]
+
+
+def test_the_local_map_is_the_whole_map_or_the_connected_part(chain, monkeypatch):
+    keyframes, points = LocalMap(chain, connected_only=False).around(5)
+    assert keyframes.tolist() == [0, 1, 2, 3, 4, 5] and (points == chain.points).all()
+    monkeypatch.setattr(tracking, "unconnected", lambda world, slot: unconnected(world, slot, 2))
+    local_map = LocalMap(chain, connected_only=True)
+    keyframes, points = local_map.around(5)
+    assert keyframes.tolist() == [3, 4, 5]
+    assert sorted(set(chain.born[points].tolist())) == [2, 3, 4, 5] and len(points) == 4 * SHARED
+    assert local_map.around(0)[0].tolist() == [0, 1, 2]
+    chain.remove_keyframe(1)
+    chain.next_keyframe += 1
+    assert local_map.around(0)[0].tolist() == [0]
+
+
+# Local bundle adjustment against a general least-squares solver.
+
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+POSES, VARIABLE, POINTS = 5, 3, 30
+
+
+def measured(poses, points):
+    """Pixels and right coordinates ``[N, 3]`` of all points in all views, point by point."""
+    local = np.einsum("pij,qj->qpi", poses[:, :3, :3], points) + poses[:, :3, 3]
+    uv = CAMERA.project(local)
+    return np.concatenate([uv, uv[..., :1] - CAMERA.fx * CAMERA.baseline_m / local[..., 2:]], axis=-1).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("with_depth", [0.6, 1.0])
+def test_bundle_adjustment_agrees_with_general_least_squares(with_depth):
+    rng = np.random.default_rng(0)
+    true, points = se3.exp(rng.normal(0, 0.06, (POSES, 6))), rng.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
+    values = measured(true, points) + rng.normal(0, 0.3, (POSES * POINTS, 3))
+    info, has_depth = np.ones(len(values)), rng.random(len(values)) < with_depth
+    start = np.concatenate([se3.exp(rng.normal(0, 0.01, (VARIABLE, 6))) @ true[:VARIABLE], true[VARIABLE:]])
+    problem = BundleProblem(
+        start, VARIABLE, points + rng.normal(0, 0.02, points.shape), np.tile(np.arange(POSES), POINTS),
+        np.repeat(np.arange(POINTS), POSES), values[:, :2], values[:, 2], info, info * has_depth, CAMERA,
+    )  # fmt: skip
+
+    def moved(x):
+        twists, offsets = np.split(x, [6 * VARIABLE])
+        poses = np.concatenate([se3.exp(twists.reshape(-1, 6)) @ start[:VARIABLE], start[VARIABLE:]])
+        return poses, problem.points + offsets.reshape(-1, 3)
+
+    def residuals(x):
+        return (np.where([True, True, False], True, has_depth[:, None]) * (measured(*moved(x)) - values)).ravel()
+
+    solution = least_squares(residuals, np.zeros(6 * VARIABLE + 3 * POINTS), xtol=1e-12, ftol=1e-12)
+    poses, _ = moved(solution.x)
+    result = adjust_bundle(problem, 40)
+    assert result.inliers.all() and result.cost == pytest.approx(2 * solution.cost, rel=1e-4)
+    np.testing.assert_allclose(result.poses, poses, atol=1e-4)
+    assert adjust_bundle(replace(problem, poses=true), 0).cost > result.cost

@@ -1,17 +1,34 @@
 """After the camera was lost: what is recognised, what only looks like it, and what the relocalisation gate admits."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
-from point_world import PointWorld, observed, states
+from point_world import PointWorld, make_backend, observed, states, track_all
 from ring_world import RingWorld, drive, position_errors, rotated
+from scipy.spatial.transform import Rotation
 
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.place_recognition import PlaceHypothesis, is_aliased
+from dynslam_bench.slam.place_recognition import (
+    CHANGED,
+    STRIDE,
+    PlaceHypothesis,
+    PlaceMatch,
+    is_aliased,
+    match_keyframe,
+    pose_uncertainty,
+    ransac_pose,
+    recognition_scores,
+    top_candidates,
+    verify_place,
+)
 from dynslam_bench.slam.relocalisation import RelocalisationGate, RotationEstimate
 from dynslam_bench.slam.settings import TrackingSettings
-from dynslam_bench.slam.tracking import TrackedFrame
+from dynslam_bench.slam.tracking import TrackedFrame, solve
 
 STEP = 0.15
 QUARTER = round((4.0 + np.pi / 2) / STEP)
@@ -134,3 +151,228 @@ def test_a_camera_that_still_sees_what_it_saw_is_not_kidnapped(degrees, kidnappe
     bound = gate.while_lost(last, seen_from(pose_at(2 * degrees), 2), 0.2)
     assert bound.admits(0, se3.inverse(pose_at(2 * degrees)))
     assert bound.admits(0, se3.inverse(pose_at(2 * degrees + 90.0))) is kidnapped
+
+
+# Place recognition: the RANSAC pose, whether the place is verified, and how well matches determine the pose.
+
+
+FIRST = np.eye(4)
+
+
+def mapped():
+    """A room, and the map of its first view."""
+    room = PointWorld()
+    backend = make_backend(room)
+    track_all(backend, [room.see(FIRST, 0, depthless=0.0)])
+    return room, backend
+
+
+def verified(backend, observations, patch, T_cam_world):
+    """The verified place, from matches in a part of the image and from a pose."""
+    every = match_keyframe(backend.world, 0, observations)
+    few = every.select(patch(observations.xy[every.feature]))
+    assert 8 <= len(few) < len(every) / 4
+    return verify_place(backend.world, 0, observations, few, T_cam_world, TrackingSettings())
+
+
+def test_a_pose_grows_from_a_patch():
+    room, backend = mapped()
+    pose = se3.exp(np.array([0.1, 0.05, 0.0, 0.0, 0.02, 0.01]))
+    frame = room.see(pose, 1, noise_px=1.5)
+    observations = observed(frame, room.camera)
+    place = verified(backend, observations, lambda xy: np.abs(xy - 120).max(axis=1) < 70, se3.inverse(pose))
+    assert place.share > 0.7 and len(place.matches) > 150
+    assert np.linalg.norm(se3.inverse(place.T_cam_world)[:3, 3] - pose[:3, 3]) < 0.03
+
+
+def test_what_people_hide_is_not_expected_to_be_seen():
+    room, backend = mapped()
+    frame = room.see(FIRST, 1)
+    mask = np.zeros((480, 640), bool)
+    mask[:, 220:] = True
+    outside = frame.xy[:, 0] < 219
+    patch = lambda xy: (xy[:, 0] < 120) & (xy[:, 1] < 160)  # noqa: E731
+    without = verified(backend, observed(frame, room.camera, keep=outside), patch, FIRST)
+    behind = verified(backend, observed(replace(frame, mask=mask), room.camera, keep=outside), patch, FIRST)
+    assert without.share < 0.4 < 0.8 < behind.share and len(behind.matches) == len(without.matches)
+
+
+@pytest.mark.parametrize(
+    ("half", "beside", "precise"), [(60, 0, False), (60, 4, False), (60, 24, True), (90, 0, False), (250, 0, True)]
+)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_one_patch_does_not_determine_the_pose_nor_do_a_few_matches_beside_it(half, beside, precise, seed):
+    """Eighty matches each, from a square of twice `half` in an image of 640 x 480, and `beside` of them around it."""
+    room = PointWorld(count=30_000)
+    backend = make_backend(room)
+    track_all(backend, [room.see(FIRST, 0, depthless=0.0, limit=4000)])
+    pose = se3.exp(np.array([0.1, 0.05, 0.0, 0.0, 0.02, 0.01]))
+    frame = room.see(pose, 1, noise_px=1.0, limit=4000)
+    observations = observed(frame, room.camera)
+    every, rng = match_keyframe(backend.world, 0, observations), np.random.default_rng(seed)
+    off = np.abs(observations.xy[every.feature] - [260, 200]).max(axis=1)
+    patch, beside_it = rng.permutation(np.flatnonzero(off < half)), rng.permutation(np.flatnonzero(off > 150))
+    few = every.select(np.sort(np.concatenate([patch[: 80 - beside], beside_it[:beside]])))
+    fitted = solve(room.camera, observations, few, se3.inverse(pose))
+    place = PlaceMatch(fitted.T_cam_world, few.select(fitted.inliers), 0.5)
+    assert len(place.matches) > 60
+    assert (pose_uncertainty(backend.world, observations, place, np.random.default_rng(0)) <= 1) == precise
+
+
+@pytest.mark.parametrize("count", [0, 4, 6, 11])
+def test_a_few_matches_determine_no_pose(count):
+    room, backend = mapped()
+    frame = room.see(FIRST, 1)
+    observations = observed(frame, room.camera)
+    few = match_keyframe(backend.world, 0, observations).select(np.arange(count))
+    assert (
+        pose_uncertainty(backend.world, observations, PlaceMatch(FIRST, few, 1.0), np.random.default_rng(0)) == np.inf
+    )
+
+
+CAMERA = Camera(640, 480, 535.0, 539.0, 320.0, 247.0)
+
+
+def true_and_false_matches(seed, count, right):
+    """World points, noisy pixels of which the first `right` are right, and the world-to-camera pose."""
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.5, 3)).as_matrix()
+    pose[:3, 3] = rng.normal(0, 1, 3)
+    xy = rng.uniform([0, 0], [640, 480], (count, 2))
+    world = (CAMERA.unproject(xy, rng.uniform(1, 5, count)) - pose[:3, 3]) @ pose[:3, :3]
+    world[right:] = world[right:][rng.permutation(count - right)]
+    return world, xy + rng.normal(0, 0.5, xy.shape), pose
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_half_of_the_matches_may_be_wrong(seed):
+    world, xy, pose = true_and_false_matches(seed, 80, 40)
+    estimate, inliers = ransac_pose(world, xy, np.ones(80), CAMERA, np.random.default_rng(seed))
+    _, rotation, translation, theirs = cv2.solvePnPRansac(
+        world, xy, CAMERA.matrix, None, iterationsCount=150, reprojectionError=np.sqrt(2 * 5.991), confidence=0.999
+    )
+    assert inliers[:40].sum() >= 30 and inliers[40:].sum() <= 3
+    assert inliers.sum() >= len(theirs) - 8, "before any refinement, which theirs has"
+    assert np.linalg.norm(estimate[:3, 3] - pose[:3, 3]) < 0.15
+    assert np.linalg.norm(estimate[:3, 3] - translation.ravel()) < 0.15
+    assert np.linalg.norm(Rotation.from_matrix(estimate[:3, :3] @ cv2.Rodrigues(rotation)[0].T).as_rotvec()) < 0.05
+
+
+def test_coarse_features_may_be_farther_off():
+    world, xy, _ = true_and_false_matches(4, 60, 60)
+    xy = xy + np.random.default_rng(0).normal(0, 3.0, xy.shape)
+    strict, coarse = (
+        ransac_pose(world, xy, np.full(60, info), CAMERA, np.random.default_rng(0))[1] for info in (1.0, 0.1)
+    )
+    assert coarse.sum() > 50 > strict.sum()
+
+
+def test_too_few_or_degenerate_points_give_no_pose():
+    for count in (0, 3):
+        world, xy, _ = true_and_false_matches(0, count, count)
+        assert ransac_pose(world, xy, np.ones(count), CAMERA, np.random.default_rng(0)) is None
+    same = np.tile([[0.3, -0.2, 2.0]], (30, 1))
+    line = np.linspace([-1.0, 0.0, 3.0], [1.0, 0.0, 3.0], 30)
+    for world in (same, line):
+        xy = np.random.default_rng(0).uniform([0, 0], [640, 480], (30, 2))
+        estimate = ransac_pose(world, xy, np.ones(30), CAMERA, np.random.default_rng(0))
+        assert estimate is None or estimate[1].sum() < 15
+
+
+# The ranking of keyframes by the descriptors' own substrings.
+
+
+ANGLES = np.deg2rad(np.arange(0, 360, 30))
+
+
+def observations(room, angle, index):
+    """The features of a camera that looks in a direction, radians about the vertical."""
+    return observed(room.see(se3.exp(np.array([0, 0, 0, 0, angle, 0])), index), room.camera, levels=1)
+
+
+@pytest.fixture
+def world(room):
+    """A map of twelve keyframes around a room, every feature a point of its own."""
+    world = Map(room.camera, np.ones(1))
+    for index, angle in enumerate(ANGLES):
+        features = observations(room, angle, index)
+        slot = world.add_keyframe(features, np.eye(4), index, index / 30)
+        world.add_points(np.ones((len(features), 3)), features.rgb, slot, np.arange(len(features)))
+    return world
+
+
+@pytest.mark.parametrize("place", [0, 5, 11])
+def test_the_keyframe_of_the_same_place_is_ranked_first(room, world, place):
+    best = top_candidates(world, world.keyframes, observations(room, ANGLES[place] + 0.02, 100), 3)
+    assert len(best) == 3 and world.kf_frame[best[0]] == place
+    neighbours = top_candidates(world, world.keyframes, observations(room, ANGLES[4], 100), 11)
+    assert [int(world.kf_frame[slot]) for slot in neighbours[:1]] == [4]
+    assert {int(world.kf_frame[slot]) for slot in neighbours[1:3]} == {3, 5}
+
+
+def test_only_the_keyframes_given_are_chosen(room, world):
+    given = world.keyframes[[1, 2, 8, 9]]
+    best = top_candidates(world, given, observations(room, ANGLES[5], 100), 2)
+    assert len(best) == 2 and set(best) <= set(given.tolist())
+    assert top_candidates(world, given, observations(room, 0.0, 100), 4) == given.tolist()
+    assert top_candidates(world, world.keyframes, observed(room.blind(0), room.camera), 2) == [0, 1]
+
+
+def test_of_equal_scores_the_newer_keyframe_is_first(room, world):
+    """A frame whose substrings no keyframe has scores zero everywhere."""
+    stranger = observations(PointWorld(seed=9), 0.0, 100)
+    stored = world.kf_words[world.keyframes].view(np.uint16)[:, :, ::STRIDE]
+    used = np.concatenate([stored[row, : world.kf_count[slot]] for row, slot in enumerate(world.keyframes)])
+    stranger.words.view(np.uint16)[:] = np.setdiff1d(np.arange(1 << 16), used)[0]
+    newest = world.keyframes[np.argsort(-world.kf_id[world.keyframes])]
+    assert top_candidates(world, world.keyframes, stranger, 4) == newest[:4].tolist()
+
+
+def reference_scores(world, keyframes, features):
+    """The same score, counted substring by substring without an index."""
+    query = np.ascontiguousarray(features.words).view(np.uint16)[:, ::STRIDE]
+    shared = []
+    for slot in keyframes.tolist():
+        own = world.kf_words[slot, world.kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE]
+        shared.append([own[np.isin(own[:, p], query[:, p]), p] for p in range(query.shape[1])])
+    everything = [np.concatenate([columns[p] for columns in shared]) for p in range(query.shape[1])]
+    total = sum(map(len, everything))
+    scores = []
+    for slot, columns in zip(keyframes.tolist(), shared, strict=True):
+        weights = [
+            np.log(total / np.count_nonzero(everything[p] == value))
+            for p, column in enumerate(columns)
+            for value in column
+        ]
+        scores.append(sum(weights) / np.sqrt(max(np.count_nonzero(world.kf_point[slot] >= 0), 1)))
+    return np.array(scores)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_index_follows_keyframes_that_come_and_go(room, seed):
+    """Keyframes of many sizes, some features without a point, slots used again, and only some asked for."""
+    world, rng, compared = Map(room.camera, np.ones(1)), np.random.default_rng(seed), 0
+    for number in range(40):
+        if world.keyframe_count < 4 or rng.random() < 0.6:
+            features = observations(room, rng.uniform(0, 6), number)
+            slot = world.add_keyframe(features, np.eye(4), number, number / 30)
+            some = np.flatnonzero(rng.random(len(features)) < 0.6)
+            world.add_points(np.ones((len(some), 3)), features.rgb[some], slot, some)
+        else:
+            world.remove_keyframe(int(rng.choice(world.keyframes)))
+        asked = world.keyframes[rng.random(world.keyframe_count) < 0.8]
+        if number % 3 == 0 and len(asked):  # not each time: several come and go in between
+            features, compared = observations(room, rng.uniform(0, 6), 1000 + number), compared + 1
+            expected = reference_scores(world, asked, features)
+            np.testing.assert_allclose(recognition_scores(world, asked, features), expected, rtol=1e-9)
+    assert compared > 8
+
+
+def test_a_keyframe_is_indexed_again_when_many_of_its_points_changed(room, world):
+    (slot,) = world.keyframes[:1]
+    count = int(np.count_nonzero(world.kf_point[slot] >= 0))
+    for removed, indexed in ((0, count), (int(count * CHANGED), count), (int(count * CHANGED) + 1, None)):
+        world.kf_point[slot, :removed] = -1
+        recognition_scores(world, world.keyframes, observations(room, 0.0, 100))
+        assert world.substrings[slot][1].shape[1] == (count - removed if indexed is None else indexed)

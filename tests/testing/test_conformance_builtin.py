@@ -2,28 +2,44 @@
 
 import importlib
 import inspect
+import os
 import pkgutil
+import re
+import sys
 import typing
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import hostile
 import numpy as np
 import pytest
 
 import dynslam_bench.culling
-from dynslam_bench.contracts.filter import DynamicFilter
-from dynslam_bench.core.settings import Settings
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult
+from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.se3 import inverse
+from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.testing import (
+    ConformanceError,
     CornerSequence,
+    TurningSequence,
     check_filter,
     check_segmenter,
     check_sequence,
     check_tracker,
     filter_scene,
+    isolated_tracker_report,
+    tracker_report,
 )
+from dynslam_bench.trackers import TrackerSpec
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 
@@ -90,3 +106,352 @@ def test_segmenters():
     scene = CornerSequence(2)
     settings = SegmentationSettings(source="oracle")
     check_segmenter(lambda: build_segmenter(settings, sequence_id=scene.id, masks=scene.masks))
+
+
+# Conformance checks of trackers that exit, hang, crash or leave processes behind: a verdict on every check.
+
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "runs"))
+
+
+def report_of(mode, tmp_path=None, target=hostile.TARGET, **options):
+    settings = {"mode": mode} | ({} if tmp_path is None else {"pids": str(tmp_path / "pids")})
+    return isolated_tracker_report(target, settings=settings, frames=4, **({"frame_s": 3.0} | options))
+
+
+def failures(report):
+    return {check.name: check.message for check in report.failed}
+
+
+@pytest.mark.parametrize(
+    ("mode", "check", "words"),
+    [
+        ("sys.exit", "results", "called sys.exit(0)"),
+        ("os._exit", "results", "the process left with exit code 0 (likely cause: os._exit"),
+        ("segfault", "results", "SIGSEGV (segmentation fault)"),
+        ("hang", "results", "no sign of life for 3 s (likely cause: an endless loop"),
+        ("build-sys.exit", "construction", "called sys.exit(0)"),
+        ("build-os._exit", "construction", "the process left with exit code 0"),
+    ],
+)
+def test_a_tracker_that_ends_its_process_fails_the_check(mode, check, words):
+    report = report_of(mode)
+    assert list(failures(report)) == [check] and words in failures(report)[check]
+    assert "\n" not in failures(report)[check]
+
+
+def test_the_other_checks_go_on():
+    """It leaves the process on a black image only: that check fails, all others are made."""
+    told = []
+    report = report_of("ok", target=f"{hostile.__file__}:BLACK", on_check=told.append)
+    assert list(failures(report)) == ["all-black frame"]
+    assert told == report.checks and len({check.name for check in told}) == len(told) >= 14
+    assert report.checks[-1].name == "closing" and report.subject == "tracker 'blackhater'"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers")
+def test_nothing_survives(tmp_path):
+    assert report_of("children", tmp_path).ok
+    pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
+    assert len(pids) >= 3
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_a_module_that_exits_when_it_is_loaded(tmp_path):
+    (tmp_path / "leaver.py").write_text("import os\nos._exit(0)\n")
+    report = report_of("ok", target=f"{tmp_path}/leaver.py:SPEC")
+    assert list(failures(report)) == ["loading"] and "exit code 0" in failures(report)["loading"]
+
+
+def test_unknown_names_are_errors_and_no_verdicts():
+    with pytest.raises(PluginError, match=r"unknown tracker 'orb-slam'.*orb-slam2"):
+        isolated_tracker_report("orb-slam")
+    report = isolated_tracker_report("never-move", settings={"speed": 1})
+    assert "unknown setting 'speed'" in failures(report)["spec"]
+
+
+# Each check finds the fault that it is for, and names it.
+
+
+TRUTH = CornerSequence(4).ground_truth.T_world_cam
+TURNING = TurningSequence().ground_truth.T_world_cam
+
+
+class Good:
+    """Knows the scenes' poses by heart."""
+
+    def reset(self, camera, *, rng):
+        self.rng, self.stamps = rng, []
+        self.poses = TRUTH if camera.width == 640 else TURNING
+
+    def track(self, frame):
+        self.stamps.append(frame.timestamp)
+        return TrackResult(self.poses[frame.index].copy(), "ok", {"matches": 1.0}, {"all": 0.001})
+
+    def finalize(self):
+        return Trajectory(np.array(self.stamps), TRUTH[: len(self.stamps)])
+
+    def close(self):
+        pass
+
+
+def faulty(**methods):
+    return type("Faulty", (Good,), methods)
+
+
+def gave(change):
+    return faulty(track=lambda self, frame: change(self, Good.track(self, frame), frame))
+
+
+def reused_pose(self, frame):
+    """One pose array for all results."""
+    self.pose = vars(self).get("pose", np.eye(4))
+    self.pose[:] = self.poses[frame.index]
+    return TrackResult(self.pose, "ok")
+
+
+def test_a_good_tracker_passes():
+    report = tracker_report(Good, frames=4)
+    assert report.ok and {c.status for c in report.checks if c.name != "online settings"} == {"passed"}
+    assert len(report.checks) == 16
+
+
+class Forgetful(Good):
+    total = 0
+
+    def track(self, frame):
+        self.total += 1
+        return TrackResult(self.poses[frame.index], "ok", {"total": float(self.total)})
+
+
+SKEW = np.diag([1.1, 1, 1, 1])
+
+
+def scribble(self, result, frame):
+    frame.rgb[0, 0] = 77  # the same on every call: only fresh frames show it
+    return result
+
+
+@pytest.mark.parametrize(
+    ("tracker", "check", "words"),
+    [
+        (gave(lambda s, r, f: r.T_world_cam), "results", "gave a ndarray, not a TrackResult"),
+        (gave(lambda s, r, f: replace(r, state="fine")), "results", "gave state 'fine'"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=None)), "results", "state 'ok' without a pose"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam * np.nan)), "results", "a solver diverged"),
+        (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam @ SKEW)), "results", "no rigid transformation"),
+        (
+            gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam[:3])),
+            "results",
+            r"shape \(3, 4\) as pose",
+        ),
+        (gave(lambda s, r, f: replace(r, T_world_cam=inverse(r.T_world_cam))), "camera to world", "invert your"),
+        (gave(lambda s, r, f: replace(r, state="lost")), "results", "no frame of an easy scene was tracked"),
+        (
+            gave(lambda s, r, f: replace(r, stats={f"n{f.index}": 1.0})),
+            "same stats on every frame",
+            "the same on every frame",
+        ),
+        (gave(lambda s, r, f: replace(r, stats={"n": float("nan")})), "results", "no finite numbers"),
+        (gave(lambda s, r, f: replace(r, timings={"t": -1.0})), "results", "a timing that is negative"),
+        (gave(lambda s, r, f: replace(r, dynamic_mask=np.zeros((4, 4), bool))), "results", "a dynamic mask of shape"),
+        (gave(scribble), "frames are left alone", "draw on a copy"),
+        (faulty(track=reused_pose), "results", "the pose of frame 0 changed"),
+        (
+            gave(lambda s, r, f: replace(r, stats={"matches": float(np.random.rand())})),  # noqa: NPY002
+            "determinism",
+            "randomness that does not come from rng",
+        ),
+        (Forgetful, "two resets", "leaves something of the sequence before"),
+        (
+            faulty(finalize=lambda self: Trajectory(np.array([1.0]), np.eye(4)[None])),
+            "final trajectory",
+            "1 stamps of no frame",
+        ),
+        (faulty(finalize=lambda self: TRUTH), "final trajectory", "not a Trajectory"),
+        (faulty(__init__=lambda self: 1 / 0), "construction", "raised ZeroDivisionError"),
+        (faulty(track=None), "construction", r"lacks track\(\)"),
+        (faulty(close=lambda self: self.inner.close()), "construction", r"close\(\) of a Faulty raised AttributeError"),
+    ],
+)
+def test_faulty_trackers(tracker, check, words):
+    with pytest.raises(ConformanceError, match=words) as caught:
+        check_tracker(tracker, frames=4)
+    assert f"\n  {check}: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("condition", "name"),
+    [
+        (lambda f: not f.rgb.any(), "all-black"),
+        (lambda f: (f.rgb == 255).all(), "saturated"),
+        (lambda f: f.rgb.any() and not f.depth.any(), "zero depth"),
+        (lambda f: (f.rgb == 128).all(), "textureless"),
+    ],
+)
+def test_trackers_that_break_on_hard_frames(condition, name):
+    def track(self, frame):
+        if condition(frame):
+            raise IndexError("no features")
+        return Good.track(self, frame)
+
+    report = tracker_report(faulty(track=track), frames=4)
+    assert [check.name for check in report.failed] == [f"{name} frame"]
+    assert "raised IndexError: no features" in report.failed[0].message
+
+
+def test_the_spec_is_checked_too(tmp_path):
+    spec = TrackerSpec("mine", f"{__name__}:Good", "Mine", presets={"fast": {"nothing": 1}})
+    report = tracker_report(spec, frames=2)
+    assert report.checks[0].status == "failed" and "preset 'fast' does not fit" in report.checks[0].message
+
+
+def frames(change):
+    return {"__getitem__": lambda self, index: change(CornerSequence.__getitem__(self, index))}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"stamps": lambda stamps: stamps.astype(np.float32)}, "no float64 array"),
+        ({"stamps": lambda stamps: stamps[::-1].copy()}, "not strictly increasing"),
+        ({"stamps": lambda stamps: stamps * 1000}, "in seconds"),
+        ({"truth": Trajectory(CornerSequence(4).timestamps + 1e6, TRUTH)}, "different clocks"),
+        ({"__getitem__": lambda self, index: CornerSequence.__getitem__(self, min(index, 3))}, "beyond the end"),
+        (frames(lambda f: replace(f, rgb=f.rgb[..., 0])), "the image is grey"),
+        (frames(lambda f: replace(f, depth=f.depth * 5000)), "wrong depth_factor"),
+        (frames(lambda f: replace(f, depth=np.where(f.depth > 2, np.float32("nan"), f.depth))), "missing depth is 0"),
+        (frames(lambda f: replace(f, index=0)), "says that its index is 0"),
+        (frames(lambda f: replace(f, depth=f.depth + np.float32(np.random.rand()))), "differs when it is read"),  # noqa: NPY002
+        ({"masks": [replace(CornerSequence(4).masks[i], class_names={}) for i in range(4)]}, "have no class name"),
+        ({"digest": lambda self: str(np.random.default_rng().random())}, "two digests of one sequence differ"),
+    ],
+)
+def test_faulty_sequences(changes, words):
+    sequence = type("Broken", (CornerSequence,), changes)(4)
+    sequence.timestamps = changes.get("stamps", np.copy)(sequence.timestamps)
+    sequence.ground_truth = changes.get("truth", sequence.ground_truth)
+    with pytest.raises(ConformanceError, match=words):
+        check_sequence(sequence)
+
+
+class Keep:
+    """Keeps everything."""
+
+    name, needs, provenance = "keep", frozenset({"depth"}), "own"
+
+    def reset(self, camera):
+        pass
+
+    def apply(self, frame, state):
+        return FilterResult.of(np.ones(len(frame), bool))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"needs": frozenset({"magic"})}, "unknown needs"),
+        ({"provenance": "copied"}, "provenance is 'copied'"),
+        ({"apply": lambda s, f, st: FilterResult.of(np.ones(3, bool))}, "not only on those that earlier filters kept"),
+        ({"apply": lambda s, f, st: FilterResult(np.ones(len(f), bool), np.full(len(f), 2, np.float32))}, "outside"),
+        ({"apply": lambda s, f, st: FilterResult.of(st.flow.valid)}, "raised AttributeError"),
+        ({"apply": lambda s, f, st: FilterResult.of(f.z > f.z.min())}, "no keypoints: raised ValueError"),
+        (
+            {"apply": lambda s, f, st: replace(FilterResult.of(np.ones(len(f), bool)), stats={f"n{f.index}": 1.0})},
+            "not declared",
+        ),
+        ({"stats_names": ("dropped", "tested")}, r"stats missing: \['tested'\]"),
+        ({"stats_names": ()}, r"stats not declared: \['dropped'\]"),
+        ({"apply": lambda s, f, st: FilterResult.of(np.random.rand(len(f)) > 0.5)}, "state.seed"),  # noqa: NPY002
+    ],
+)
+def test_faulty_filters(change, words):
+    check_filter(Keep)
+    with pytest.raises(ConformanceError, match=words):
+        check_filter(type("Faulty", (Keep,), change))
+
+
+def instances(frame, **change):
+    mask = np.zeros((1, *frame.depth.shape), bool)
+    mask[0, 10:20, 30:60] = True
+    whole = Instances(mask, np.array([[30, 10, 60, 20]], np.float32), ("person",), np.ones(1, np.float32))
+    return replace(whole, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"masks": np.zeros((1, 9, 9), bool)}, "at the frame's resolution"),
+        ({"boxes": np.array([[10, 30, 20, 60]], np.float32)}, "y before x"),
+        ({"boxes": np.array([[30, 10, 25, 20]], np.float32)}, "not x, y, w, h"),
+        ({"scores": np.array([3], np.float32)}, "logits, not scores"),
+        ({"class_names": ("",)}, "a class has no name"),
+    ],
+)
+def test_faulty_segmenters(change, words):
+    check_segmenter(lambda: SimpleNamespace(segment=instances))
+    with pytest.raises(ConformanceError, match=words):
+        check_segmenter(lambda: SimpleNamespace(segment=lambda frame: instances(frame, **change)))
+
+
+class Online(Settings):
+    shift: float = tunable(0.0, low=0.0, high=1.0, online=True, meaning="added to a statistic")
+
+
+class Configured(Good):
+    """Obeys and forgets, as it should."""
+
+    def __init__(self, settings):
+        self.settings = self.built_with = settings
+
+    def configure(self, settings):
+        self.settings = settings
+
+    def reset(self, camera, *, rng):
+        super().reset(camera, rng=rng)
+        self.settings = self.built_with
+
+    def track(self, frame):
+        return replace(super().track(frame), stats={"shift": self.settings.shift})
+
+
+class Late(Configured):
+    """Obeys one frame late."""
+
+    def track(self, frame):
+        before, self.seen = self.seen if frame.index else self.built_with, self.settings
+        return replace(Good.track(self, frame), stats={"shift": before.shift})
+
+
+class Once(Configured):
+    """Reads its settings on the first frame and never again."""
+
+    def track(self, frame):
+        self.seen = self.settings if frame.index == 0 else self.seen
+        return replace(Good.track(self, frame), stats={"shift": self.seen.shift})
+
+
+Fixed = type("Fixed", (Configured,), {"configure": None})
+Deaf = type("Deaf", (Configured,), {"configure": lambda self, settings: None})
+Leaky = type("Leaky", (Configured,), {"reset": Good.reset})
+Inert = type("Inert", (Configured,), {"track": Good.track})
+
+
+@pytest.mark.parametrize(
+    ("tracker", "status", "words"),
+    [
+        (Configured, "passed", ""),
+        (Fixed, "failed", "class Fixed has no method configure.settings., but shift is online"),
+        (Deaf, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
+        (Leaky, "failed", "reset.. does not bring back the settings: frame 0, shift"),
+        (Late, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
+        (Once, "failed", "configure.. in mid-episode changes nothing, although building with shift does"),
+        (Inert, "skipped", "shift change nothing on this scene"),
+    ],
+)
+def test_online_settings_are_checked(tracker, status, words):
+    spec = TrackerSpec("t", f"{__file__}:{tracker.__name__}", "T", settings=Online)
+    (check,) = [c for c in tracker_report(spec, frames=4).checks if c.name == "online settings"]
+    assert check.status == status and re.search(words, check.message), check

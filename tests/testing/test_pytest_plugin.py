@@ -1,10 +1,9 @@
 """The conformance checks as tests of pytest, and what they find in broken flows and feature extractors."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
+from importlib import metadata
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -14,10 +13,12 @@ import pytest
 
 from dynslam_bench.contracts import FlowResult, Keypoints
 from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.features.registry import build_extractor
 from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.testing import ConformanceError, check_features, check_flow, features_report
+from dynslam_bench.testing import ConformanceError, check_features, check_flow, features_report, installation
+from dynslam_bench.testing.installation import examine
 from dynslam_bench.testing.pytest_plugin import report_on
 
 FLOW = """
@@ -83,11 +84,6 @@ def test_an_unknown_subject_is_one_line(tmp_path: Path) -> None:
     ended = run_pytest(tmp_path, "--dynslam-flow", "dasiy")
     assert ended.returncode == 4 and "--dynslam-flow: unknown flow 'dasiy'" in ended.stderr + ended.stdout
     assert "Traceback" not in ended.stderr + ended.stdout
-
-
-def test_pytest_elsewhere_is_not_slowed_down() -> None:
-    code = "import dynslam_bench.testing.pytest_plugin, sys; print([m for m in ('cv2', 'torch') if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
 @pytest.mark.parametrize("method", ["lucas-kanade", "dis", "daisy"])
@@ -159,3 +155,30 @@ def test_an_extractor_that_breaks_the_contract_is_found(fault: str, message: str
     check_features(lambda: BadFeatures("none"), descriptor_bytes=32)
     with pytest.raises(ConformanceError, match=message):
         check_features(lambda: BadFeatures(fault), descriptor_bytes=32)
+
+
+# What the program says is installed, and how to get what is not.
+
+
+def test_missing_packages_extras_and_weights_are_named_with_a_way_to_get_them(monkeypatch, tmp_path) -> None:
+    def version(name: str) -> str:
+        if name in ("gtsam", "pandas"):
+            raise metadata.PackageNotFoundError(name)
+        return "1.2.3"
+
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(installation.metadata, "version", version)
+    monkeypatch.setattr(
+        installation.metadata,
+        "requires",
+        lambda _: ["numpy>=1.26", "pandas>=2.0", "gtsam>=4.2; extra == 'gtsam'", "ruff; extra == 'lint'",
+                   "tomli>=2; python_version < '3.11'"],
+    )  # fmt: skip
+    findings = {(finding.part, finding.name): finding for finding in examine()}
+    assert findings["package", "numpy"].state == "1.2.3" and not findings["package", "numpy"].missing
+    assert findings["package", "pandas"].missing and "pip install" in findings["package", "pandas"].hint
+    assert findings["extra", "gtsam"].hint == "pip install '.[gtsam]' in the checkout of dynslam-bench"
+    assert ("extra", "lint") not in findings
+    coco = findings["weights", "coco"]
+    assert coco.missing and "https://" in coco.hint and str(tmp_path) in coco.hint
+    assert not findings["weights", "embedded"].missing

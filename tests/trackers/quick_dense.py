@@ -1,7 +1,5 @@
 """Settings of a dense flow that finds little, but soon: for tests that ask what a system does with it."""
 
-from __future__ import annotations
-
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.flow.settings import DenseFlowSettings
 

@@ -1,7 +1,5 @@
 """A short, small excerpt on which nearly every online setting of every tracker shows, and a segmenter that errs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 

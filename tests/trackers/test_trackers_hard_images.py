@@ -1,7 +1,5 @@
 """Images as bad cameras give them, through the whole tracker: an honest state on each frame, and recovery after it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

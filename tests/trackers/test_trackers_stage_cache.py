@@ -1,17 +1,19 @@
 """The stage cache in a whole tracker: the same bits, no network loaded where none is needed, honest times."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.settings import flatten
+from dynslam_bench.runs import RunSpec, RunStore, run_many
 from dynslam_bench.sequences.synthetic import open_synthetic
-from dynslam_bench.trackers import TrackerContext, build_tracker
+from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
+from dynslam_bench.trackers.registry import resolve_settings
 
 FRAMES = 4
 
@@ -100,3 +102,27 @@ def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Pat
 def test_a_missing_file_is_an_error_at_once_with_the_cache_too(sequence, tmp_path: Path) -> None:
     with pytest.raises(SegmentationError, match=r"nowhere\.onnx"):
         run(sequence, tmp_path, **{"segmentation.source": f"onnx:{tmp_path / 'nowhere.onnx'}"})
+
+
+# The presets that ship: they fit, change something and act in a run.
+
+
+SHIPPED = [(found.spec.id, name) for found in TRACKERS.all() for name in found.spec.presets]
+
+
+@pytest.mark.parametrize(("tracker", "name"), SHIPPED)
+def test_each_sets_something_else_than_the_default(tracker, name):
+    spec = TRACKERS.get(tracker)
+    default, chosen = flatten(spec.settings()), flatten(resolve_settings(spec, spec.presets[name]))
+    changed = {key for key in chosen if chosen[key] != default[key]}
+    assert changed and changed <= set(spec.presets[name])
+
+
+@pytest.mark.parametrize(("more", "asked"), [({}, [1, 0, 1, 0, 1, 0, 1]), ({"crowded_share": 0.1}, [1] * 7)])
+def test_fast_asks_the_network_on_every_second_frame_but_where_people_cover_the_view(tmp_path, more, asked):
+    settings = {"segmentation.source": "oracle", **TRACKERS.get("mask-rcnn").presets["fast"]}
+    settings |= {f"segmentation.{name}": value for name, value in more.items()}
+    spec = RunSpec(tracker="mask-rcnn", sequence="synthetic/walking_xyz?frames=7", settings=settings)
+    (record,) = run_many([spec], results=tmp_path)
+    frames = pd.read_csv(RunStore(tmp_path).folder(record.run_id) / "frames.csv")
+    assert frames["stat_segmented"].tolist() == asked

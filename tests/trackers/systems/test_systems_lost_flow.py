@@ -1,7 +1,5 @@
 """Features whose flow fails: each published system judges them by its own rule, and by no check that is ours."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

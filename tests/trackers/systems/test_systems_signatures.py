@@ -1,7 +1,5 @@
 """The signature table: published classes by the written rule, measured classes, and the table of a small store."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from itertools import product
