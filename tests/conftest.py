@@ -1,9 +1,24 @@
 import os
+import subprocess
+import sys
 
 import pytest
 
 # The tests start many interpreters, and each would compile the sources that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+COMPILING = pytest.StashKey[subprocess.Popen]()
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels once, beside the first tests: several workers would each compile all of them."""
+    if getattr(session.config.option, "numprocesses", None) and not hasattr(session.config, "workerinput"):
+        code = "from dynslam_bench.cli.demo import compile_kernels; compile_kernels()"
+        session.config.stash[COMPILING] = subprocess.Popen([sys.executable, "-c", code])
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if COMPILING in session.config.stash:
+        session.config.stash[COMPILING].kill()
 
 
 @pytest.fixture(scope="session")

@@ -5,24 +5,21 @@
 Needs the extra: ``pip install '.[gtsam]'``.
 """
 
+import one_thread  # noqa: F401  # before all others
+
+# isort: split
 import argparse
-import os
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+import gtsam
+import numpy as np
 
-import gtsam  # noqa: E402
-import numpy as np  # noqa: E402
-
-from dynslam_bench.geometry import se3  # noqa: E402
-from dynslam_bench.geometry.camera import Camera  # noqa: E402
-from dynslam_bench.slam.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle  # noqa: E402
-from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH  # noqa: E402
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.slam.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
+from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH
 
 FIXED_SIGMA = 1e-5
 """Standard deviation (rad, m) of the prior of a fixed pose; an equality constraint is seven times slower."""

@@ -12,6 +12,9 @@ Bars: less than 1 MB of growth a 1,000 frames after the first fifth, and in the 
 (processor time, median of a tenth of the frames) that it was at a tenth of the way.
 """
 
+import one_thread  # noqa: F401  # before all others
+
+# isort: split
 import argparse
 import json
 import multiprocessing
@@ -22,20 +25,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+import cv2
+import numpy as np
+import torch
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-
-from dynslam_bench.contracts.sequence import FrameMasks, Sequence  # noqa: E402
-from dynslam_bench.core.settings import field_names  # noqa: E402
-from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
-from dynslam_bench.sequences.settings import PreprocessingSettings  # noqa: E402
-from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker  # noqa: E402
+from dynslam_bench.contracts.sequence import FrameMasks, Sequence
+from dynslam_bench.core.settings import field_names
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 
 BAR_MB, BAR_SLOWER = 1.0, 1.2
 

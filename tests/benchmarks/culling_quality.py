@@ -17,29 +17,25 @@ the back end did not get, after the starvation guard. ATE is the online one in m
 sequences.
 """
 
+import one_thread  # noqa: F401  # before all others
+
+# isort: split
 import argparse
-import os
-import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+import cv2
+import numpy as np
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-
-from dynslam_bench.contracts.sequence import FrameMasks  # noqa: E402
-from dynslam_bench.evaluation.evaluate import evaluate  # noqa: E402
-from dynslam_bench.evaluation.protocol import get_protocol  # noqa: E402
-from dynslam_bench.geometry.trajectory import Trajectory  # noqa: E402
-from dynslam_bench.sequences.catalogue import open_sequence  # noqa: E402
-from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
-from dynslam_bench.trackers.registry import TRACKERS  # noqa: E402
+from dynslam_bench.contracts.sequence import FrameMasks
+from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.trackers import TrackerContext, build_tracker
+from dynslam_bench.trackers.registry import TRACKERS
 
 SEQUENCES = [
     f"synthetic/walking_{motion}?scene={100 + number}&frames=300"

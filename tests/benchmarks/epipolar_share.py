@@ -9,22 +9,18 @@ is an id or a folder; masks are those of `segmentation.source`. `--write` puts t
 which `dynslam-bench trackers info` shows.
 """
 
+import one_thread  # noqa: F401  # before all others
+
+# isort: split
 import argparse
 import json
-import os
-import sys
 from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+import numpy as np
 
-import numpy as np  # noqa: E402
-
-from dynslam_bench.envs.slam_env import SlamEnv  # noqa: E402
-from dynslam_bench.runs.frames import FrameLog, FrameRow  # noqa: E402
-from dynslam_bench.trackers import TRACKERS  # noqa: E402
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.runs.frames import FrameLog, FrameRow
+from dynslam_bench.trackers import TRACKERS
 
 TRACKERS_WITH_F = (
     "emfoa-oft", "emfoa-oft?depth=none", "emfoa-oft?flow=lucas-kanade", "emfoa-oft?search=patchmatch",

@@ -14,32 +14,28 @@ the known ones all are `ok` within ten frames. A frame that is `ok` is wrong if 
 from the true one in the world of the first frame, beyond what it was before the loss; a black one always is.
 """
 
+import one_thread  # noqa: F401  # before all others
+
+# isort: split
 import argparse
-import os
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+import cv2
+import numpy as np
+import pandas as pd
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-import pandas as pd  # noqa: E402
-
-from dynslam_bench.contracts.features import Keypoints  # noqa: E402
-from dynslam_bench.contracts.filter import FrameBundle  # noqa: E402
-from dynslam_bench.core.settings import apply_overrides, parse_assignments  # noqa: E402
-from dynslam_bench.features.registry import build_extractor  # noqa: E402
-from dynslam_bench.features.settings import FeatureSettings  # noqa: E402
-from dynslam_bench.geometry import se3  # noqa: E402
-from dynslam_bench.geometry.camera import Camera  # noqa: E402
-from dynslam_bench.segmentation.settings import SegmentationSettings  # noqa: E402
-from dynslam_bench.sequences import open_sequence  # noqa: E402
-from dynslam_bench.slam.backend import RgbdBackend  # noqa: E402
-from dynslam_bench.slam.settings import BackendSettings  # noqa: E402
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.core.settings import apply_overrides, parse_assignments
+from dynslam_bench.features.registry import build_extractor
+from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences import open_sequence
+from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.settings import BackendSettings
 
 SCENES = [
     *(f"synthetic/sitting_{motion}?scene={scene}" for motion in ("xyz", "halfsphere", "rpy") for scene in (3, 103)),

@@ -11,27 +11,23 @@ the culled features of every frame, and the names of the stats. Bits depend on p
 recorded too: on another machine, record at the revision to compare with first.
 """
 
+from one_thread import ROOT  # before all others
+
+# isort: split
 import argparse
 import hashlib
 import json
-import os
 import platform
 import statistics
-import sys
 import time
 from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+import cv2
+import numpy as np
+import torch
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-
-from dynslam_bench.sequences import open_sequence  # noqa: E402
-from dynslam_bench.trackers import TrackerContext, build_tracker  # noqa: E402
+from dynslam_bench.sequences import open_sequence
+from dynslam_bench.trackers import TrackerContext, build_tracker
 
 RECORDED = Path(__file__).with_suffix(".json")
 TRACKERS = (

@@ -160,6 +160,22 @@ def test_empty_lists():
 
 
 @pytest.mark.parametrize(
+    ("first", "second", "max_dt", "strict", "pairs"),
+    [
+        ([0.0], [0.5], 0.5, True, []),
+        ([0.0], [0.5], 0.5, False, [(0, 0)]),
+        ([1.0], [1.0], 0.0, False, [(0, 0)]),
+        ([0.0, 0.010], [0.008], 0.02, True, [(1, 0)]),  # the closer pair wins and the other stamp goes without
+        ([0.008], [0.0, 0.010], 0.02, True, [(0, 1)]),
+    ],
+)
+def test_the_limit_is_strict_or_not_and_the_closer_pair_wins(first, second, max_dt, strict, pairs):
+    indices = associate(first, second, max_dt, strict=strict)
+    assert list(zip(*(index.tolist() for index in indices), strict=True)) == pairs
+    assert not any(index.flags.writeable for index in indices)
+
+
+@pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (([0.0, float("nan")], [0.0], 0.02), "stamp 1 of 2 is nan"),
@@ -175,7 +191,7 @@ def test_bad_input_is_one_clear_line(arguments, text):
 
 
 def test_nearest_gap():
-    assert nearest_gap([0.0, 1.0, 9.0], [0.5, 1.25]).tolist() == [0.5, 0.25, 7.75]
+    assert nearest_gap([0.0, 1.0, 9.0], [1.25, 0.5]).tolist() == [0.5, 0.25, 7.75]
     assert np.isinf(nearest_gap([1.0], [])).all()
 
 

@@ -238,10 +238,10 @@ def with_depth(scene, depth_of):
 @pytest.mark.parametrize("tracker", OURS)
 def test_depth_is_never_read(plain_scene, tracker):
     rng = np.random.default_rng(0)
-    wild = with_depth(scene, lambda frame: rng.uniform(0.1, 9.0, frame.depth.shape).astype(np.float32))
+    wild = with_depth(plain_scene, lambda frame: rng.uniform(0.1, 9.0, frame.depth.shape).astype(np.float32))
     spec = TRACKERS.get(tracker)
     few = {"backend.two_views.min_matches": 40, "backend.two_views.min_points": 25}  # the images are small
-    true = list(play(construct(spec, scene, **few), scene))
+    true = list(play(construct(spec, plain_scene, **few), plain_scene))
     if tracker == "orb-slam2-mono":  # masks that err leave the others too little of so small a room for a map
         assert sum(result.state == "ok" for result in true) >= len(true) // 2
     else:
@@ -249,12 +249,12 @@ def test_depth_is_never_read(plain_scene, tracker):
     assert difference(true, play(construct(spec, wild, **few), wild)) == ""
 
 
-def test_sequences_without_depth_are_for_monocular_trackers_alone(scene):
-    scene.has_depth = False
+def test_sequences_without_depth_are_for_monocular_trackers_alone(plain_scene):
+    plain_scene.has_depth = False
     try:
-        check_sensors(TRACKERS.get("emfoa-oft-mono"), scene)
+        check_sensors(TRACKERS.get("emfoa-oft-mono"), plain_scene)
         with pytest.raises(TrackerError, match=r"'emfoa-oft' needs depth, and .*walking_xyz\?scene=103.* colour"):
-            check_sensors(TRACKERS.get("emfoa-oft"), scene)
+            check_sensors(TRACKERS.get("emfoa-oft"), plain_scene)
     finally:
-        del scene.has_depth
-    check_sensors(TRACKERS.get("emfoa-oft"), scene)
+        del plain_scene.has_depth
+    check_sensors(TRACKERS.get("emfoa-oft"), plain_scene)
