@@ -285,9 +285,9 @@ def test_help_all_shows_every_option(cli):
 STUDY = """
 name = "tiny"
 tracker = "orb-slam2"
-tune = ["synthetic/sitting_xyz?scene=1&frames=8"]
-confirm = ["synthetic/sitting_xyz?scene=2&frames=8"]
-held_out = ["synthetic/sitting_xyz?scene=101&frames=8"]
+tune = ["synthetic/sitting_xyz?scene=1&frames=5"]
+confirm = ["synthetic/sitting_xyz?scene=2&frames=5"]
+held_out = ["synthetic/sitting_xyz?scene=101&frames=5"]
 seeds = [0]
 offsets = [0]
 trials = 2
@@ -311,7 +311,7 @@ def test_a_study(cli, facts, tmp_path):
     assert more["summary"]["trials"]["complete"] == 3 == facts("tune", "status", "study.toml")["complete"]
     assert "not judged" in cli("tune", "best", "study.toml", "--trial", "0")[1]
     assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
-    name = "synthetic/sitting_xyz?scene=1&frames=8"
+    name = "synthetic/sitting_xyz?scene=1&frames=5"
     assert facts("run", "orb-slam2", name, "--settings", "preset.toml")[0]["status"] == "ok"
     assert cli("tune", "report", "study.toml")[1].splitlines()[0] == more["summary"]["conclusion"]
     Path("study.toml").write_text(STUDY.replace("n_features", "n_featurs"))

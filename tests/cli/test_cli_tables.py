@@ -153,7 +153,8 @@ ENCODINGS = {
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_report_is_shown_on_every_terminal(encoding: str, foreign: Path, tmp_path: Path) -> None:
     done = program("report", foreign, "-o", tmp_path, **ENCODINGS[encoding])
-    assert done.returncode == 0 and not done.stderr
+    assert done.returncode == 0
+    assert [line for line in done.stderr.splitlines() if not line.endswith(b"so far")] == []
     assert "caf" in done.stdout.decode("latin-1") and b"?" in done.stdout
     assert LABEL in (tmp_path / "report.md").read_text(encoding="utf-8")
 
