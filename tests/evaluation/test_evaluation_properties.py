@@ -485,12 +485,10 @@ def test_without_ground_truth_there_is_no_error():
 
 
 def test_causal_and_repeatable():
-    error = OnlineError(SHORT)
-    whole = run(error, SHORT, POSES, [True] * len(SHORT))
-    error.reset()
+    whole = run(OnlineError(SHORT), SHORT, POSES, [True] * len(SHORT))
     other = POSES.copy()
     other[30:] = np.eye(4)
-    assert run(error, SHORT, other, [True] * len(SHORT))[:30] == whole[:30]
+    assert run(OnlineError(SHORT), SHORT, other, [True] * len(SHORT))[:30] == whole[:30]
 
 
 def test_the_tolerance_is_strict():
