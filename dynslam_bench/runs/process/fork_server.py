@@ -228,6 +228,7 @@ class _Server:
         with contextlib.suppress(SystemExit):
             while not wait([self.control], _LOOK_S if self.runs else None) or self._accept():
                 self._reap()
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what follows ends by itself
         for pid in self.runs:
             end_tree(pid)
         end_children()

@@ -208,8 +208,13 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
     """Refuse cameras with which ORB-SLAM3 crashes or returns meaningless poses.
 
     Raises:
-        TrackerError: Intrinsics that are none, or an image too small for the pyramid.
+        TrackerError: Another camera model, intrinsics that are none, or an image too small for the pyramid.
     """
+    if type(camera) is not Camera or len(camera.distortion) != 5:
+        raise TrackerError(
+            f"orbslam3 cannot take a {type(camera).__name__} with {len(camera.distortion)} distortion coefficients",
+            "its RGB-D mode knows the pinhole camera with k1 k2 p1 p2 k3 only; undistort the images",
+        )
     values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m, *camera.distortion)
     if not all(math.isfinite(value) for value in values) or min(camera.fx, camera.fy, camera.baseline_m) <= 0:
         raise TrackerError(

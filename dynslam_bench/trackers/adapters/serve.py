@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +24,7 @@ def serve(
     """Answer requests on standard input until ``close`` or its end.
 
     Whatever is written to standard output in the meantime, by C++ threads too, goes to standard error, so that it
-    cannot get between the answers. It returns when its parent has died, too. An exception becomes an ``error``
+    cannot get between the answers. The process also ends when its parent has died. An exception becomes an ``error``
     answer. Only images handed over as ``raw`` are understood.
 
     Args:
@@ -33,6 +35,7 @@ def serve(
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     sys.stdout.flush()
     os.dup2(2, 1)
+    _end_with_parent()
     images: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
     for line in sys.stdin:
         request = json.loads(line)
@@ -73,3 +76,15 @@ def map_images(request: dict[str, Any]) -> tuple[NDArray[np.uint8], NDArray[np.f
     rgb = memory[start : start + height * width * 3].reshape(height, width, 3)
     depth = memory[depth_start : depth_start + height * width * 4].view("<f4").reshape(height, width)
     return rgb, depth
+
+
+def _end_with_parent() -> None:
+    """End this process soon after its parent has died, even if a call never comes back."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -65,13 +65,19 @@ def test_settings_file_holds_our_camera(tmp_path):
     assert stored.getNode("File.version").string() == "1.0" and stored.getNode("Camera.type").string() == "PinHole"
 
 
+class Fisheye(Camera):
+    """Some other model of a plug-in."""
+
+
 @pytest.mark.parametrize(
     "camera, expected",
     [
+        (Fisheye(640, 480, 500.0, 500.0, 320.0, 240.0), "cannot take a Fisheye"),
         (replace(FR1, fx=float("nan")), "fx=nan"),
         (replace(FR1, fy=-516.5), "fy=-516.5"),
         (replace(FR1, baseline_m=0.0), "baseline=0 m"),
         (replace(FR1, distortion=(0.1, float("inf"), 0.0, 0.0, 0.0)), "inf"),
+        (replace(FR1, distortion=(0.1, 0.2, 0.0, 0.0)), "4 distortion coefficients"),
         (replace(FR1, width=320, height=110), "320x110.*needs 117 pixels"),
         (replace(FR1, width=300, height=560), "2.38 times as high as wide"),
     ],
