@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 from typing import Literal
 
@@ -142,8 +143,14 @@ def ratio_interval(log_ratios: Array, weights: Array | None = None) -> Interval:
     if len(values) < FEWEST:
         return Interval(float(np.exp(np.average(values, weights=share))), math.nan, math.nan)
     mean, error, freedom = _weighted_mean(values, share)
-    half = float(scipy.stats.t.ppf(0.975, freedom) * error)
+    half = _quantile(round(freedom, 9)) * float(error)
     return Interval(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))
+
+
+@cache
+def _quantile(freedom: float) -> float:
+    """Student's 97.5 % quantile."""
+    return float(scipy.stats.t.ppf(0.975, freedom))
 
 
 def _weighted_mean(values: Array, weights: Array) -> tuple[Array, Array, float]:
