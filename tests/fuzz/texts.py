@@ -18,7 +18,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.training import labelled_images as labels
 from dynslam_bench.sequences import cameras, catalogue, fetch
-from dynslam_bench.sequences.readers import lists, tum
+from dynslam_bench.sequences.readers import layouts, lists
 from dynslam_bench.sequences.readers import recorded as recorded_sequence
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.slam.settings import TrackingSettings
@@ -90,7 +90,7 @@ def _read_folder(data: bytes | None, folder: Path) -> None:
         at(folder, f"rgb/{name}", _PNG)
         at(folder, f"depth/{name}", _DEPTH)
     camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0)
-    sequence = recorded_sequence.RecordedSequence(folder, tum.read(folder, 30.0), camera, id="fuzz")
+    sequence = recorded_sequence.RecordedSequence(folder, layouts.read_tum(folder, 30.0), camera, id="fuzz")
     files = (*sequence._colour, *sequence._depth)
     assert files and all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)
 

@@ -16,8 +16,7 @@ from dynslam_bench.geometry import Array, Camera, FileNotes, Trajectory, TumFile
 from dynslam_bench.sequences.bags import read_bag_poses
 from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.sequences.readers.lists import read_image_list
-from dynslam_bench.sequences.readers.tables import camera_truth, column, floats, nanoseconds, read_rows
-from dynslam_bench.sequences.readers.vslam_lab import POSE
+from dynslam_bench.sequences.readers.tables import POSE, camera_truth, read_pose_table
 from dynslam_bench.slam.map_files import Cloud
 
 
@@ -42,7 +41,10 @@ def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topi
     if path.is_dir():
         raise TrajectoryError(f"the folder {path} holds neither {IMAGES} of COLMAP nor a bag of ROS 2")
     if is_pose_table(path):
-        return _whole(read_pose_table(path))
+        camera_poses = read_pose_table(path, np.eye(4))
+        if camera_poses is None:
+            raise TrajectoryError(f"no row of {path} holds a rotation")
+        return _whole(camera_poses)
     return load_trajectory(path, timestamps)
 
 
@@ -70,30 +72,6 @@ def is_pose_table(path: Path) -> bool:
     """
     first = next((line for line in read_lines(path, kind=TrajectoryError) if line.strip()), "").lower()
     return "," in first and ("timestamp" in first or "(ns)" in first)
-
-
-def read_pose_table(path: Path) -> Trajectory:
-    """The poses of a table of either kind, as the camera's own.
-
-    Raises:
-        DynslamError: A row is malformed, no row holds a pose, or the heading is of neither kind.
-    """
-    heading, rows = read_rows(path)
-    if POSE[0] in heading:
-        order = [column(heading, name, path) for name in POSE]
-    elif len(heading) >= 8 and "w" in heading[4].lower():
-        order = [0, 1, 2, 3, 5, 6, 7, 4]
-    else:
-        raise TrajectoryError(
-            f"{path} has the columns {', '.join(heading)[:200]}: neither EuRoC's nor VSLAM-LAB's",
-            "EuRoC's fifth is the quaternion's w; VSLAM-LAB's are " + ", ".join(POSE),
-        )
-    picked = [[row[at] for at in order] for row in rows]
-    stamps, values = nanoseconds([row[0] for row in picked], path), floats([row[1:] for row in picked], path)
-    camera_poses = camera_truth(stamps, values, np.eye(4), str(path))
-    if camera_poses is None:
-        raise TrajectoryError(f"none of the {len(rows)} rows of {path} holds a rotation")
-    return camera_poses
 
 
 def write_euroc(path: Path, trajectory: Trajectory) -> None:

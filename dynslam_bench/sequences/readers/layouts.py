@@ -1,18 +1,307 @@
 """Every layout of recorded sequences that is read, and which one a folder has.
 
-A new reader is a module beside this one with ``read(folder, fps) -> Contents``, and a row of `LAYOUTS`
-(``docs/how-to/dataset.md``).
+A new layout is a function ``read(folder, fps) -> Contents`` and a row of `LAYOUTS` (``docs/how-to/dataset.md``). Each
+function raises a `SequenceError` for a file that is missing or malformed and a `TrajectoryError` for such a ground truth.
 """
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
-from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.sequences.readers.lists import Contents
+import numpy as np
+
+from dynslam_bench.core.errors import SequenceError, TrajectoryError
+from dynslam_bench.core.reading import read_text
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.association import nearest_gap
+from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.stamps import from_seconds, to_seconds
+from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry.trajectory_files import TumFile, load_tum, read_stamps, read_table
+from dynslam_bench.sequences.readers.lists import (
+    Contents,
+    ImageList,
+    find_names,
+    list_folder,
+    pinhole,
+    read_associations,
+    read_image_list,
+    stamped,
+)
+from dynslam_bench.sequences.readers.tables import (
+    Array,
+    camera_on_body,
+    nanoseconds,
+    numbers,
+    pick,
+    read_pose_table,
+    read_rows,
+    read_yaml,
+    rigid,
+    section,
+)
+
+MILLIMETRES = 1000.0
+"""Units a metre."""
+
+
+# TUM RGB-D, Bonn Dynamic, Wild-SLAM MoCap, and recordings of one's own.
+
+
+def read_tum(folder: Path, fps: float | None) -> Contents:
+    """Read the lists ``rgb.txt`` and ``depth.txt``, else an ``associations.txt``, else the names of the images.
+
+    `fps` makes stamps of images that are named by frame numbers.
+    """
+    truth, dropped = _tum_truth(folder)
+    if not (folder / "rgb.txt").is_file() and not (folder / "depth.txt").is_file():
+        for name in ("associations.txt", "associated.txt", "associate.txt", "association.txt"):
+            if (folder / name).is_file():
+                colour, depth = read_associations(folder / name)
+                return Contents(colour, depth, paired=True, truth=truth, truth_dropped=dropped)
+    return Contents(_tum_list(folder, "rgb", fps), _tum_list(folder, "depth", fps), False, truth, dropped)
+
+
+def _tum_list(folder: Path, name: str, fps: float | None) -> ImageList:
+    file = folder / f"{name}.txt"
+    return read_image_list(file) if file.is_file() else list_folder(folder, name, fps)
+
+
+def _tum_truth(folder: Path) -> tuple[Trajectory | None, str]:
+    """The ground truth, None if there is no file, and one phrase on the lines that were not taken as they stand."""
+    for name in ("groundtruth.txt", "pose.txt"):
+        if (folder / name).is_file():
+            file = load_tum(folder / name)
+            return file.trajectory, _not_taken(file)
+    return None, ""
+
+
+def _not_taken(file: TumFile) -> str:
+    return ", ".join(f"ground truth: {phrase}" for phrase in file.notes.describe())
+
+
+def read_eth3d(folder: Path, fps: float | None) -> Contents:
+    """ETH3D SLAM: TUM's lists, paired by ``associated.txt``, with the camera in ``calibration.txt``.
+
+    A sequence is published as two archives of one folder: ``*_mono.zip`` (colour, lists, calibration, ground truth) and
+    ``*_rgbd.zip`` (depth and ``associated.txt``).
+    """
+    pairs = folder / "associated.txt"
+    if not pairs.is_file():
+        raise SequenceError(
+            f"{folder} has no associated.txt, that is no depth", "unpack the sequence's _rgbd archive into it as well"
+        )
+    colour, depth = read_associations(pairs)
+    fx, fy, cx, cy = read_table(folder / "calibration.txt", 4, "fx fy cx cy")[0].tolist()
+    camera = pinhole(folder, colour.files[0], fx, fy, cx, cy, 5000.0)
+    truth, dropped = _tum_truth(folder)
+    return Contents(colour, depth, True, truth, dropped, camera, fps or 27.1)
+
+
+_ICL_CAMERA = Camera(640, 480, 481.20, 480.0, 319.5, 239.5)
+_ICL_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def read_icl_nuim(folder: Path, fps: float | None) -> Contents:
+    """ICL-NUIM in its TUM-compatible form: ``rgb/N.png``, ``depth/N.png`` and a ``*.gt.freiburg`` by frame number.
+
+    Its camera has a negative fy: the y axis points up, in images and in poses alike. Turning it down mirrors the camera
+    and the world, ``M T M`` with ``M = diag(1, -1, 1)``, after which fy is positive and every pose is a rotation as
+    before. Its ``associations.txt`` names the depth image first; images are paired by their numbers instead.
+    """
+    rate, files = fps or 30.0, find_names(folder, "*.gt.freiburg")
+    if len(files) > 1:
+        raise SequenceError(f"{folder} holds {len(files)} trajectories ({', '.join(files[:3])[:200]}), expected 1")
+    file = load_tum(folder / files[0])
+    truth = Trajectory(file.trajectory.timestamps / rate, _ICL_MIRROR @ file.trajectory.T_world_cam @ _ICL_MIRROR)
+    colour, depth = list_folder(folder, "rgb", rate), list_folder(folder, "depth", rate)
+    return Contents(colour, depth, False, truth, _not_taken(file), _ICL_CAMERA, rate)
+
+
+_SEVEN_SCENES_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, depth_factor=MILLIMETRES)
+_LOST = ("nan", "inf", "#ind", "#qnan", "#inf")
+
+
+def read_seven_scenes(folder: Path, fps: float | None) -> Contents:
+    """7-Scenes: ``frame-*.color.png``, ``.depth.png`` and ``.pose.txt``, the poses being KinectFusion's 4x4 matrices.
+
+    The poses are camera to world and taken to the last digit. A frame that KinectFusion lost (a pose that is no number)
+    stays a frame without ground truth. Raw depth 65535 is missing.
+    """
+    rate, files = fps or 30.0, find_names(folder, "frame-*.color.png")
+    frames = [name.removeprefix("frame-").removesuffix(".color.png") for name in files]
+    bad = [number for number in frames if not (number.isascii() and number.isdigit() and len(number) < 16)]
+    if bad:
+        raise SequenceError(f"frame-{bad[0][:40]}.color.png of {folder} is named by no number")
+    stamps = from_seconds(int(number) / rate for number in frames)
+    colour = stamped(files, stamps, str(folder))
+    depth = stamped([f"frame-{number}.depth.png" for number in frames], stamps, str(folder))
+    poses = [_kinect_fusion_pose(folder / f"frame-{number}.pose.txt") for number in frames]
+    known = [i for i, pose in enumerate(poses) if pose is not None]
+    tracked = np.array([pose for pose in poses if pose is not None])
+    truth = Trajectory(to_seconds(stamps[known]), tracked, stamps[known]) if known else None
+    lost = len(poses) - len(known)
+    dropped = f"ground truth: {lost} of {len(poses)} poses lost" if lost else ""
+    return Contents(colour, depth, True, truth, dropped, _SEVEN_SCENES_CAMERA, rate, missing_depth=65535)
+
+
+def _kinect_fusion_pose(path: Path) -> Array | None:
+    """A 4x4 pose, unchanged; None where it is no number, as KinectFusion writes a lost frame."""
+    parts = read_text(path, limit=1 << 16, kind=SequenceError).split()
+    if len(parts) == 16 and any(mark in part.lower() for part in parts for mark in _LOST):
+        return None
+    try:
+        return rigid([float(part) for part in parts], str(path))
+    except ValueError:
+        raise SequenceError(f"{path} holds {len(parts)} values, expected the 16 numbers of a 4x4 pose") from None
+
+
+_SHIBUYA_CAMERA = Camera(640, 360, *2 * (772.5483399593904,), 320.0, 180.0, depth_factor=1.0, baseline_m=0.25)
+_T_NED_CAM = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""From optical axes (x right, y down, z forward) to NED axes (x forward, y right, z down)."""
+
+
+def read_tartanair_shibuya(folder: Path, fps: float | None) -> Contents:
+    """TartanAir-Shibuya: ``image_0``, ``depth_0`` (arrays of metres), ``times.txt``, and ``gt_pose.txt`` in NED axes.
+
+    Poses are those of a camera that looks along x, with y to the right and z down. The sky is rendered at thousands of
+    metres and is no measurement.
+    """
+    colour, depth = find_names(folder, "image_0/*.[pj][np]g"), find_names(folder, "depth_0/*.npy")
+    stamps = read_stamps(folder / "times.txt")
+    try:
+        rows = read_table(folder / "gt_pose.txt", 8, "timestamp tx ty tz qx qy qz qw")[:, 1:]
+    except TrajectoryError:
+        rows = read_table(folder / "gt_pose.txt", 7, "tx ty tz qx qy qz qw")
+    if not len(colour) == len(depth) == len(stamps) == len(rows):
+        raise SequenceError(
+            f"{folder} holds {len(colour)} colour images, {len(depth)} depth arrays, {len(stamps)} stamps and "
+            f"{len(rows)} poses, expected as many of each"
+        )
+    if not np.isfinite(rows).all() or (np.linalg.norm(rows[:, 3:], axis=1) < 1e-8).any():
+        raise SequenceError(f"{folder / 'gt_pose.txt'} holds a pose that is none")
+    images, arrays = stamped(colour, stamps, str(folder)), stamped(depth, stamps, str(folder))
+    order = np.argsort(stamps, kind="stable")
+    poses = se3.from_quaternion(rows[order, :3], rows[order, 3:]) @ _T_NED_CAM
+    truth = Trajectory(images.stamps, poses, images.stamps_ns)
+    return Contents(images, arrays, True, truth, camera=_SHIBUYA_CAMERA, fps=fps, furthest_m=1000.0)
+
+
+_LORIS_BASE, _LORIS_CAMERA = "base_link", "d400_color_optical_frame"
+_LORIS_GAP_S = 1.0
+
+
+def read_openloris(folder: Path, fps: float | None) -> Contents:
+    """OpenLORIS-Scene: ``color.txt``, ``aligned_depth.txt``, ``groundtruth.txt`` of the robot's base, two YAML files.
+
+    Intrinsics are in the order fx cx fy cy. The ground truth is that of ``base_link``; ``trans_matrix.yaml`` says where
+    on it the camera sits. Stamps are said to carry a deliberate random bias, another for every sequence, so only those
+    of one sequence may be compared. A ground truth that shares no time with the images is refused.
+    """
+    colour, depth = read_image_list(folder / "color.txt"), read_image_list(folder / "aligned_depth.txt")
+    sensors, transforms = folder / "sensors.yaml", folder / "trans_matrix.yaml"
+    sensor = section(read_yaml(sensors), _LORIS_CAMERA, str(sensors))
+    fx, cx, fy, cy = numbers(sensor, "intrinsics", 4, str(sensors))
+    camera = pinhole(folder, colour.files[0], fx, fy, cx, cy, MILLIMETRES)
+    base, dropped = _tum_truth(folder)
+    if base is None:
+        return Contents(colour, depth, camera=camera, fps=fps)
+    gap = float(nearest_gap(colour.stamps, base.timestamps).min())
+    if gap > _LORIS_GAP_S:
+        raise SequenceError(
+            f"the ground truth of {folder} is never nearer than {gap:.3f} s to an image",
+            "stamps of OpenLORIS carry a bias of their own in every sequence: are both files of the same one?",
+        )
+    for entry in _mappings(section(read_yaml(transforms), "trans_matrix", str(transforms))):
+        if (entry.get("parent_frame"), entry.get("child_frame")) == (_LORIS_BASE, _LORIS_CAMERA):
+            T_base_cam = rigid(numbers(entry, "matrix", 16, str(transforms)), str(transforms))
+            truth = base.with_poses(base.T_world_cam @ T_base_cam)
+            return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
+    raise SequenceError(f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}")
+
+
+def _mappings(value: object) -> list[dict[str, object]]:
+    return [entry for entry in value if isinstance(entry, dict)] if isinstance(value, list) else []
+
+
+def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
+    """VSLAM-LAB: ``rgb.csv`` (stamps in nanoseconds, pairs), ``calibration.yaml``, ``groundtruth.csv``.
+
+    The ground truth is that of the body, on which ``T_BS`` places the camera.
+    """
+    table, poses, where = folder / "rgb.csv", folder / "groundtruth.csv", str(folder / "calibration.yaml")
+    names = ("ts_rgb_0 (ns)", "path_rgb_0", "ts_depth_0 (ns)", "path_depth_0")
+    stamps, files, depth_stamps, depth_files = pick(*read_rows(table), names, table)
+    order = np.argsort(nanoseconds(stamps, table), kind="stable")
+    colour = stamped(files, nanoseconds(stamps, table), str(table))
+    depth = stamped([depth_files[i] for i in order], nanoseconds([depth_stamps[i] for i in order], table), str(table))
+    entries = [entry for value in read_yaml(Path(where)).values() for entry in _mappings(value)]
+    stated = next((entry for entry in entries if entry.get("cam_name") == "rgb_0"), None)
+    if stated is None:
+        raise SequenceError(f"{where} describes no camera 'rgb_0'")
+    width, height = numbers(stated, "image_dimension", 2, where)
+    fx, fy = numbers(stated, "focal_length", 2, where)
+    cx, cy = numbers(stated, "principal_point", 2, where)
+    (factor,) = numbers(stated, "depth_factor", 1, where)
+    kind = stated.get("distortion_type")
+    if kind not in (None, "radtan4", "radtan5"):
+        raise SequenceError(f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5")
+    k = [] if kind is None else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
+    camera = _camera_of(where, width, height, fx, fy, cx, cy, k, factor)
+    truth = read_pose_table(poses, camera_on_body(stated, where)) if poses.is_file() else None
+    return Contents(colour, depth, True, truth, camera=camera, fps=fps or _frame_rate(stated.get("fps")))
+
+
+def read_euroc(folder: Path, fps: float | None) -> Contents:
+    """RGB-D in EuRoC's layout: ``mav0/cam0``, ``mav0/depth0`` (registered), ``mav0/state_groundtruth_estimate0``.
+
+    The folder holds ``mav0`` or is ``mav0`` itself. Stamps are nanoseconds. The ground truth is the body's, its
+    quaternion has w first, and ``T_BS`` of ``cam0`` places the camera on the body. EuRoC itself has no depth:
+    ``depth0`` is what others add, in millimetres unless its ``sensor.yaml`` states a ``depth_factor``.
+    """
+    base = "mav0/" if (folder / "mav0").is_dir() else ""
+    if not (folder / base / "depth0" / "data.csv").is_file():
+        raise SequenceError(
+            f"{folder} has no {base}depth0/data.csv, that is no depth", "EuRoC's own sequences are stereo"
+        )
+    colour, depth = _euroc_images(folder, f"{base}cam0"), _euroc_images(folder, f"{base}depth0")
+    where, depth_file = str(folder / base / "cam0" / "sensor.yaml"), folder / base / "depth0" / "sensor.yaml"
+    sensor = read_yaml(Path(where))
+    width, height = numbers(sensor, "resolution", 2, where)
+    fx, fy, cx, cy = numbers(sensor, "intrinsics", 4, where)
+    k = numbers(sensor, "distortion_coefficients", 4, where)
+    depth_sensor = {"depth_factor": MILLIMETRES, **(read_yaml(depth_file) if depth_file.is_file() else {})}
+    (factor,) = numbers(depth_sensor, "depth_factor", 1, str(depth_file))
+    camera = _camera_of(where, width, height, fx, fy, cx, cy, k, factor)
+    poses = folder / base / "state_groundtruth_estimate0" / "data.csv"
+    truth = read_pose_table(poses, camera_on_body(sensor, where)) if poses.is_file() else None
+    return Contents(colour, depth, truth=truth, camera=camera, fps=fps or _frame_rate(sensor.get("rate_hz")))
+
+
+def _euroc_images(folder: Path, name: str) -> ImageList:
+    path = folder / name / "data.csv"
+    heading, rows = read_rows(path)
+    if len(heading) < 2:
+        raise SequenceError(f"{path} has one column, expected a stamp and a file name")
+    return stamped([f"{name}/data/{row[1]}" for row in rows], nanoseconds([row[0] for row in rows], path), str(path))
+
+
+def _camera_of(where: str, width: float, height: float, fx: float, fy: float, cx: float, cy: float,
+               distortion: list[float], depth_factor: float) -> Camera:  # fmt: skip
+    if min(width, height, fx, fy, depth_factor) <= 0:
+        raise SequenceError(f"{where}: size, focal lengths and depth_factor have to be above 0")
+    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * 5)[:5]
+    return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
+
+
+def _frame_rate(value: object) -> float | None:
+    """A frame rate in Hz that a file states; None where the value is none."""
+    return float(value) if isinstance(value, (int, float)) and 0 < value < 1e6 else None
+
+
+# Which layout a folder has.
 
 
 @dataclass(frozen=True)
@@ -21,13 +310,13 @@ class Layout:
 
     Attributes:
         name: For example ``7-scenes``; the catalogue names it.
-        module: Module of the reader, beside this one; its ``read(folder, fps)`` gives `Contents`.
         marks: A folder has this layout if all of these files are in it (patterns), or in its folder ``mav0``.
+        reader: Reads a folder of this layout, ``reader(folder, fps)``.
     """
 
     name: str
-    module: str
     marks: tuple[str, ...]
+    reader: Callable[[Path, float | None], Contents]
 
     def fits(self, folder: Path) -> bool:
         """Whether a folder has this layout."""
@@ -46,18 +335,18 @@ class Layout:
         """
         if not folder.is_dir():
             raise SequenceError(f"there is no sequence folder {folder}")
-        return cast("Contents", importlib.import_module(f"{__package__}.{self.module}").read(folder, fps))
+        return self.reader(folder, fps)
 
 
-TUM = Layout("tum", "tum", ("rgb.txt",))
+TUM = Layout("tum", ("rgb.txt",), read_tum)
 LAYOUTS = (
-    Layout("eth3d", "eth3d", ("calibration.txt", "associated.txt")),
-    Layout("icl-nuim", "icl_nuim", ("*.gt.freiburg",)),
-    Layout("7-scenes", "seven_scenes", ("frame-*.color.png",)),
-    Layout("tartanair-shibuya", "tartanair_shibuya", ("gt_pose.txt", "times.txt")),
-    Layout("openloris", "openloris", ("color.txt", "aligned_depth.txt")),
-    Layout("vslam-lab", "vslam_lab", ("rgb.csv", "calibration.yaml")),
-    Layout("euroc", "euroc", ("cam0/data.csv",)),
+    Layout("eth3d", ("calibration.txt", "associated.txt"), read_eth3d),
+    Layout("icl-nuim", ("*.gt.freiburg",), read_icl_nuim),
+    Layout("7-scenes", ("frame-*.color.png",), read_seven_scenes),
+    Layout("tartanair-shibuya", ("gt_pose.txt", "times.txt"), read_tartanair_shibuya),
+    Layout("openloris", ("color.txt", "aligned_depth.txt"), read_openloris),
+    Layout("vslam-lab", ("rgb.csv", "calibration.yaml"), read_vslam_lab),
+    Layout("euroc", ("cam0/data.csv",), read_euroc),
     TUM,
 )
 
@@ -73,10 +362,10 @@ def layout_of(name: str) -> Layout:
     Raises:
         SequenceError: There is none of that name.
     """
-    for layout in LAYOUTS:
-        if layout.name == name:
-            return layout
-    raise SequenceError(f"unknown layout '{name}'", f"one of {', '.join(layout.name for layout in LAYOUTS)}")
+    layout = next((layout for layout in LAYOUTS if layout.name == name), None)
+    if layout is None:
+        raise SequenceError(f"unknown layout '{name}'", f"one of {', '.join(layout.name for layout in LAYOUTS)}")
+    return layout
 
 
 def is_bag(path: Path) -> bool:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.core.reading import read_lines, read_text
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import parse_ns, refuse_close, to_seconds
@@ -20,23 +21,16 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import is_number
 from dynslam_bench.sequences.readers.lists import MOST_LINES
 
+Array = NDArray[np.float64]
+
 MOST_BYTES = 1 << 16
 """A calibration has a few kilobytes."""
 MOST_BRACKETS = 1000
 """What opens more takes yaml's parser minutes."""
 
 
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no annotations
-    """Plain values only; OpenCV's matrices are mappings with their numbers under ``data``."""
-
-
-_Loader.add_constructor(
-    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: yaml.SafeLoader.construct_mapping(loader, node, deep=True)
-)
-
-
 def read_yaml(path: Path) -> Mapping[str, Any]:
-    """The mapping that a YAML file holds.
+    """The mapping that a YAML file holds; OpenCV's matrices are mappings with their numbers under ``data``.
 
     Raises:
         SequenceError: It cannot be read, or holds no mapping.
@@ -45,39 +39,14 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
     opened = text.count("[") + text.count("{")
     if opened > MOST_BRACKETS:
         raise SequenceError(f"{path} opens {opened} lists and mappings, more than a calibration's {MOST_BRACKETS}")
-    lines = ["" if line.startswith("%YAML") else line for line in text.split("\n")]
     try:
-        document = yaml.load("\n".join(lines), _Loader)
+        document = yaml.safe_load(re.sub(r"^%YAML.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
     except Exception as error:  # values such as dates make yaml's constructors raise whatever they like
         reason = " ".join(str(error).split())[:200]
         raise SequenceError(f"{path} is no valid YAML: {reason or type(error).__name__}") from error
     if not isinstance(document, Mapping):
         raise SequenceError(f"{path} holds no YAML mapping")
     return document
-
-
-def numbers(value: object, count: int, where: str) -> list[float]:
-    """The numbers of a list, or of a matrix' ``data``.
-
-    Args:
-        value: What the file holds there.
-        count: How many there have to be.
-        where: What it is, for the message.
-
-    Raises:
-        SequenceError: It is no list of so many finite numbers.
-    """
-    data = value.get("data") if isinstance(value, Mapping) else value
-    listed: list[object] = data if isinstance(data, list) else [data]
-    values = [float(x) for x in listed if isinstance(x, (int, float)) and _finite(x)]
-    if not len(values) == len(listed) == count:
-        raise SequenceError(f"{where} holds no {count} numbers")
-    return values
-
-
-def frame_rate(value: object) -> float | None:
-    """A frame rate in Hz that a file states; None where the value is none."""
-    return float(value) if isinstance(value, (int, float)) and 0 < value < 1e6 else None
 
 
 def section(value: object, key: str, where: str) -> Any:
@@ -91,6 +60,27 @@ def section(value: object, key: str, where: str) -> Any:
     return value[key]
 
 
+def numbers(mapping: object, key: str, count: int, where: str) -> list[float]:
+    """The numbers of a list in a mapping, or of a matrix' ``data``.
+
+    Args:
+        mapping: What the file holds.
+        key: Which of its values.
+        count: How many numbers there have to be.
+        where: The file, for the message.
+
+    Raises:
+        SequenceError: There is no such value, or it is no list of so many finite numbers.
+    """
+    value = section(mapping, key, where)
+    data = value.get("data") if isinstance(value, Mapping) else value
+    listed: list[object] = data if isinstance(data, list) else [data]
+    values = [float(x) for x in listed if isinstance(x, (int, float)) and _finite(x)]
+    if not len(values) == len(listed) == count:
+        raise SequenceError(f"{where}: {key} holds no {count} numbers")
+    return values
+
+
 def _finite(value: float) -> bool:
     try:
         return math.isfinite(value)
@@ -100,21 +90,27 @@ def _finite(value: float) -> bool:
 
 # Ground truth of a body that carries the camera, turned into the camera's.
 
-Array = NDArray[np.float64]
+
+def rigid(values: Sequence[float], where: str) -> Array:
+    """The pose ``[4, 4]`` of 16 numbers, unchanged.
+
+    Raises:
+        SequenceError: It is no rigid transformation.
+        ValueError: There are not 16.
+    """
+    pose = np.array(values).reshape(4, 4)
+    if not se3.is_pose(pose, tolerance=1e-3):
+        raise SequenceError(f"{where} holds no rigid transformation")
+    return pose
 
 
-def camera_on_body(value: object, where: str) -> Array:
+def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
     """The camera's pose on the body, ``T_BS`` of EuRoC's files, ``[4, 4]``; the identity where it is not stated.
 
     Raises:
         SequenceError: It is no rigid transformation.
     """
-    if value is None:
-        return np.eye(4)
-    pose = np.array(numbers(value, 16, f"{where}: T_BS")).reshape(4, 4)
-    if not se3.is_pose(pose, tolerance=1e-3):
-        raise SequenceError(f"{where}: T_BS is no rigid transformation")
-    return pose
+    return np.eye(4) if sensor.get("T_BS") is None else rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
 
 
 def camera_truth(stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str) -> Trajectory | None:
@@ -137,6 +133,39 @@ def camera_truth(stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, wher
 
 # Tables in CSV whose stamps are nanoseconds, as EuRoC and VSLAM-LAB write them.
 
+POSE = ("ts (ns)", "tx (m)", "ty (m)", "tz (m)", "qx", "qy", "qz", "qw")
+"""Heading of VSLAM-LAB's tables of poses."""
+
+
+def read_pose_table(path: Path, T_body_cam: Array) -> Trajectory | None:
+    """The camera's poses of a table of EuRoC or VSLAM-LAB; None where no row holds a rotation.
+
+    Args:
+        path: The table.
+        T_body_cam: The camera's pose on the body whose poses the table holds, ``[4, 4]``.
+
+    Raises:
+        DynslamError: A row is malformed, or the heading is of neither kind.
+    """
+    heading, rows = read_rows(path)
+    if POSE[0] in heading:
+        columns = pick(heading, rows, POSE, path)
+    elif len(heading) >= 8 and "w" in heading[4].lower():
+        columns = [[row[at] for row in rows] for at in (0, 1, 2, 3, 5, 6, 7, 4)]
+    else:
+        raise TrajectoryError(
+            f"{path} has the columns {', '.join(heading)[:200]}: neither EuRoC's nor VSLAM-LAB's",
+            "EuRoC's fifth is the quaternion's w; VSLAM-LAB's are " + ", ".join(POSE),
+        )
+    texts = [text for column in columns[1:] for text in column]
+    bad = next((text for text in texts if not is_number(text)), None)
+    if bad is not None:
+        raise SequenceError(f"{path}: '{bad[:40]}' is not a number")
+    values = np.array([float(text) for text in texts]).reshape(7, -1).T
+    if not np.isfinite(values).all():
+        raise SequenceError(f"{path} holds values that are not finite")
+    return camera_truth(nanoseconds(columns[0], path), values, T_body_cam, str(path))
+
 
 def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     """The heading (without ``#``) and the rows of a table, split at commas; every row as long as the heading.
@@ -144,34 +173,31 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     Raises:
         SequenceError: The file cannot be read, has no row, or rows of other lengths.
     """
-    heading: list[str] = []
-    rows: list[list[str]] = []
+    table: list[list[str]] = []
     for number, line in enumerate(read_lines(path, kind=SequenceError), start=1):
         parts = [part.strip() for part in line.strip().lstrip("#").split(",")]
         if not any(parts):
             continue
-        if not heading:
-            heading = parts
-        elif len(parts) != len(heading):
-            raise SequenceError(f"{path} line {number} has {len(parts)} columns, the heading {len(heading)}")
-        elif len(rows) == MOST_LINES:
+        table.append(parts)
+        if len(parts) != len(table[0]):
+            raise SequenceError(f"{path} line {number} has {len(parts)} columns, the heading {len(table[0])}")
+        if len(table) > MOST_LINES:
             raise SequenceError(f"{path} has more than {MOST_LINES} rows")
-        else:
-            rows.append(parts)
-    if not rows:
+    if len(table) < 2:
         raise SequenceError(f"{path} holds no rows")
-    return heading, rows
+    return table[0], table[1:]
 
 
-def column(heading: list[str], name: str, path: Path) -> int:
-    """Index of a column.
+def pick(heading: list[str], rows: list[list[str]], names: Sequence[str], path: Path) -> list[list[str]]:
+    """The columns of these names.
 
     Raises:
-        SequenceError: There is none.
+        SequenceError: One is missing.
     """
-    if name not in heading:
-        raise SequenceError(f"{path} has no column '{name}' (it has: {', '.join(heading)[:200]})")
-    return heading.index(name)
+    missing = [name for name in names if name not in heading]
+    if missing:
+        raise SequenceError(f"{path} has no column '{missing[0]}' (it has: {', '.join(heading)[:200]})")
+    return [[row[heading.index(name)] for row in rows] for name in names]
 
 
 def nanoseconds(texts: list[str], path: Path) -> NDArray[np.int64]:
@@ -187,20 +213,3 @@ def nanoseconds(texts: list[str], path: Path) -> NDArray[np.int64]:
         except (ValueError, ArithmeticError):
             raise SequenceError(f"{path}: '{text[:40]}' is not a stamp in nanoseconds") from None
     return np.array(stamps, dtype=np.int64)
-
-
-def floats(rows: list[list[str]], path: Path) -> NDArray[np.float64]:
-    """Numbers ``[N, K]`` of a table.
-
-    Raises:
-        SequenceError: One is no finite number.
-    """
-    texts = [text for row in rows for text in row]
-    try:
-        values = np.array([float(text) for text in texts])
-    except ValueError:
-        bad = next(text for text in texts if not is_number(text))
-        raise SequenceError(f"{path}: '{bad[:40]}' is not a number") from None
-    if not np.isfinite(values).all():
-        raise SequenceError(f"{path} holds values that are not finite")
-    return values.reshape(len(rows), -1)
