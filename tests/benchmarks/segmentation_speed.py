@@ -20,12 +20,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout tha
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
-from dynslam_bench.segmentation.carry import carry_dense, carry_sparse
 from dynslam_bench.segmentation.networks.backbone import RESNET18, NetworkConfig
 from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.postprocess import dynamic_mask
+from dynslam_bench.segmentation.schedule import carry_dense, carry_sparse
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 

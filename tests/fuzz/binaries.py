@@ -20,11 +20,11 @@ from dynslam_bench.core import images
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.networks import loading
-from dynslam_bench.segmentation.networks import onnx_header as onnx
+from dynslam_bench.segmentation.networks import onnx_segmenter as onnx
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.training.prepared import PreparedImages
-from dynslam_bench.sequences import archives
+from dynslam_bench.segmentation.training.labelled_images import PreparedImages
+from dynslam_bench.sequences import fetch as archives
 from dynslam_bench.sequences.readers import recorded as reader
 from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png
 from dynslam_bench.trackers.adapters import orbslam3 as vocabulary

@@ -7,7 +7,7 @@ import pytest
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation import carry, schedule
+from dynslam_bench.segmentation import schedule
 from dynslam_bench.segmentation.postprocess import boxes_of, dilate, dynamic_mask, fill_holes, repair, select
 from dynslam_bench.segmentation.schedule import MaskScheduler, MissedDetections
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -110,7 +110,7 @@ def scene(shift_x, shift_y=0, scale=1.0, seed=0):
     return image, mask
 
 
-@pytest.mark.parametrize("move", [carry.carry_dense, carry.carry_sparse])
+@pytest.mark.parametrize("move", [schedule.carry_dense, schedule.carry_sparse])
 @pytest.mark.parametrize("motion", [(0, 0, 1.0), (9, 3, 1.0), (-14, 6, 1.05)])
 def test_masks_follow_the_motion(move, motion):
     before, mask = scene(0)
@@ -121,7 +121,7 @@ def test_masks_follow_the_motion(move, motion):
     assert carried.class_names == ("person",) and carried.scores == pytest.approx([0.8])
 
 
-@pytest.mark.parametrize("move", [carry.carry_dense, carry.carry_sparse])
+@pytest.mark.parametrize("move", [schedule.carry_dense, schedule.carry_sparse])
 def test_carrying_nothing_and_carrying_over_black_images(move):
     black = np.zeros((H, W), np.uint8)
     assert len(move(Instances.empty(H, W), black, black)) == 0
@@ -132,9 +132,9 @@ def test_carrying_nothing_and_carrying_over_black_images(move):
 def test_an_exact_flow_moves_masks_exactly():
     mask = block(30, 60, 40, 80)
     flow = np.full((H, W, 2), (7, -4), np.float32)
-    assert np.array_equal(carry.push_mask(mask, flow), block(26, 56, 47, 87))
-    assert not carry.push_mask(mask, flow + 500).any()
-    assert np.array_equal(carry.push_mask(mask, flow[::2, ::2] / 2), block(26, 56, 47, 87))
+    assert np.array_equal(schedule.push_mask(mask, flow), block(26, 56, 47, 87))
+    assert not schedule.push_mask(mask, flow + 500).any()
+    assert np.array_equal(schedule.push_mask(mask, flow[::2, ::2] / 2), block(26, 56, 47, 87))
 
 
 # --- missed detections -------------------------------------------------------------------------------------------

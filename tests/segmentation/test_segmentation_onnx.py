@@ -10,14 +10,15 @@ import pytest
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
-from dynslam_bench.segmentation.networks.onnx_header import TensorInfo, read_header
 from dynslam_bench.segmentation.networks.onnx_segmenter import (
     Layout,
     OnnxSegmenter,
     Placement,
+    TensorInfo,
     decode,
     detect_layout,
     fit,
+    read_header,
 )
 from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings
 

@@ -18,7 +18,8 @@ from sequence_folders import make_folder
 from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.core.images import read_image
 from dynslam_bench.geometry.trajectory_files import load_tum
-from dynslam_bench.sequences import archives, open_sequence
+from dynslam_bench.sequences import fetch as archives
+from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.fetch import MANIFEST, verify
 from dynslam_bench.sequences.readers.lists import read_image_list
 

@@ -18,16 +18,20 @@ from torch.nn import functional
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.segmentation.networks.boxes import BOX_WEIGHTS, RPN_WEIGHTS, box_iou, clip, decode
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import (
     BOX_POOL,
+    BOX_WEIGHTS,
     MIN_BOX_PX,
     MIN_PROPOSAL_PX,
+    RPN_WEIGHTS,
     SAMPLES,
     MaskRCNN,
     anchors_of,
+    box_iou,
+    clip,
+    decode,
     level_scale,
     levels_of,
 )

@@ -24,8 +24,13 @@ from dynslam_bench.segmentation.networks.loading import load_strictly, read_chec
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import paste
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.settings import COCO_NAMES, PRESETS
-from dynslam_bench.segmentation.training.labelled_images import open_labelled
-from dynslam_bench.segmentation.training.prepared import Example, PreparedImages, batch_of, prepare
+from dynslam_bench.segmentation.training.labelled_images import (
+    Example,
+    PreparedImages,
+    batch_of,
+    open_labelled,
+    prepare,
+)
 from dynslam_bench.segmentation.training.settings import TrainProgress, TrainResult, TrainSettings
 
 LOSSES = ("objectness", "anchor", "class", "box", "mask")

@@ -1,7 +1,7 @@
 """Every layout of recorded sequences that is read, and which one a folder has.
 
 A new layout is a function ``read(folder, fps) -> Contents`` and a row of `LAYOUTS` (``docs/how-to/dataset.md``). Each
-function raises a `SequenceError` for a file that is missing or malformed and a `TrajectoryError` for such a ground truth.
+function raises a `SequenceError` for a file that is missing or malformed, a `TrajectoryError` for such a ground truth.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.sequences.synthetic import kernels, sensors
+from dynslam_bench.sequences.synthetic import kernels
 from dynslam_bench.sequences.synthetic.arithmetic import cos, exp, norm, power, product, sin
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
 from dynslam_bench.sequences.synthetic.kernels import NEAR_M, TILE
@@ -312,7 +312,7 @@ class Renderer:
         light, sweep = _LAMPS[1, :3] / _LAMPS[1, 2], 1.6 * sin(2 * math.pi * time / 6.3)
         first = [sweep + light[0] * 1.2, 0.7 + 0.3 * sin(1.1 * time), 1.0, 0.5]
         spots = np.array([first, [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4]])
-        self._rows(lambda a, b: sensors.dim(a, b, _INTRINSICS, pose, depth, light, 2.2, spots, color))
+        self._rows(lambda a, b: kernels.dim(a, b, _INTRINSICS, pose, depth, light, 2.2, spots, color))
 
     def _glare(self, pose: Array, time: float) -> NDArray[np.float32]:
         """A bright veil ``[H, W, 1]`` around a window beside the back wall, brightening and fading."""
@@ -337,7 +337,7 @@ class Renderer:
             return np.clip(np.floor(depth * CAMERA.depth_factor + 0.5), 0, 65535).astype(np.uint16)
         values = sensor.disparity_noise_px, sensor.near_m, sensor.far_m, sensor.edge_px, sensor.dark
         self._rows(
-            lambda a, b: sensors.measure_depth(
+            lambda a, b: kernels.measure_depth(
                 a, b, seed, CAMERA.fx, CAMERA.baseline_m, depth, cosine, color, *values, CAMERA.depth_factor, raw
             )
         )
@@ -355,7 +355,7 @@ class Renderer:
             gain *= optics.gain * power(_MEAN_GREY / mean, optics.auto_exposure)
         seed = self._noise_seed(2 * index + 1)
         read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
-        self._rows(lambda a, b: sensors.expose(a, b, seed, color, gain, read, shot, rgb))
+        self._rows(lambda a, b: kernels.expose(a, b, seed, color, gain, read, shot, rgb))
         return rgb
 
 
