@@ -74,7 +74,7 @@ modified_ns  # trackers.adapters.orbslam3: part of the key of the cached functio
 descriptor_bytes  # FeatureSpec
 median_dt_s  # evaluation
 translation_m  # evaluation: the alignment
-pixels_first  # sequences.truth_checks reads it by name
+pixels_first  # sequences.doctor reads it by name
 pixels_second  # the same
 n_ground_truth  # evaluation
 hole_at_s  # evaluation

@@ -35,23 +35,23 @@ def list_(
     from dynslam_bench.sequences.catalogue import summaries
 
     everything = summaries(data_root=data_root)
-    tags = sorted({name for summary in everything for name in summary.tags})
+    tags = sorted({name for summary in everything for name in summary["tags"]})
     if tag is not None and tag not in tags:
         raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
     patterns = (pattern, f"{pattern.rstrip('/')}/*")
-    matches = [summary for summary in everything if any(fnmatch(summary.id, glob) for glob in patterns)]
+    matches = [summary for summary in everything if any(fnmatch(summary["id"], glob) for glob in patterns)]
     if not matches:
-        ids = [summary.id for summary in everything]
+        ids = [summary["id"] for summary in everything]
         raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, ids))
-    matches = [s for s in matches if (tag is None or tag in s.tags) and (s.here or not here)]
+    matches = [s for s in matches if (tag is None or tag in s["tags"]) and (s["here"] or not here)]
     lines = []
-    for title, members in groupby(matches, key=lambda summary: summary.dataset):
+    for title, members in groupby(matches, key=lambda summary: summary["dataset"]):
         group = list(members)
-        facts = [f"{len(group)} listed, {sum(s.here for s in group)} here", f"licence: {group[0].license}"]
-        facts += [f"layout: {group[0].layout} on the publisher's files"] if group[0].layout else []
-        facts += [f"by hand: {group[0].by_hand}"] if group[0].by_hand else []
+        facts = [f"{len(group)} listed, {sum(s['here'] for s in group)} here", f"licence: {group[0]['license']}"]
+        facts += [f"layout: {group[0]['layout']} on the publisher's files"] if group[0]["layout"] else []
+        facts += [f"by hand: {group[0]['by_hand']}"] if group[0]["by_hand"] else []
         columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum")
-        rows = [(s.id, s.here, s.size, s.tags, s.split, s.ground_truth, s.checksum) for s in group]
+        rows = [(s["id"], s["here"], s["size"], s["tags"], s["split"], s["ground_truth"], s["checksum"]) for s in group]
         lines += [f"{title} ({'; '.join(facts)})", table(columns, rows), ""]
     none = f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"
     present(matches, *(lines or [none]))

@@ -1,10 +1,22 @@
-"""Feature extractors by id: built in or plug-ins (entry-point group ``dynslam_bench.features``)."""
+"""Feature extractors: by id (built in, or plug-ins of the entry-point group ``dynslam_bench.features``), and cached."""
 
 from __future__ import annotations
 
-from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec
+import time
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
 from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.plugins import Registry, build_plugin
+from dynslam_bench.core.records import digest
+from dynslam_bench.core.settings import Reconfigurable, Settings
+from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.features.settings import FeatureSettings
 
 __all__ = ["FEATURES", "ORB", "FeatureSpec"]
@@ -32,3 +44,94 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
     settings = settings or FeatureSettings()
     spec = FEATURES.get(settings.extractor)
     return build_plugin("extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings))  # type: ignore[type-abstract]
+
+
+# Keypoints from the stage cache.
+
+_PACKAGES = ("core", "contracts", "features")
+"""The packages whose code decides what an extractor returns."""
+
+
+class CachedExtractor:
+    """An extractor whose results are stored, addressed by the image, the extractor's code and the settings.
+
+    Args:
+        extractor: The extractor that the settings name.
+        settings: Its settings.
+        cache: Where results are stored.
+        threads: Threads of the extractor, part of the cost.
+
+    Attributes:
+        hit: Whether the last call's result was stored.
+        saved_s: Difference in seconds between the last call's cost without the cache and its wall time: the stored cost
+            less the look-up, or minus the time of storing.
+    """
+
+    def __init__(self, extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int) -> None:
+        self._extractor = extractor
+        self._cache = cache
+        self._threads = threads
+        self._code = code_of(str(getattr(settings, "extractor", "orb")))
+        self._address(settings)
+        self.hit = False
+        self.saved_s = 0.0
+
+    def configure(self, settings: Settings) -> None:
+        """Use other settings, in the extractor too."""
+        if isinstance(self._extractor, Reconfigurable):
+            self._extractor.configure(settings)
+        self._address(settings)
+
+    def _address(self, settings: Settings) -> None:
+        weights = named_digests(settings)
+        self._prefix = digest([self._code, weights, settings.model_dump(mode="json"), machine_digest(), self._threads])
+
+    def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
+        """The keypoints of a uint8 ``[H, W]`` image."""
+        return self._answer([content_digest(gray)], lambda: self._extractor.extract(gray))
+
+    def _answer(self, inputs: list[Any], compute: Callable[[], Keypoints]) -> Keypoints:
+        begin = time.perf_counter()
+        key = digest([self._prefix, *inputs], 32)
+        entry = self._cache.get("features", key)
+        self.hit = entry is not None
+        if entry is not None:
+            keypoints, cost = Keypoints(**entry.arrays), entry.cost_s
+        else:
+            start = time.perf_counter()
+            keypoints = compute()
+            cost = time.perf_counter() - start
+            self._cache.put("features", key, vars(keypoints), cost)
+        self.saved_s = cost - (time.perf_counter() - begin)
+        return keypoints
+
+
+class CachedMaskedExtractor(CachedExtractor):
+    """The same for an extractor with masked extraction."""
+
+    _extractor: MaskedExtractor
+
+    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+        """The keypoints of a uint8 ``[H, W]`` image with a mask; see `MaskedExtractor`."""
+        inputs = [content_digest(gray), content_digest(mask), share]
+        return self._answer(inputs, lambda: self._extractor.extract_masked(gray, mask, share))
+
+
+def cached_extractor(
+    extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int
+) -> CachedExtractor:
+    """The extractor with a cache; with masked extraction if it has that."""
+    kind = CachedMaskedExtractor if isinstance(extractor, MaskedExtractor) else CachedExtractor
+    return kind(extractor, settings, cache, threads)
+
+
+@cache
+def code_of(extractor: str) -> str:
+    """Digest of the code of an extractor: this package's, and a plug-in's own.
+
+    It is read once a process, when the plug-in is loaded: later edits of the file do not change the running code.
+
+    Raises:
+        PluginError: No such extractor, or its code cannot be read.
+    """
+    return code_digest(FEATURES.get(extractor).entry_point, _PACKAGES)

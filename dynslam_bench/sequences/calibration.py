@@ -26,9 +26,7 @@ from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.se3 import hat
-from dynslam_bench.sequences.rgbd_motion import follow_corners
-
-Array = NDArray[np.float64]
+from dynslam_bench.sequences.rgbd_motion import Array, follow_corners
 
 WINDOW_FRAMES = 16
 """Frames of a window, half of which the next one shares: 0.5 s at 30 Hz, in which a hand changes the velocity."""

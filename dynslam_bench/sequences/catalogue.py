@@ -6,8 +6,9 @@ import fnmatch
 import re
 from collections.abc import Iterator
 from collections.abc import Sequence as PySequence
-from dataclasses import dataclass, replace
 from functools import cache
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -111,15 +112,6 @@ def entry_of(name: str) -> CatalogueEntry | None:
 def by_folder() -> dict[str, CatalogueEntry]:
     """The public sequences whose published folder name is like no other, by that name."""
     return {entry.folder: entry for entry in catalogue().values() if entry.distinctive}
-
-
-@cache
-def public_datasets() -> dict[str, CatalogueEntry]:
-    """The public data sets by name, each with its first sequence, in the order of the data files."""
-    first: dict[str, CatalogueEntry] = {}
-    for entry in catalogue().values():
-        first.setdefault(entry.dataset, entry)
-    return first
 
 
 def sequence_ids() -> list[str]:
@@ -261,7 +253,8 @@ def _open_whole(
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
     prefix = name.partition("/")[0]
     datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all()}
-    if not _is_path(name) and "/" in name and prefix in datasets and prefix not in public_datasets():
+    public = {entry.dataset for entry in catalogue().values()}
+    if not _is_path(name) and "/" in name and prefix in datasets and prefix not in public:
         if camera is not None:
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
         return cast("Sequence", load_object(datasets[prefix].entry_point)(name, data_root=data_root))
@@ -303,17 +296,14 @@ def parse_frames(frames: PySequence[int | None] | str | None) -> tuple[int, int 
 # Data sets as plug-ins: each serves the sequences below one prefix, ``tum/...`` for example.
 
 
-OPENERS = "dynslam_bench.sequences.catalogue"
-"""The module that opens sequences of the built-in data sets; loaded when the first one is opened."""
-
-
 def _builtin() -> Iterator[DatasetSpec]:
     """The data sets that come with the package."""
-    for name, first in public_datasets().items():
-        ids = tuple(entry.id for entry in catalogue().values() if entry.dataset == name)
-        yield DatasetSpec(name, f"{OPENERS}:open_public", ids, first.title, first.license, first.citation)
+    for name, group in groupby(catalogue().values(), key=attrgetter("dataset")):
+        first, *others = group
+        ids = tuple(entry.id for entry in (first, *others))
+        yield DatasetSpec(name, f"{__name__}:open_public", ids, first.title, first.license, first.citation)
     summary = "rendered scenes with exact poses, masks and flow"
-    yield DatasetSpec("synthetic", f"{OPENERS}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
+    yield DatasetSpec("synthetic", f"{__name__}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
 
 
 DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
@@ -322,60 +312,36 @@ DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
 # Lists and descriptions for people.
 
 
-@dataclass(frozen=True)
-class Summary:
-    """One line of the list of sequences.
-
-    Attributes:
-        id: Its id.
-        here: Whether it is on this machine; rendered ones are always.
-        size: Size of the archive, for people.
-        tags: For example ``high-dynamic``.
-        split: ``tune``, ``held-out`` or empty.
-        ground_truth: Whether the ground truth is public.
-        license: Licence of the data.
-        url: Where the archive lies.
-        dataset: Name of the data set.
-        layout: How its files were known when the reader was written: ``verified``, ``not verified`` on the publisher's
-            files, or empty where there are none.
-        by_hand: Why this program cannot fetch it; empty where it can.
-        checksum: Whether its checksum is known before it is fetched; None for what is rendered.
-    """
-
-    id: str
-    here: bool
-    size: str = ""
-    tags: tuple[str, ...] = ()
-    split: str = ""
-    ground_truth: bool = True
-    license: str = ""
-    url: str = ""
-    dataset: str = ""
-    layout: str = ""
-    by_hand: str = ""
-    checksum: bool | None = None
-
-
-def summaries(*, data_root: str | Path | None = None) -> list[Summary]:
-    """All listed sequences.
+def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
+    """All listed sequences, in the order of their data sets.
 
     Args:
         data_root: Folder of the sequences.
+
+    Returns:
+        Of each sequence its ``id``, whether it is ``here`` on this machine (rendered ones always are), the ``size`` of
+        its archive for people, ``tags``, ``split``, whether its ``ground_truth`` is public, ``license``, ``url`` and
+        the ``dataset``'s name. ``layout`` says whether the reader was ``verified`` on the publisher's files or ``not
+        verified``; ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before it is
+        fetched, None for what is rendered.
     """
     root, rows = find_data_root(data_root), []
-    for dataset in DATASETS.all():
-        for name in dataset.spec.sequences:
+    for spec in (dataset.spec for dataset in DATASETS.all()):
+        for name in spec.sequences:
             entry = catalogue().get(name)
-            row = Summary(name, True, license=dataset.spec.license, dataset=dataset.spec.summary or dataset.spec.id)
+            row: dict[str, Any] = {
+                "id": name, "here": True, "size": "", "tags": (), "split": "", "ground_truth": True,
+                "license": spec.license, "url": "", "dataset": spec.summary or spec.id, "layout": "", "by_hand": "",
+                "checksum": None,
+            }  # fmt: skip
             if entry is not None:
+                row |= entry.model_dump(include={"tags", "split", "ground_truth", "license", "url", "by_hand"})
                 layout = "verified" if entry.verified else "not verified"
-                row = Summary(
-                    name, entry.find(root) is not None, entry.size_text(), entry.tags, entry.split, entry.ground_truth,
-                    entry.license, entry.url, entry.title, layout, entry.by_hand, entry.sha256 is not None,
-                )  # fmt: skip
-            elif dataset.spec.id == "synthetic":
+                row |= {"here": entry.find(root) is not None, "size": entry.size_text(), "dataset": entry.title,
+                        "layout": layout, "checksum": entry.sha256 is not None}  # fmt: skip
+            elif spec.id == "synthetic":
                 parsed = parse_synthetic_id(name)
-                row = replace(row, size="rendered", tags=(parsed.variant.tag,), split=parsed.split)
+                row |= {"size": "rendered", "tags": (parsed.variant.tag,), "split": parsed.split}
             rows.append(row)
     return rows
 

@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Sequence as PySequence
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.association import nearest_gap
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.rgbd_motion import RgbdPair, rgbd_pairs
+from dynslam_bench.sequences.rgbd_motion import (
+    READINGS,
+    ROTATION_GAIN,
+    ROTATION_NOISE,
+    Array,
+    Match,
+    Motions,
+    RgbdPair,
+    TruthMotion,
+    agreement,
+    match,
+    motions_of,
+    rgbd_pairs,
+    rotation_between,
+    weighted_mean,
+)
 from dynslam_bench.sequences.settings import PreprocessingSettings
-from dynslam_bench.sequences.stream_checks import Finding, Streams, fault, stream_findings
-from dynslam_bench.sequences.truth_checks import RESAVE, truth_findings
 
 MOST_FRAMES = 240
 FEWEST = 10
@@ -170,3 +192,739 @@ def _unopened(
 def _message(error: Exception) -> str:
     """The message of an error on one line, without the hint."""
     return " ".join(str(error.args[0] if error.args else error).split())
+
+
+# Do the colour and depth images of a recording fit together? Statistics of single frames and of short stretches.
+#
+# Contours of depth are contours in the colour image, too, at the same place and time. Their correlation over shifts,
+# mirrorings and delays says whether the depth is registered, which way up the images are, and whether the two streams
+# are synchronous.
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check of a recording found.
+
+    Attributes:
+        id: Stable name, for example ``truth-time-shift``.
+        severity: ``fault``: results on the recording are wrong until it is mended; ``note``: good to know.
+        value: The measured number; None where nothing is measured.
+        unit: Its unit, for example ``s``; empty for a ratio or where nothing is measured.
+        text: One line that says what was measured.
+        cure: What to change, and in which file.
+    """
+
+    id: str
+    severity: Literal["fault", "note"]
+    value: float | None
+    unit: str
+    text: str
+    cure: str
+
+
+def fault(id: str, value: float | None, unit: str, text: str, cure: str) -> Finding:
+    """A finding that makes results on the recording wrong."""
+    return Finding(id, "fault", None if value is None else float(value), unit, text, cure)
+
+
+Map = NDArray[np.float32]
+
+MAP_WIDTH = 160
+"""Width of the maps of contours, in cells; of an image 640 pixels wide a cell is 4 pixels."""
+MOST_DELAY = 10
+"""Largest delay between colour and depth that is looked for, in frames."""
+FLIPS = {"": (1, 1), "upside down": (-1, 1), "mirrored": (1, -1), "turned by 180 degrees": (-1, -1)}
+
+
+@dataclass(eq=False)
+class Streams:
+    """What is kept of the frames that were read, stretch by stretch.
+
+    Attributes:
+        depth_factor: Raw units a metre.
+        seconds_a_frame: Median interval of the stamps.
+        dark: How many frames have a colour image without contrast.
+        empty: How many have no depth.
+        medians: Median depth of each frame that has any, metres.
+        colour_run: Most equal colour images in a row.
+        depth_run: Most equal depth images in a row.
+        rough: Median step between neighbouring raw depths relative to the depth, and the same with swapped bytes.
+        contours: Of each stretch the maps of contours of its colour and of its depth images, both ``[N, H, W]``.
+        cell_px: Pixels a cell of the maps.
+    """
+
+    depth_factor: float
+    seconds_a_frame: float
+    dark: int = 0
+    empty: int = 0
+    medians: list[float] = field(default_factory=list)
+    colour_run: int = 1
+    depth_run: int = 1
+    rough: list[tuple[float, float]] = field(default_factory=list)
+    contours: list[tuple[Map, Map]] = field(default_factory=list)
+    cell_px: int = 1
+
+    @property
+    def frames(self) -> int:
+        """How many frames were added."""
+        return sum(len(colour) for colour, _ in self.contours)
+
+    def add(self, stretch: list[Frame]) -> None:
+        """Add consecutive frames of one size."""
+        colour_maps, depth_maps = [], []
+        self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
+        self.colour_run = max(self.colour_run, _longest_run([frame.rgb for frame in stretch]))
+        self.depth_run = max(self.depth_run, _longest_run([frame.depth for frame in stretch]))
+        for number, frame in enumerate(stretch):
+            gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+            valid = frame.depth[::4, ::4]
+            valid = valid[valid > 0]
+            self.dark += bool(gray.std() < 1.0)
+            self.empty += bool(len(valid) < 100)
+            if len(valid) >= 100:
+                self.medians.append(float(np.median(valid)))
+                if number % 5 == 0:
+                    self.rough.append(_roughness(frame.depth, self.depth_factor))
+            colour_maps.append(_standardised(_colour_contours(gray, self.cell_px)))
+            depth_maps.append(_standardised(_depth_contours(frame.depth, self.cell_px)))
+        self.contours.append((np.stack(colour_maps), np.stack(depth_maps)))
+
+
+def _longest_run(images: list[NDArray[Any]]) -> int:
+    """Most equal images in a row."""
+    longest = run = 1
+    for before, after in itertools.pairwise(images):
+        run = run + 1 if np.array_equal(before, after) else 1
+        longest = max(longest, run)
+    return longest
+
+
+def _correlation(colour: Map, depth: Map) -> Map:
+    """Sum of the circular correlations ``[H, W]`` of maps of the colour with maps of the depth, both ``[N, H, W]``."""
+    spectrum = (np.fft.rfft2(colour) * np.conj(np.fft.rfft2(depth))).sum(axis=0)
+    return np.fft.irfft2(spectrum, s=colour.shape[1:]).astype(np.float32)
+
+
+def _by_delay(streams: Streams, delays: PySequence[int]) -> tuple[Map, NDArray[np.intp]]:
+    """Correlation of every second colour image with the depth so many frames later.
+
+    Returns:
+        Sums over all pairs ``[D, H, W]``, and how many pairs each sums ``[D]``.
+    """
+    shape = streams.contours[0][0].shape[1:]
+    surfaces, pairs = np.zeros((len(delays), *shape), np.float32), np.zeros(len(delays), np.intp)
+    for colour, depth in streams.contours:
+        colours, depths = np.fft.rfft2(colour), np.conj(np.fft.rfft2(depth))
+        for row, delay in enumerate(delays):
+            index = np.arange(0, len(colour), 2)
+            index = index[(index + delay >= 0) & (index + delay < len(depth))]
+            spectrum = (colours[index] * depths[index + delay]).sum(axis=0)
+            surfaces[row] += np.fft.irfft2(spectrum, s=shape).astype(np.float32)
+            pairs[row] += len(index)
+    return surfaces, pairs
+
+
+def _roughness(depth: Map, factor: float) -> tuple[float, float]:
+    raw = np.clip(np.round(depth[::2].astype(np.float64) * factor), 0, 65535).astype(np.uint16)
+    both = (raw[:, 1:] > 0) & (raw[:, :-1] > 0)
+    if both.sum() < 100:
+        return np.nan, np.nan
+    wide = np.stack([raw, raw.byteswap()]).astype(np.float64)
+    steps = np.minimum(np.abs(np.diff(wide, axis=2)) / np.maximum(wide[:, :, 1:], 1), 1)[:, both].mean(axis=1)
+    return float(steps[0]), float(steps[1])
+
+
+def _colour_contours(gray: NDArray[np.uint8], cell: int) -> Map:
+    small = cv2.resize(gray, (gray.shape[1] // cell, gray.shape[0] // cell), interpolation=cv2.INTER_AREA)
+    wide = small.astype(np.float32)
+    return np.asarray(np.sqrt(np.hypot(cv2.Sobel(wide, -1, 1, 0), cv2.Sobel(wide, -1, 0, 1))), np.float32)
+
+
+def _depth_contours(depth: Map, cell: int) -> Map:
+    """The step in depth around each cell, as a logarithm; missing depth is no contour."""
+    rows, columns = depth.shape[0] // cell, depth.shape[1] // cell
+    blocks = depth[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
+    around, least = np.ones((3, 3), np.uint8), np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3))
+    far, near = cv2.dilate(blocks.max(axis=(1, 3)), around), cv2.erode(least.astype(np.float32), around)
+    valid = (far > 0) & np.isfinite(near)
+    steps = np.log(np.where(valid, far / np.where(valid, near, 1), 1))
+    return np.where(valid, np.minimum(steps, 0.3), 0).astype(np.float32)
+
+
+def _standardised(values: Map) -> Map:
+    """Without slow changes across the image, with zero mean and unit length."""
+    sharp = values - cv2.blur(values, (25, 25))
+    sharp -= sharp.mean()
+    return np.asarray(sharp / max(float(np.linalg.norm(sharp)), 1e-9), np.float32)
+
+
+FROZEN_FRAMES = 4
+LEAST_SHIFT_PX = 14.0
+"""A shift of the depth below this occurs in published data: 7-Scenes' depth is not registered to its colour."""
+LEAST_DELAY = 2
+"""In frames; the first Kinect's depth lags by nearly one."""
+CLEAR_PEAK = 7.0
+"""Of a correlation, in standard deviations over all shifts: what has nothing in common stays below 6."""
+DEPTH_RANGE_M = (0.1, 60.0)
+
+
+def stream_findings(streams: Streams, with_depth: bool = True) -> list[Finding]:
+    """What is wrong with the images alone, the most basic fault first; what follows from a fault is not repeated.
+
+    Args:
+        streams: Statistics of the frames that were read.
+        with_depth: Whether the sequence announces depth images.
+    """
+    for check in (_empty, _frozen, _swapped, _units, _flipped, _asynchronous, _shifted) if with_depth else (_empty,):
+        finding = check(streams)
+        if finding is not None and (with_depth or finding.id == "colour-blank"):
+            return [finding]
+    text = "the sequence has no depth images: only the colour images were checked"
+    return [] if with_depth else [Finding("no-depth", "note", None, "", text, "add depth images to check more")]
+
+
+def _empty(streams: Streams) -> Finding | None:
+    for id, count, text, cure in (
+        ("colour-blank", streams.dark, "colour images hold one brightness only", "record or export the colour again"),
+        ("depth-empty", streams.empty, "depth images hold no depth",
+         "record or export the depth again, or use trackers that need none"),
+    ):  # fmt: skip
+        if count >= 0.5 * streams.frames:
+            return fault(id, count / streams.frames, "", f"{count} of {streams.frames} {text}", cure)
+    return None
+
+
+def _frozen(streams: Streams) -> Finding | None:
+    colour, depth = streams.colour_run >= FROZEN_FRAMES, streams.depth_run >= FROZEN_FRAMES
+    if colour == depth:  # a rendered camera at rest repeats both; the truth says whether it rests
+        return None
+    run, name, other = (streams.colour_run, "colour", "depth") if colour else (streams.depth_run, "depth", "colour")
+    text = f"one {name} image is repeated in {run} or more successive frames while the {other} changes"
+    return fault(f"{name}-frozen", run, "frames", text, f"export the {name} images again")
+
+
+def _swapped(streams: Streams) -> Finding | None:
+    stated, swapped = np.nanmedian(np.array(streams.rough or [(np.nan, np.nan)]), axis=0)
+    if not swapped < stated / 3:
+        return None
+    text = (
+        f"neighbouring depths differ by {100 * stated:.0f} % on average, by {100 * swapped:.1f} % with the bytes of "
+        "each value swapped"
+    )
+    cure = "write the 16-bit depth images in the machine's byte order (PNG stores big-endian by itself)"
+    return fault("depth-byte-order", stated, "", text, cure)
+
+
+def _units(streams: Streams) -> Finding | None:
+    median, factor = float(np.median(streams.medians)), streams.depth_factor
+    if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
+        return None
+    text = f"the median depth is {median:.3g} m with {factor:g} raw units a metre"
+    likely = next((f for f in (1.0, 100.0, 1000.0, 5000.0) if 0.4 < median * factor / f < 8), factor)
+    cure = f"set depth_factor in camera.toml (here perhaps {likely:g}), or store arrays in metres"
+    return fault("depth-units", median, "m", text, cure)
+
+
+def _flipped(streams: Streams) -> Finding | None:
+    peaks = {}
+    for name, (rows, columns) in FLIPS.items():
+        parts = [_correlation(colour[::4], depth[::4, ::rows, ::columns]) for colour, depth in streams.contours]
+        peaks[name] = _peak(np.sum(parts, axis=0), 8)[0]
+    best = max(peaks, key=lambda name: peaks[name])
+    if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
+        return None
+    text = (
+        f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard "
+        f"deviations so, by {peaks['']:.0f} as stored"
+    )
+    return fault("colour-flipped", peaks[best], "sigma", text, "turn the colour images as the depth images are")
+
+
+def _asynchronous(streams: Streams) -> Finding | None:
+    rows = np.concatenate([_agreements(colour, depth) for colour, depth in streams.contours])
+    pairs = np.isfinite(rows).sum(axis=0)
+    usable = pairs >= max(10, 0.3 * len(rows))
+    surfaces, _ = _by_delay(streams, range(-MOST_DELAY, MOST_DELAY + 1))
+    peaks = np.array([_peak(surface, 30)[0] if good else 0.0 for surface, good in zip(surfaces, usable, strict=True)])
+    mean = np.where(usable, np.nansum(rows, axis=0) / np.maximum(pairs, 1), -np.inf)
+    column = int(np.argmax(mean))
+    delay = float(column - MOST_DELAY)
+    if abs(delay) < LEAST_DELAY or peaks[column] < CLEAR_PEAK:
+        return None
+    near = slice(MOST_DELAY - 1, MOST_DELAY + 2)
+    reference = MOST_DELAY - 1 + int(np.argmax(mean[near]))
+    better = rows[:, column] - rows[:, reference]
+    better = better[np.isfinite(better)]
+    sure = float(better.mean() / max(better.std() / np.sqrt(len(better) / 5), 1e-9))
+    if sure < 4 or mean[column] < 1.25 * max(mean[reference], 0) or peaks[column] < 1.1 * peaks[near].max():
+        return None
+    around = mean[max(column - 1, 0) : column + 2]
+    if len(around) == 3 and np.isfinite(around).all():  # the vertex of the parabola through the peak
+        delay += float((around[0] - around[2]) / (2 * (around[0] - 2 * around[1] + around[2])))
+    seconds = delay * streams.seconds_a_frame
+    text = (
+        f"the depth images fit the colour images of {abs(delay):.1f} frames {'before' if delay > 0 else 'after'} "
+        f"({abs(seconds):.2f} s): their contours agree {mean[column] / max(mean[MOST_DELAY], 0.01):.1f} times as well"
+    )
+    cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt"
+    return fault("depth-delay", seconds, "s", text, cure)
+
+
+def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
+    """Correlation of the contours of each colour image with those of depth images before and after it.
+
+    ``[N, 2 * MOST_DELAY + 1]``; NaN beyond the stretch.
+    """
+    colour, depth = (
+        np.stack([cv2.GaussianBlur(contours, (0, 0), 1.0).ravel() for contours in maps])
+        for maps in (colour_maps, depth_maps)
+    )
+    products, scores = colour @ depth.T, np.full((len(colour), 2 * MOST_DELAY + 1), np.nan)
+    for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
+        diagonal, first = np.diagonal(products, delay), max(0, -delay)
+        scores[first : first + len(diagonal), column] = diagonal
+    return scores
+
+
+def _shifted(streams: Streams) -> Finding | None:
+    sums, pairs = _by_delay(streams, (-1, 0, 1))
+    middle = sums / np.maximum(pairs, 1)[:, None, None]
+    peaks = [(*_peak(surface, 30), surface) for surface in middle]
+    clear, (row, column), surface = max(peaks, key=lambda peak: float(peak[2][peak[1]]))
+    shape = middle.shape[1:]
+    down, right = (row + shape[0] // 2) % shape[0] - shape[0] // 2, (column + shape[1] // 2) % shape[1] - shape[1] // 2
+    size = float(np.hypot(down, right)) * streams.cell_px
+    rolled = np.roll(middle, (2, 2), (1, 2))[:, :5, :5]
+    if size < LEAST_SHIFT_PX or clear < CLEAR_PEAK or surface[row, column] < 1.4 * rolled.max():
+        return None
+    text = (
+        f"the depth lies {size:.0f} pixels beside the colour ({-right * streams.cell_px:+d} right, "
+        f"{-down * streams.cell_px:+d} down)"
+    )
+    return fault("depth-not-registered", size, "px", text, "register the depth to the colour camera")
+
+
+def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
+    """Height in standard deviations and place of the peak within `reach` cells of no shift."""
+    height, width = surface.shape
+    reach_y, reach_x = min(reach, height // 2 - 1), min(reach, width // 2 - 1)
+    near = np.roll(surface, (reach_y, reach_x), (0, 1))[: 2 * reach_y + 1, : 2 * reach_x + 1]
+    y, x = np.unravel_index(int(near.argmax()), near.shape)
+    deviation = (float(near[y, x]) - float(surface.mean())) / max(float(surface.std()), 1e-12)
+    return deviation, ((int(y) - reach_y) % height, (int(x) - reach_x) % width)
+
+
+# Does the ground truth of a recording agree with the motion that its images show?
+#
+# The motion between frames (`rgbd_motion`) is compared with that of the truth: as stored, shifted in time, inverted,
+# with its quaternions read in the other order, in other axes. Where the two agree, camera and depth are measured by
+# them.
+
+total = attrgetter("total")
+
+LARGEST_SHIFT_S = 2.0
+SAME_FRAME_S = 0.02
+LEAST_COVERAGE = 0.15
+LEAST_PAIRS = 8
+REST_PX = 2.0
+GOOD = 0.75
+"""`Match.total` of a truth that agrees with the motion; 0.78 to 0.98 in healthy recordings, else up to 0.5."""
+SURE = 0.86
+"""The same for a shift in time of a recording that is shorter than the range of shifts searched, or has few pairs: one
+of 160 shifts fits by chance to 0.84."""
+MANY_PAIRS = 25
+UNLIKE = 0.6
+LEAST_TIME_S = 0.05
+UNRELATED = 0.48
+"""The best agreement of a truth of another recording stays below; where moving things fill the view it is 0.55."""
+LEAST_UNLIKE = 12
+_STEP_S = 0.025
+RESAVE = "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
+_CURES = {
+    "inverted": ("truth-inverted", "the poses are world-to-camera", "invert them: p -> -R^T p, R -> R^T"),
+    "w first": ("truth-quaternion-order", "the quaternions are in the order qw qx qy qz", RESAVE),
+    "w first, inverted": (
+        "truth-quaternion-order",
+        "the quaternions are in the order qw qx qy qz, and the poses are world-to-camera",
+        RESAVE,
+    ),
+    "rotations inverted": (
+        "truth-inverted",
+        "the rotations are world-to-camera while the positions are the camera's",
+        "invert the rotations: conjugate the quaternions",
+    ),
+}
+
+
+def truth_findings(
+    stamps: Array, truth: Trajectory | None, camera: Camera, pairs: PySequence[RgbdPair]
+) -> list[Finding]:
+    """What the truth of a recording does not share with its images, then what camera and depth do not.
+
+    Args:
+        stamps: Stamps of the frames.
+        truth: Poses at their stamps; None if there are none.
+        camera: The stated camera.
+        pairs: Pairs of frames and their motions.
+    """
+    if truth is None:
+        text = "there is no ground truth: units of the depth, intrinsics and time were not compared with any"
+        return [Finding("no-truth", "note", None, "", text, "add groundtruth.txt to check more")]
+    begin, end = truth.timestamps[[0, -1]]
+    apart = max(begin - stamps[-1], stamps[0] - end)
+    if apart > 0:
+        text = (
+            f"truth and images share no time: {begin:.3f} to {end:.3f} s and {stamps[0]:.3f} to {stamps[-1]:.3f} s, "
+            f"{apart:.3f} s apart"
+        )
+        cure = "take the groundtruth.txt of this recording, or put its stamps on the images' clock"
+        return [fault("truth-other-sequence", float(apart), "s", text, cure)]
+    covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
+    if covered < max(LEAST_COVERAGE * len(stamps), 3):
+        text = f"{covered} of {len(stamps)} frames have a true pose within {SAME_FRAME_S} s"
+        return [fault("truth-sparse", covered, "frames", text, "export the truth of all frames again")]
+    usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
+    displacement = float(np.median([pair.displacement_px for pair in usable])) if usable else np.inf
+    if displacement < REST_PX and len(usable) >= 3:
+        return [_at_rest(TruthMotion(truth), camera, motions_of(usable, stamps), displacement)]
+    if len(usable) < LEAST_PAIRS:
+        text = (
+            f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: "
+            "truth and camera were not compared"
+        )
+        return [
+            Finding("motion-unmeasured", "note", float(len(usable)), "pairs", text, "check a part with more texture")
+        ]
+    return _compared(stamps, truth, camera, [pair for pair in usable if pair.displacement_px >= REST_PX], len(pairs))
+
+
+def _at_rest(truth: TruthMotion, camera: Camera, motions: Motions, displacement: float) -> Finding:
+    """Images that do not move beside a truth that does, or does not either."""
+    _, relative, turns, valid = truth.between(motions.start, motions.end)
+    moves = np.linalg.norm(turns, axis=1) + np.linalg.norm(relative[:, :3, 3], axis=1) / motions.depth_m
+    expected = camera.fx * float(np.median(moves[valid])) if valid.any() else 0.0
+    if expected > 10 * REST_PX:
+        text = f"the truth moves the image by {expected:.0f} pixels between frames that move by {displacement:.1f}"
+        return fault("truth-other-sequence", expected, "px", text, "take the truth of this recording")
+    text = f"the camera rests (the image moves by {displacement:.1f} pixels): truth and intrinsics cannot be compared"
+    return Finding("no-motion", "note", displacement, "px", text, "check a part in which the camera moves")
+
+
+def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair], tried: int) -> list[Finding]:
+    motions = motions_of(pairs, stamps)
+    readings = {reading: TruthMotion(truth, reading) for reading in READINGS}
+    steps = round(LARGEST_SHIFT_S / _STEP_S)
+    shifts = _STEP_S * np.arange(-steps, steps + 1)  # exact multiples: the same limits early and late
+    every = [match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts]
+    matches = [candidate for candidate in every if candidate.share >= 0.5]
+    near = [one for one in matches if one.reading == READINGS[0] and abs(one.shift_s) < LEAST_TIME_S]
+    if not near or sum(near[0].weights) < 0.4:
+        text = f"only {len(pairs)} pairs of frames with a small motion share time with the truth: it cannot be compared"
+        return [Finding("motion-unmeasured", "note", float(len(pairs)), "pairs", text, "check a longer part")]
+    stated, best = max(near, key=total), max(matches, key=total)
+    unshifted = min(near, key=lambda one: abs(one.shift_s))
+    if unshifted.total > stated.total - 0.02:
+        stated = unshifted
+    differs = best.reading != READINGS[0] or abs(best.shift_s) >= LEAST_TIME_S
+    long = len(pairs) >= MANY_PAIRS and float((motions.end - motions.start).sum()) >= 2 * LARGEST_SHIFT_S
+    needed = GOOD if long or abs(best.shift_s) < LEAST_TIME_S else SURE
+    now, then = stated.clearest, best.clearest
+    if differs and then >= needed and 1 - then < 0.65 * (1 - now) and now < then - 0.05:
+        turned = None if best.reading == READINGS[0] else _turned(motions, readings[READINGS[0]], stated, best)
+        return _misread(motions, readings, stated, best) if turned is None else [turned]
+    if stated.rotation >= UNLIKE and stated.weights[0] >= 0.3:
+        return _measured(motions, readings[READINGS[0]], stated, camera, pairs)
+    return _otherwise(motions, readings, stated, best, tried)
+
+
+def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match) -> list[Finding]:
+    findings = []
+    fine = [match(motions, readings[best.reading], best.reading, best.shift_s + d) for d in np.arange(-5, 6) * 0.005]
+    shift = max(fine, key=total).shift_s
+    so = f"so they explain {100 * best.clearest:.0f} % of the images' motion, as stored {100 * stated.clearest:.0f} %"
+    if best.reading != READINGS[0]:
+        name, text, cure = _CURES[best.reading]
+        findings.append(fault(name, best.total, "", f"{text}: {so}", cure))
+    if abs(shift) >= LEAST_TIME_S:
+        when = "late" if shift > 0 else "early"
+        text = f"the truth is {abs(shift):.3f} s {when}: {so.replace('they explain', 'it explains')}"
+        change = "subtract {} s from" if shift > 0 else "add {} s to"
+        cure = f"{change.format(f'{abs(shift):.3f}')} the stamps of the truth"
+        findings.append(fault("truth-time-shift", shift, "s", text, cure))
+    return findings
+
+
+def _otherwise(
+    motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match, tried: int
+) -> list[Finding]:
+    """A truth that agrees with the motion in no convention: in other axes, or not at all."""
+    closest = best.total
+    for reading in READINGS[:3]:
+        for shift in np.arange(-4, 5) * 0.025 if reading == READINGS[0] else (0.0,):
+            _, _, turns, valid = readings[reading].between(motions.start + shift, motions.end + shift)
+            if valid.mean() < 0.5:
+                continue
+            measured, true = motions.rotation[valid], turns[valid]
+            X = rotation_between(measured, true)
+            alike = agreement(measured @ X.T, true, ROTATION_GAIN)
+            closest = max(closest, alike)
+            if alike >= GOOD and reading == READINGS[0]:
+                return [_axes(X, alike, stated)]
+    enough = stated.weights[0] >= 0.5 and len(motions.start) >= LEAST_UNLIKE and len(motions.start) >= 0.5 * tried
+    if enough and closest < UNRELATED:
+        text = (
+            f"the truth explains at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames "
+            f"show, under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
+        )
+        return [fault("truth-other-sequence", closest, "", text, "take the truth of this recording")]
+    text = (
+        f"the truth explains {100 * stated.total:.0f} % of the motion between the frames, too little to compare more: "
+        "it may belong to another recording"
+    )
+    cure = "make sure that groundtruth.txt is this recording's, or check a part with a clearer motion"
+    return [Finding("truth-unclear", "note", stated.total, "", text, cure)]
+
+
+def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) -> Finding | None:
+    """Other axes, where these explain rotations and translations better than another reading of the file."""
+    _, relative, turns, valid = truth.between(motions.start, motions.end)
+    X = rotation_between(motions.rotation[valid], turns[valid])
+    rotation = agreement(motions.rotation[valid] @ X.T, turns[valid], ROTATION_GAIN)
+    translation = agreement(motions.translation[valid] @ X.T, relative[valid, :3, 3])
+    total = weighted_mean(rotation, translation, stated.weights)
+    return _axes(X, rotation, stated) if total > best.total + 0.03 else None
+
+
+def _degrees(X: Array) -> float:
+    """The angle of an orthogonal matrix."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(X) - 1) / 2, -1, 1))))
+
+
+def _axes(X: Array, alike: float, stated: Match) -> Finding:
+    angle = _degrees(X)
+    text = (
+        f"the truth's axes are turned by {angle:.0f} degrees against the camera's: so they explain "
+        f"{100 * alike:.0f} % of the images' rotation, as stored {100 * stated.rotation:.0f} %"
+    )
+    return fault("truth-axes", angle, "degrees", text, _turn(X))
+
+
+def _turn(R_body_cam: Array) -> str:
+    """How to give a truth the camera's axes; a rotation within 20 degrees of swapped axes is written as such."""
+    swapped = np.round(R_body_cam)
+    near = not np.array_equal(swapped, np.eye(3)) and np.trace(swapped.T @ R_body_cam) > 1 + 2 * np.cos(np.radians(20))
+    rows = [", ".join(f"{value:g}" for value in row) for row in (swapped if near else R_body_cam.round(3)) + 0.0]
+    return f"multiply each rotation of groundtruth.txt from the right by [{'; '.join(rows)}]"
+
+
+def _measured(
+    motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: PySequence[RgbdPair]
+) -> list[Finding]:
+    """Of a truth whose rotations are the camera's: units, positions' axes, then camera, depth and lever arm."""
+    first, relative, turns, valid = truth.between(motions.start + stated.shift_s, motions.end + stated.shift_s)
+    size = np.linalg.norm(motions.rotation, axis=1) + np.linalg.norm(turns, axis=1) + 2 * ROTATION_NOISE
+    agreeing = valid & (np.linalg.norm(motions.rotation - turns, axis=1) < 0.5 * size)
+    if agreeing.sum() < LEAST_PAIRS:
+        return []
+    relative, clear = relative[agreeing], stated.weights[1] >= 0.4
+    if stated.gain < 0.05:
+        return [_scale(1 / stated.gain, camera, motions)]
+    fitted = _fitted([pair for pair, use in zip(pairs, agreeing, strict=True) if use], relative, camera)
+    if not fitted and clear and stated.translation >= 0.7 and abs(np.log(stated.gain)) > np.log(1.5):
+        return [_scale(1 / stated.gain, camera, motions)]
+    if not fitted and clear and stated.translation < UNLIKE:
+        return _positions(motions.translation[agreeing], first[agreeing, :3, :3], relative[:, :3, 3], stated)
+    return fitted
+
+
+def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
+    """The true translations are `factor` times the measured ones."""
+    text = f"the truth's translations are {factor:.4g} times the measured ones (median depth {motions.depth_m:.2f} m)"
+    if factor > 30 and 0.15 < motions.depth_m < 20:
+        unit, divisor = ("millimetres", 1000) if factor > 300 else ("centimetres", 100)
+        cure = f"divide the positions of groundtruth.txt by {divisor}"
+        return fault("truth-scale", factor, "", f"{text}: they are in {unit}", cure)
+    cure = f"set depth_factor = {camera.depth_factor / factor:.4g} in camera.toml (it is {camera.depth_factor:g})"
+    return fault("depth-factor", factor, "", text, f"{cure}, unless the truth is not in metres")
+
+
+def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Match) -> list[Finding]:
+    """Positions in other axes than the orientations, or mirrored, of translations in the camera's axes ``[N, 3]``."""
+    in_world = [np.einsum("nij,nj->ni", R_world_first, motion) for motion in (steps, true_steps)]
+    for measured, true, where in ((*in_world, "world"), (steps, true_steps, "camera")):
+        W = rotation_between(measured, true, proper=False)
+        alike = agreement(measured @ W.T, true)
+        angle = _degrees(W)
+        if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
+            how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
+            text = (
+                f"the truth's positions are {how} in the {where}'s axes against its orientations: so they explain "
+                f"{100 * alike:.0f} % of the images' translation, as stored {100 * stated.translation:.0f} %"
+            )
+            return [fault("truth-axes", angle, "degrees", text, "use one right-handed frame for both")]
+    return []
+
+
+def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> list[Finding]:
+    """The one of focal length, principal point, depth scale, axes and lever arm that explains the errors best."""
+    before = fit_camera(pairs, relative, camera, ())
+    fits = {name: fit_camera(pairs, relative, camera, names) for name, names in _GROUPS.items()}
+    name = min(fits, key=lambda group: fits[group].cost)
+    fit = fits[name]
+    size, sigma = (float(np.linalg.norm([values[part] for part in _GROUPS[name]])) for values in (fit.value, fit.sigma))
+    left = fit.cost / before.cost
+    rules = _EXPLAINED if name != "lever" else _EXPLAINED_BY_LEVER
+    if name == "lever" and float(np.median([pair.depth_share for pair in pairs])) < _DEPTH_FOR_LEVER:
+        return []
+    if size < _LIMITS[name] or not any(size >= sigmas * sigma and left <= share for sigmas, share in rules):
+        return []
+    errors = f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px"
+    return [_described(name, fit, size, sigma, errors, camera)]
+
+
+_GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "turn": ("turn",), "lever": ("lever",)}
+_LIMITS = {"focal": 0.08, "centre": 25.0, "scale": 0.1, "turn": np.radians(6), "lever": 0.04}
+"""Published recordings differ from their cameras and truths by less: Bonn's lever arm is 0.019 m."""
+_EXPLAINED = ((5, 0.75), (8, 0.88))
+"""Standard deviations, and the part of the errors that may remain, for one value to be at fault: 0.87 and more remain
+in healthy recordings, and no value above its limit is sure to 4."""
+_EXPLAINED_BY_LEVER = ((5, 0.62),)
+"""People who walk past can feign one: 0.68 remained then."""
+_DEPTH_FOR_LEVER = 0.5
+"""Part of the image that has depth. With less, the corners may lie on moving people alone: 0.61 remained then."""
+
+
+def _described(name: str, fit: Fit, size: float, sigma: float, errors: str, camera: Camera) -> Finding:
+    if name == "focal":
+        factor = float(np.exp(fit.value["focal"][0]))
+        text = f"the focal length is {factor:.3f} times the stated one (+- {100 * sigma:.1f} %): {errors}"
+        cure = f"fx = {camera.fx * factor:.1f}, fy = {camera.fy * factor:.1f} in camera.toml, or name the right camera"
+        return fault("camera-focal-length", factor, "", text, cure)
+    if name == "centre":
+        dx, dy = float(fit.value["cx"][0]), float(fit.value["cy"][0])
+        text = f"the principal point is {dx:+.0f}, {dy:+.0f} px from the stated one (+- {sigma:.0f}): {errors}"
+        cure = f"cx = {camera.cx + dx:.1f}, cy = {camera.cy + dy:.1f} in camera.toml, or name the right camera"
+        return fault("camera-principal-point", size, "px", text, cure)
+    if name == "scale":
+        factor = float(np.exp(fit.value["scale"][0]))
+        text = f"the depth, multiplied by {factor:.3f} (+- {100 * sigma:.1f} %), agrees with the truth: {errors}"
+        cure = f"depth_factor = {camera.depth_factor / factor:.5g} in camera.toml (it is {camera.depth_factor:g})"
+        return fault("depth-factor", factor, "", text, cure)
+    if name == "turn":
+        angle = float(np.degrees(size))
+        text = f"the truth's axes are turned by {angle:.1f} degrees against the camera's: {errors}"
+        turn = se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
+        return fault("truth-axes", angle, "degrees", text, _turn(turn))
+    text = f"the camera is {size:.3f} m (+- {sigma:.3f}) from the point that the truth tracks: {errors}"
+    lever = ", ".join(f"{value:+.3f}" for value in fit.value["lever"])
+    return fault("truth-lever-arm", size, "m", text, f"move each position by R ({lever}), R being the pose's rotation")
+
+
+# Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Camera and mounting that make the truth's motion carry the corners from image to image.
+
+    Attributes:
+        value: ``focal`` and ``scale`` (of the depth) as natural logarithms of the factor, ``cx`` and ``cy`` as pixels
+            to be added, ``turn`` the rotation vector ``[3]`` in rad and ``lever`` the position ``[3]`` in metres of the
+            camera in the frame of the body that the truth tracks.
+        sigma: Their standard deviations, each pair of frames being one observation.
+        residual_px: Median reprojection error.
+        cost: Mean robust cost of a corner.
+    """
+
+    value: dict[str, Array]
+    sigma: dict[str, Array]
+    residual_px: float
+    cost: float
+
+
+_PARAMETERS = {"focal": slice(0, 1), "cx": slice(1, 2), "cy": slice(2, 3), "scale": slice(3, 4),
+               "turn": slice(4, 7), "lever": slice(7, 10)}  # fmt: skip
+_PRIOR = np.array([1.0, 200.0, 200.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+_SCALES = np.array([0.1, 10, 10, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
+_STEPS = np.array([1e-4, 0.05, 0.05, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
+_CORNERS_A_PAIR = 25
+_OUTLIER_PX = 2.0
+
+
+def _reprojection_errors(
+    x: Array, camera: Camera, pair: NDArray[np.intp], first: Array, depth: Array, second: Array, back: Array
+) -> Array:
+    """Reprojection errors ``[N, 2]`` in pixels under the values ``[10]``.
+
+    Args:
+        x: The values, in the order of `_PARAMETERS`.
+        camera: The stated camera.
+        pair: The pair of each corner ``[N]``.
+        first: Its pixels in the first frame ``[N, 2]``.
+        depth: Its depth there ``[N]``.
+        second: Its pixels in the second frame ``[N, 2]``.
+        back: The truth's motions back to the second frames, of all pairs ``[M, 4, 4]``.
+    """
+    focal, centre = np.exp(x[0]) * np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]) + x[1:3]
+    rays = np.concatenate([(first - centre) / focal, np.ones((len(first), 1))], axis=1)
+    mount = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
+    mount[:3, 3] = x[7:10]
+    moves = (se3.inverse(mount) @ back @ mount)[pair]
+    moved = np.einsum("nij,nj->ni", moves[:, :3, :3], np.exp(x[3]) * depth[:, None] * rays) + moves[:, :3, 3]
+    return np.asarray(moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre - second)
+
+
+def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, free: PySequence[str]) -> Fit:
+    """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
+
+    Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.
+    A weak prior keeps values that the motion does not determine near the stated ones.
+
+    Args:
+        pairs: Pairs of frames with a motion.
+        relative: Motions of the truth between them ``[N, 4, 4]``, in the depth's units.
+        camera: The stated camera.
+        free: Names of what is fitted, of `Fit.value`; the rest stays as stated.
+    """
+    chosen = [np.flatnonzero(pair.inliers) for pair in pairs]
+    chosen = [index[:: max(1, len(index) // _CORNERS_A_PAIR)][:_CORNERS_A_PAIR] for index in chosen]
+    first, depth, second = (
+        np.concatenate([getattr(pair, name)[index] for pair, index in zip(pairs, chosen, strict=True)])
+        for name in ("pixels_first", "depth_first", "pixels_second")
+    )
+    number, back = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen]), se3.inverse(relative)
+    index = [number for name in free for number in np.arange(10)[_PARAMETERS[name]].tolist()]
+
+    def filled(part: Array) -> Array:
+        x = np.zeros(10)
+        x[index] = part
+        return x
+
+    def errors(x: Array) -> Array:
+        return _reprojection_errors(x, camera, number, first, depth, second, back)
+
+    def robust(part: Array) -> Array:
+        raw = errors(filled(part)) / _OUTLIER_PX
+        square = (raw**2).sum(axis=1, keepdims=True)
+        shrunk = raw * np.sqrt(2 * (np.sqrt(1 + square) - 1) / np.maximum(square, 1e-12))
+        return np.concatenate([shrunk.ravel(), filled(part) / _PRIOR])
+
+    part = np.zeros(len(index))
+    if len(index):
+        part = np.asarray(least_squares(robust, part, x_scale=_SCALES[index]).x, np.float64)
+    x, left = filled(part), errors(filled(part))
+    # Standard deviations by a sandwich estimate, each pair of frames being one observation.
+    weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))
+    slopes = np.stack([(errors(x + s) - errors(x - s)) / (2 * s.sum()) for s in np.diag(_STEPS)], axis=-1)
+    prior, pulls = np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2, np.zeros((len(pairs), 10))
+    np.add.at(pulls, number, np.einsum("npi,n,np->ni", slopes, weight, left))
+    free_part = np.ix_(index, index)
+    inverse = np.linalg.inv((np.einsum("npi,n,npj->ij", slopes, weight, slopes) + prior)[free_part])
+    spread = inverse @ (pulls.T @ pulls + prior)[free_part] @ inverse
+    deviation = np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(len(pairs) / max(len(pairs) - len(index), 1))
+    return Fit(
+        {name: x[where] for name, where in _PARAMETERS.items()},
+        {name: filled(deviation)[where] for name, where in _PARAMETERS.items()},
+        float(np.median(np.linalg.norm(left, axis=1))),
+        float((robust(part) ** 2).sum() / len(first)),
+    )

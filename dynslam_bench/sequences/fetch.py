@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple, cast
 
 from dynslam_bench.core.download import CHUNK, MOST_BYTES, Progress, Report, download
-from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError, did_you_mean
+from dynslam_bench.core.errors import DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.core.reading import file_sha256, read_lines, read_text
@@ -128,7 +128,8 @@ def fetch(
         The sequence's folder.
 
     Raises:
-        SequenceError: Unknown id, one that has to be got by hand, or a faulty download or archive.
+        SequenceError: Unknown id, one that has to be got by hand, or a faulty archive.
+        DownloadError: The archive cannot be downloaded.
     """
     entry, root = _known(name), find_data_root(data_root)
     folder = entry.find(root)
@@ -143,13 +144,10 @@ def fetch(
         named = is_inside(own) and not own.startswith(".") and len(own) < 200
         archive = root / ".downloads" / (own if named else f"{entry.folder}.archive")
         most_bytes = (entry.size_bytes if checksum else None) or MOST_BYTES
-        try:
-            sha256 = download(
-                address, archive, sha256=expected, most_bytes=most_bytes, attempts=attempts, wait_s=wait_s,
-                timeout_s=timeout_s, progress=progress,
-            )  # fmt: skip
-        except DownloadError as error:
-            raise SequenceError(str(error.args[0]), error.hint) from error
+        sha256 = download(
+            address, archive, sha256=expected, most_bytes=most_bytes, attempts=attempts, wait_s=wait_s,
+            timeout_s=timeout_s, progress=progress,
+        )  # fmt: skip
         parts.append(Download(address, archive, sha256))
     unstated = parts if entry.sha256 is None else parts[1:]
     for part in unstated if checksum else ():

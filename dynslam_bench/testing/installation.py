@@ -41,7 +41,7 @@ def examine() -> list[Finding]:
     system = f"{platform.system()} {platform.machine()}"
     findings = [Finding("program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}")]
     findings += [*_packages(), *_weights()]
-    recorded = sum(summary.here and not summary.id.startswith("synthetic/") for summary in summaries())
+    recorded = sum(summary["here"] and not summary["id"].startswith("synthetic/") for summary in summaries())
     hint = "" if recorded else "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
     findings.append(Finding("sequences", "recorded", f"{recorded} in {find_data_root()}", not recorded, hint))
     for name, folder in (("stage cache", stage_cache_folder()), ("weights", weights_folder())):

@@ -74,7 +74,7 @@ from pathlib import Path
 import numpy as np
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.features.registry import build_extractor
-from dynslam_bench.features.cached import CachedExtractor
+from dynslam_bench.features.registry import CachedExtractor
 from dynslam_bench.features.settings import FeatureSettings
 
 settings = FeatureSettings(extractor=sys.argv[1], options={"weights": sys.argv[3]})

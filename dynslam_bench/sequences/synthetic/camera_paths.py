@@ -15,12 +15,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.sequences.synthetic.arithmetic import arctan2, cos, norm, product, sin
-
-Array = NDArray[np.float64]
+from dynslam_bench.sequences.synthetic.arithmetic import Array, arctan2, cos, norm, product, sin
 
 MOTIONS = ("xyz", "static", "halfsphere", "rpy")
 EYE_HEIGHT_M = 1.35

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.sequences.synthetic.arithmetic import atan2, cos, norm, product, sin
+from dynslam_bench.sequences.synthetic.arithmetic import Array, atan2, cos, norm, product, sin
 from dynslam_bench.sequences.synthetic.camera_paths import (
     EYE_HEIGHT_M,
     MOTIONS,
@@ -50,7 +50,7 @@ from dynslam_bench.sequences.synthetic.rooms import (
     printed_box,
     trolley,
 )
-from dynslam_bench.sequences.synthetic.scene import Actor, Array, Body, Optics, Placement, Variant, World
+from dynslam_bench.sequences.synthetic.scene import Actor, Body, Optics, Placement, Variant, World
 from dynslam_bench.sequences.tags import Tag
 
 # Replicas of TUM's fr3 dynamic sequences: two people who walk or sit in an office, four camera motions.

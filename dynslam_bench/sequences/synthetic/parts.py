@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from dynslam_bench.sequences.synthetic.arithmetic import cos, norm, product, sin
-
-Array = NDArray[np.float64]
+from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, norm, product, sin
 
 BOX, ROUND_CONE, QUAD = 0, 1, 2
 

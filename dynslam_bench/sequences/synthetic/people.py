@@ -10,10 +10,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.sequences.synthetic.arithmetic import cos, power, product, sin
+from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, power, product, sin
 from dynslam_bench.sequences.synthetic.parts import (
     ROUND_CONE,
     Key,
@@ -26,7 +25,6 @@ from dynslam_bench.sequences.synthetic.parts import (
 )
 from dynslam_bench.sequences.synthetic.rooms import pick, pick_one
 
-Array = NDArray[np.float64]
 _X, _Y, _Z = np.eye(3)
 
 _SKINS = np.array(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.sequences.synthetic import kernels
-from dynslam_bench.sequences.synthetic.arithmetic import cos, exp, norm, power, product, sin
+from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, exp, norm, power, product, sin
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
 from dynslam_bench.sequences.synthetic.kernels import NEAR_M, TILE
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE
@@ -28,7 +28,6 @@ from dynslam_bench.sequences.synthetic.scene import Scene, View
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RenderSettings
 from dynslam_bench.sequences.synthetic.textures import Atlas
 
-Array = NDArray[np.float64]
 SIZE = CAMERA.height, CAMERA.width
 _INTRINSICS = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
 _FOCAL, _CENTRE = _INTRINSICS[:2], _INTRINSICS[2:]

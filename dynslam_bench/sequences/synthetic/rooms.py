@@ -11,14 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.sequences.synthetic.arithmetic import atan2, norm, product
+from dynslam_bench.sequences.synthetic.arithmetic import Array, atan2, norm, product
 from dynslam_bench.sequences.synthetic.parts import BOX, QUAD, ROUND_CONE, Parts, turn, wall
 from dynslam_bench.sequences.synthetic.settings import HELD_OUT_SCENES
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

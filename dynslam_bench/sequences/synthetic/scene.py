@@ -11,17 +11,15 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic import textures
-from dynslam_bench.sequences.synthetic.arithmetic import norm, product
+from dynslam_bench.sequences.synthetic.arithmetic import Array, norm, product
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE, Parts
 from dynslam_bench.sequences.synthetic.people import Person, Posture, add_person
 from dynslam_bench.sequences.synthetic.settings import CAMERA, DEFAULT_FRAMES, FPS, RenderSettings
 from dynslam_bench.sequences.tags import Tag
 
-Array = NDArray[np.float64]
 Placement = Callable[[float], tuple[Array, Array]]
 """Time in seconds to the rotation 3x3 and the origin (metres) of a rigid body in the world."""
 

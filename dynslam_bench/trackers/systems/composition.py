@@ -143,8 +143,7 @@ def compose(
         SettingsError: The settings hold an online setting that has an effect and that no part takes.
     """
     from dynslam_bench.core.stage_cache import StageCache
-    from dynslam_bench.features.cached import cached_extractor
-    from dynslam_bench.features.registry import build_extractor
+    from dynslam_bench.features.registry import build_extractor, cached_extractor
     from dynslam_bench.flow.registry import build_flow
     from dynslam_bench.segmentation.build_segmenter import CachedSegmenter, build_segmenter
     from dynslam_bench.segmentation.schedule import MaskScheduler
