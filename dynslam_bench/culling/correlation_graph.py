@@ -13,14 +13,14 @@ from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundl
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
+from dynslam_bench.culling.regions import NEAR
 from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.camera import Camera, pixel_index
 
 Numbers = NDArray[np.floating]
 
 MIN_POINTS = 20
-_NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 _WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
 
 
@@ -99,10 +99,9 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         past = np.full((len(before), len(frame.xy), 12), np.nan)
         past[:, link >= 0] = before[:, link[link >= 0]]
         loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
-        raw, (height, width) = flow.xy[loose], previous.depth.shape
-        column, row = np.rint(raw).astype(np.intp).T
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        z = np.where(inside, previous.depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0)
+        raw = flow.xy[loose]
+        at, visible = pixel_index(raw, previous.depth.shape)
+        z = np.where(visible, previous.depth[at], 0)
         observations = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
         past[0, loose] = _in_world(observations, pose)
         return past
@@ -173,11 +172,8 @@ def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDAr
     The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its components' variances
     those of the sensor. Depth edges thus get a large variance.
     """
-    height, width = depth.shape
-    column, row = np.rint(xy).astype(np.intp).T
-    columns = (column[:, None] + _NEAR[:, 0]).clip(0, width - 1)
-    rows = (row[:, None] + _NEAR[:, 1]).clip(0, height - 1)
-    z = np.nan_to_num(depth[rows, columns].astype(np.float64), posinf=0.0, neginf=0.0)
+    at, _ = pixel_index(np.rint(xy)[:, None] + NEAR, depth.shape)
+    z = np.nan_to_num(depth[at].astype(np.float64), posinf=0.0, neginf=0.0)
     weight = np.where(z > 0, _WEIGHT, 0.0)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     mean = (weight * z).sum(axis=1)

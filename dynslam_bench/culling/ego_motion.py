@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.regions import cell_index, cell_mean, coherent
+from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, coherent
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.camera import Camera, pixel_index
 
 MIN_POINTS = 12
 TURN_PX = (12.0, 6.0, 4.0)
@@ -234,12 +234,8 @@ def nearest_depth(
     Returns:
         Depths ``[N]``, metres; 0 where the patch has none or lies outside the image.
     """
-    height, width = depth.shape
-    offsets = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-    pixels = np.rint(xy)[:, None, :].astype(np.intp) + offsets
-    column, row = pixels[..., 0], pixels[..., 1]
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    patch = depth[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
-    patch[~inside | ~np.isfinite(patch)] = 0
+    at, visible = pixel_index(np.rint(xy)[:, None] + NEAR, depth.shape)
+    patch = depth[at].astype(np.float64)
+    patch[~visible | ~np.isfinite(patch)] = 0
     gap = np.where(patch > 0, np.abs(patch - np.asarray(expected)[:, None]), np.inf)
     return np.asarray(np.take_along_axis(patch, gap.argmin(axis=1)[:, None], axis=1)[:, 0])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Number, ObjectRule, Rule
 from dynslam_bench.culling.ego_motion import rigid_flow
-from dynslam_bench.culling.regions import coherent
+from dynslam_bench.culling.regions import NEAR, coherent
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import (
     BoxEpipolarSettings,
@@ -419,9 +419,8 @@ def _patch_difference(
     first: NDArray[np.uint8], second: NDArray[np.uint8], xy1: NDArray[np.float32], xy2: NDArray[np.float32]
 ) -> NDArray[np.int64]:
     """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
-    offsets = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     a, b = (
-        image[tuple((xy[:, None].astype(np.intp) + offsets).T[::-1])].astype(np.int64)
+        image[tuple((xy[:, None].astype(np.intp) + NEAR).T[::-1])].astype(np.int64)
         for image, xy in ((first, xy1), (second, xy2))
     )
     return np.asarray(np.abs(a - b).sum(axis=0))

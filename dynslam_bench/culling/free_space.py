@@ -13,7 +13,7 @@ from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.regions import coherent
 from dynslam_bench.culling.settings import FreeSpaceSettings
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.camera import Camera, pixel_index
 
 KEYFRAMES = 8
 """Number of the latest keyframes that are compared."""
@@ -51,9 +51,8 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         ahead = local[..., 2] > 0.1
         pixels = np.full((*ahead.shape, 2), -1.0)
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
-        column, row = np.moveaxis(np.rint(pixels.clip(-1, 1e6)).astype(np.intp), -1, 0)
-        observed = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        at = row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
+        at, visible = pixel_index(pixels, (camera.height, camera.width))
+        observed = ahead & visible
         surface, smallest = np.empty(ahead.shape, np.float32), {}
         for number, (_, depth) in enumerate(keyframes):  # images are stored too, so that no id is used again
             smallest[id(depth)] = self._smallest.get(id(depth)) or (depth, cv2.erode(depth, PATCH))

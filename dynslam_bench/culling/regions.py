@@ -14,6 +14,10 @@ MIN_FAILING = 3
 """Fewest failing points of a moving region."""
 
 
+NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+"""Offsets of the 3x3 pixels around a pixel, row by row."""
+
+
 def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
     """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
     rows, columns = -(-shape[0] // size), -(-shape[1] // size)

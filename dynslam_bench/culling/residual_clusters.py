@@ -11,7 +11,7 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import inside
+from dynslam_bench.geometry.camera import inside, pixel_index
 from dynslam_bench.segmentation.postprocess import select
 
 STEP = 8
@@ -67,15 +67,12 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
         points = se3.transform(T_prev_cur, state.camera.unproject(state.camera.undistort_points(xy), z))
         pixels = state.camera.distort_points(state.camera.project(points))
-        height, width = frame.gray.shape
-        column, row = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0).clip(-1, 1e5)).astype(np.intp).T
-        visible = (points[:, 2] > 0.1) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        column, row = column.clip(0, width - 1), row.clip(0, height - 1)
+        at, visible = pixel_index(pixels, frame.gray.shape)
         x, y = xy.astype(np.intp).T
-        colour = np.abs(frame.gray[y, x].astype(np.float64) - state.previous.gray[row, column]) / 255
-        before = np.nan_to_num(state.previous.depth[row, column])
+        colour = np.abs(frame.gray[y, x].astype(np.float64) - state.previous.gray[at]) / 255
+        before = np.nan_to_num(state.previous.depth[at])
         depth = np.where(before > 0, np.abs(points[:, 2] - before) / np.maximum(z, 0.1), 0.0)
-        return np.where(visible, colour + self.settings.depth_weight * depth, np.nan)
+        return np.where(visible & (points[:, 2] > 0.1), colour + self.settings.depth_weight * depth, np.nan)
 
     def _cluster(self, xy: NDArray[np.float64], z: NDArray[np.floating], seed: int) -> NDArray[np.intp]:
         features = np.column_stack([xy / 160.0, np.asarray(z) / 0.5]).astype(np.float32)

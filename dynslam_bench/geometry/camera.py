@@ -129,9 +129,17 @@ class Camera:
 # Reading an image at points.
 
 
+def pixel_index(
+    xy: NDArray[np.floating], shape: tuple[int, ...]
+) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]:
+    """Rows and columns of pixels ``[..., 2]``, rounded and moved into an image ``(H, W)``, and which lie in it."""
+    rounded = np.rint(np.nan_to_num(xy, nan=-1.0, posinf=-1.0, neginf=-1.0).clip(-1, 1e6)).astype(np.intp)
+    column, row = rounded[..., 0], rounded[..., 1]
+    visible = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    return (row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)), visible
+
+
 def inside(mask: NDArray[np.bool_], xy: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Bool ``[N]``: which raw pixels ``[N, 2]`` lie on the mask ``[H, W]``; pixels outside the image do not."""
-    height, width = mask.shape
-    column, row = np.rint(xy).astype(np.intp).T
-    in_image = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return np.asarray(in_image & mask[row.clip(0, height - 1), column.clip(0, width - 1)])
+    at, visible = pixel_index(xy, mask.shape)
+    return np.asarray(visible & mask[at])

@@ -272,12 +272,9 @@ def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
 
 def _coarse_delay(windows: list[Window]) -> float:
     """The delay of least robust cost of the depth images, on a grid."""
-    grid = np.linspace(-LARGEST_DELAY_S, LARGEST_DELAY_S, 21)
-    costs = []
-    for delay in grid:
-        parts = [window.depth_cost(0.0, float(delay)) for window in windows]
-        costs.append(sum(part[0] for part in parts) / max(sum(part[1] for part in parts), 1))
-    return float(grid[int(np.argmin(costs))])
+    grid = np.linspace(-LARGEST_DELAY_S, LARGEST_DELAY_S, 21).tolist()
+    costs = [np.sum([window.depth_cost(delay) for window in windows], axis=0) for delay in grid]
+    return float(grid[int(np.argmin([cost / max(count, 1) for cost, count in costs]))])
 
 
 def _over_windows(
@@ -609,10 +606,10 @@ class Window:
         observed = np.stack([inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)], axis=1)
         return np.asarray(observed - (inverse_then - inverse_now)[..., 0])
 
-    def depth_cost(self, readout_s: float, delay_s: float) -> tuple[float, int]:
-        """Robust cost of the depth images under a delay, and how many depths it sums."""
-        now = self._in_camera(self._at(self.late * readout_s))
-        error = (1 / np.maximum(now[..., 2], 1e-3) - self._depth_at(now, readout_s, delay_s)) / self.noise[1]
+    def depth_cost(self, delay_s: float) -> tuple[float, int]:
+        """Robust cost of the depth images under a delay without a rolling shutter, and how many depths it sums."""
+        now = self._in_camera(self._at(np.zeros_like(self.late)))
+        error = (1 / np.maximum(now[..., 2], 1e-3) - self._depth_at(now, 0.0, delay_s)) / self.noise[1]
         valid = np.isfinite(error)
         return float(np.log1p((error[valid] / CAUCHY) ** 2).sum()), int(valid.sum())
 
@@ -638,17 +635,13 @@ class Window:
         by_world = by_point @ moment.R
         by_pose = np.concatenate([-by_point @ hat(points), -by_world], axis=-1)  # rotation, centre
         moving = np.cross(moment.turning, points) - (moment.R @ moment.velocity[..., None])[..., 0]
-        poses = np.zeros((L, n, 3, n, 6))
-        for i in range(n):  # a pixel's nearest pose is its own frame's: readout times are below the frame interval
-            for k in range(STENCIL):
-                own = moment.nodes[:, i, k]
-                poses[np.arange(L), i, :, own] += moment.weights[:, i, k, None, None] * by_pose[:, i]
-        jacobian = np.zeros((L, n, 3, 6 * (n - 1) + 2))
-        middle = n // 2
-        jacobian[..., : 6 * middle] = poses[..., :middle, :].reshape(L, n, 3, -1)
-        jacobian[..., 6 * middle : -2] = poses[..., middle + 1 :, :].reshape(L, n, 3, -1)
-        jacobian[..., -2] = (by_point @ moving[..., None])[..., 0] * self.late[..., None]
-        jacobian[..., 2, -1] = -self.depth_drift * weight[..., 2]
+        share = np.zeros((L, n, n))  # of each pose in the interpolated one
+        np.put_along_axis(share, moment.nodes, moment.weights, axis=2)
+        poses = np.delete(share, n // 2, axis=2)[:, :, None, :, None] * by_pose[:, :, :, None, :]
+        by_shared = np.zeros((L, n, 3, 2))
+        by_shared[..., 0] = (by_point @ moving[..., None])[..., 0] * self.late[..., None]
+        by_shared[..., 2, 1] = -self.depth_drift * weight[..., 2]
+        jacobian = np.concatenate([poses.reshape(L, n, 3, -1), by_shared], axis=-1)
         return _Reduced(
             jacobian.reshape(L, 3 * n, -1),
             by_world.reshape(L, 3 * n, 3),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -53,37 +53,30 @@ class LabelledImage:
     class_names: tuple[str, ...]
 
 
-T = TypeVar("T")
-
-
 @dataclass(frozen=True, eq=False)
-class LabelledImages(Generic[T]):
+class LabelledImages:
     """A set of labelled images, decoded or rendered on access.
 
     Attributes:
         name: Stands in records.
         version: Changes when the content changes under the same name.
-        entries: What the images are read from.
-        read: Reads an image.
+        count: How many images it has.
+        read: Reads an image by its index.
     """
 
     name: str
     version: str
-    entries: Sequence[T]
-    read: Callable[[T], LabelledImage]
+    count: int
+    read: Callable[[int], LabelledImage]
 
     def __len__(self) -> int:
-        return len(self.entries)
+        return self.count
 
     def __getitem__(self, index: int) -> LabelledImage:
-        return self.read(self.entries[index])
+        return self.read(range(self.count)[index])
 
 
-CocoEntry: TypeAlias = tuple[Path, list[tuple[str, Any]]]
-"""An image of a COCO file, and the class and segmentation of each object."""
-
-
-def coco_images(annotations: Path, images: Path | None = None) -> LabelledImages[CocoEntry]:
+def coco_images(annotations: Path, images: Path | None = None) -> LabelledImages:
     """Images of a COCO annotation file (``images``, ``annotations``, ``categories``); crowds are left out.
 
     Polygons and uncompressed and compressed run lengths are understood.
@@ -114,17 +107,16 @@ def coco_images(annotations: Path, images: Path | None = None) -> LabelledImages
         raise SegmentationError(f"{path} lists no images")
     entries = [(inside(folder, name, where=str(path), kind=SegmentationError), objects) for name, objects in files]
     version = _files_digest([path, *(image for image, _ in entries)])
-    return LabelledImages(f"coco:{path.name}", version, entries, _read_coco)
+    return LabelledImages(f"coco:{path.name}", version, len(entries), lambda index: _read_coco(*entries[index]))
 
 
-def _read_coco(entry: CocoEntry) -> LabelledImage:
-    path, objects = entry
+def _read_coco(path: Path, objects: list[tuple[str, Any]]) -> LabelledImage:
     rgb = _read(path)
     masks = [_coco_mask(segmentation, rgb.shape[:2], path) for _, segmentation in objects]
     return _labelled(rgb, masks, [name for name, _ in objects])
 
 
-def yolo_images(folder: Path) -> LabelledImages[Path]:
+def yolo_images(folder: Path) -> LabelledImages:
     """Images with YOLO polygon labels: ``images/**/NAME.jpg`` beside ``labels/**/NAME.txt``.
 
     A label's line is ``class x1 y1 x2 y2 ...`` with COCO's class numbers from 0 and coordinates in [0, 1]. An image
@@ -142,10 +134,11 @@ def yolo_images(folder: Path) -> LabelledImages[Path]:
     if not images:
         raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
 
-    def read(path: Path) -> LabelledImage:
-        return _read_yolo(path, labels / path.relative_to(root).with_suffix(".txt"))
+    def read(index: int) -> LabelledImage:
+        return _read_yolo(images[index], labels / images[index].relative_to(root).with_suffix(".txt"))
 
-    return LabelledImages(f"yolo:{folder.name}", _files_digest([*images, *sorted(labels.rglob("*.txt"))]), images, read)
+    version = _files_digest([*images, *sorted(labels.rglob("*.txt"))])
+    return LabelledImages(f"yolo:{folder.name}", version, len(images), read)
 
 
 def _read_yolo(path: Path, label: Path) -> LabelledImage:
@@ -259,7 +252,7 @@ VARIANTS: tuple[dict[str, object], ...] = (
 """Renderer options that a share of the training frames is rendered with."""
 
 
-def sequence_frames(sequence_id: str) -> LabelledImages[int]:
+def sequence_frames(sequence_id: str) -> LabelledImages:
     """Every frame of a sequence that has masks.
 
     Args:
@@ -271,11 +264,10 @@ def sequence_frames(sequence_id: str) -> LabelledImages[int]:
     sequence = open_sequence(sequence_id)
     if sequence.masks is None:
         raise SegmentationError(f"sequence '{sequence.id}' has no masks to train on or compare with")
-    frames = range(len(sequence))
-    return LabelledImages(sequence.id, sequence.digest(), frames, partial(_labelled_frame, sequence))
+    return LabelledImages(sequence.id, sequence.digest(), len(sequence), partial(_labelled_frame, sequence))
 
 
-def rendered_frames(text: str = "") -> LabelledImages[int]:
+def rendered_frames(text: str = "") -> LabelledImages:
     """Frames drawn at random from rendered sequences.
 
     Args:
@@ -315,7 +307,7 @@ def rendered_frames(text: str = "") -> LabelledImages[int]:
         return _labelled_frame(_rendered(sequence_id, variant), frame)
 
     count = len(scenes) * len(REPLICA_IDS) * frames
-    return LabelledImages(f"synthetic:{name}", f"renderer {RENDERER_VERSION}", range(count), read)
+    return LabelledImages(f"synthetic:{name}", f"renderer {RENDERER_VERSION}", count, read)
 
 
 @lru_cache(maxsize=1)  # neighbours in the order share a sequence
@@ -334,7 +326,7 @@ def _labelled_frame(sequence: RgbdSequence, index: int) -> LabelledImage:
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
 
 
-def open_labelled(text: str) -> LabelledImages[Any]:
+def open_labelled(text: str) -> LabelledImages:
     """The set that a text names.
 
     ``synthetic:scenes=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences (`rendered_frames`),
@@ -424,7 +416,7 @@ class PreparedImages:
 
 
 def prepare(
-    source: LabelledImages[Any],
+    source: LabelledImages,
     folder: Path,
     height: int,
     width: int,
