@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
-from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import Settings, tunable
-from dynslam_bench.segmentation.settings import expand_classes
+from dynslam_bench.segmentation.settings import ClassList
 
 Unmatched = Literal["keep", "drop", "judge"]
 """A feature whose flow failed stays untested, is dropped, or is tested at the place where the flow lost it."""
@@ -19,17 +18,6 @@ MOVABLE = (
 )
 """COCO classes of objects that people move (our assumption; no paper gives a list)."""
 
-
-def _check_classes(value: str) -> str:
-    try:
-        expand_classes(value)
-    except DynslamError as error:
-        raise ValueError(str(error)) from None
-    return value
-
-
-MovableClasses = Annotated[str, AfterValidator(_check_classes)]
-"""Comma-separated COCO names or presets, validated."""
 
 _MIN_SHARE: Any = Field(
     0.4,
@@ -171,7 +159,7 @@ class BoxEpipolarSettings(Settings):
 class ClassRuleSettings(Settings):
     """B15, three rules: class, depth, epipolar line (SEG-SLAM; constants are our assumption)."""
 
-    movable: MovableClasses = Field(MOVABLE, description="classes that move only at times: comma-separated COCO names")
+    movable: ClassList = Field(MOVABLE, description="classes that move only at times: comma-separated COCO names")
     threshold_px: float = tunable(
         1.0, low=0.2, high=5.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
         meaning="epipolar distance above which a point on a movable object is dropped",
@@ -220,7 +208,7 @@ class DepthBlockSettings(Settings):
     max_depth_m: float = tunable(
         6.0, low=3.0, high=10.0, limits=(0.1, 1000.0), unit="m", meaning="depth beyond this is not used"
     )
-    movable: MovableClasses = Field(
+    movable: ClassList = Field(
         MOVABLE, description="classes that are dynamic while a person touches them: comma-separated COCO names"
     )
 

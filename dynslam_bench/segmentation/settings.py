@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 
-from dynslam_bench.core.errors import DynslamError, SegmentationError, did_you_mean
+from dynslam_bench.core.errors import SegmentationError, did_you_mean
 from dynslam_bench.core.settings import Settings, tunable
 
 COCO_NAMES: tuple[str, ...] = (
@@ -69,6 +69,17 @@ def expand_classes(names: str) -> frozenset[str]:
     return frozenset(classes)
 
 
+def _known_classes(value: Any) -> str:
+    text = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else value if isinstance(value, str) else ""
+    try:
+        expand_classes(text)
+    except SegmentationError as error:
+        raise ValueError(str(error)) from None
+    return text
+
+
+ClassList = Annotated[str, BeforeValidator(_known_classes)]
+"""Comma-separated COCO names or presets, validated; a list of names is taken as well."""
 PLAIN_SOURCES = ("auto", "none", "oracle", "oracle-classes", "embedded", "coco")
 PREFIXED_SOURCES = ("onnx", "recorded", "weights", "plugin")
 FORMS = "auto, none, oracle, oracle-classes, embedded, coco, onnx:PATH, recorded:DIR, weights:PATH, plugin:ID"
@@ -92,7 +103,7 @@ class SegmentationSettings(Settings):
     fetched), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes`` (exact masks of the
     classes alone), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN checkpoint:
     torchvision's or this project's) or ``plugin:ID``."""
-    classes: str = Field(
+    classes: ClassList = Field(
         "person", description="dynamic classes: comma-separated COCO names or presets (person, dynaslam19, all)"
     )
     confidence: float = tunable(
@@ -145,17 +156,6 @@ class SegmentationSettings(Settings):
             raise ValueError(f"'{prefix}:' needs {'an id' if prefix == 'plugin' else 'a path'} after the colon")
         hint = did_you_mean(prefix, [*PLAIN_SOURCES, *(f"{name}:" for name in PREFIXED_SOURCES)])
         raise ValueError(f"not one of {FORMS}" + (f"; {hint}" if hint.startswith("did") else ""))
-
-    @field_validator("classes", mode="before")
-    @classmethod
-    def _known_classes(cls, value: Any) -> Any:
-        if isinstance(value, (list, tuple)):
-            value = ",".join(map(str, value))
-        try:
-            expand_classes(value if isinstance(value, str) else "")
-        except DynslamError as error:
-            raise ValueError(str(error)) from None
-        return value
 
     @property
     def unused(self) -> Mapping[str, str]:

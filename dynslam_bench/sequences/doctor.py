@@ -140,14 +140,11 @@ def examine(
                 pairs.extend(rgbd_pairs(frames, sequence.camera))
     findings = []
     if unreadable:
-        text = f"{len(unreadable)} of {todo} frames cannot be read; {unreadable[0]}"
-        cure = "export or fetch these files again, or remove them from the lists"
-        findings.append(fault("unreadable", len(unreadable), "frames", text, cure))
+        findings.append(fault("unreadable", len(unreadable), todo=todo, first=unreadable[0]))
     if not streams.frames:
         return Diagnosis(sequence.id, 0, tuple(findings))
     if streams.frames < FEWEST:
-        text = f"too few frames ({streams.frames}): motion, delays and truth cannot be compared"
-        findings.append(Finding("too-short", "note", float(streams.frames), "frames", text, "check a longer part"))
+        findings.append(note("too-short", streams.frames))
     in_streams = stream_findings(streams, with_depth)
     findings += in_streams
     if streams.frames >= FEWEST and not any(finding.severity == "fault" for finding in in_streams):
@@ -176,17 +173,14 @@ def _unopened(
     except _UNREADABLE:
         text, cure = _message(error), getattr(error, "hint", "")
         if isinstance(error, TrajectoryError):
-            return fault("unreadable", None, "", text, cure or RESAVE)
-        kind = "unreadable"
+            return fault("unreadable/opening", None, text=text, cure=cure or RESAVE)
+        cure = cure or "docs/reference/sequences.md says what a folder holds"
         if isinstance(error, SequenceError) and text.startswith("depth image"):
-            kind = "depth-format"
-        elif text.endswith("nor a folder depth"):
-            kind, cure = "no-depth", "record or export depth images: a folder is read only with depth"
-        return fault(kind, None, "", text, cure or "docs/reference/sequences.md says what a folder holds")
+            return fault("depth-format", None, text=text, cure=cure)
+        return fault("no-depth/opening" if text.endswith("nor a folder depth") else "unreadable/opening", None,
+                     text=text, cure=cure)  # fmt: skip
     (height, width), (rows, columns) = frame.rgb.shape[:2], frame.depth.shape
-    text = f"depth images are {columns}x{rows}, colour images {width}x{height}"
-    cure = "register the depth to the colour images, pixel by pixel; resizing serves only if both have one view"
-    return fault("depth-size", columns / width, "", text, cure)
+    return fault("depth-size", columns / width, columns=columns, rows=rows, width=width, height=height)
 
 
 def _message(error: Exception) -> str:
@@ -222,9 +216,213 @@ class Finding:
     cure: str
 
 
-def fault(id: str, value: float | None, unit: str, text: str, cure: str) -> Finding:
-    """A finding that makes results on the recording wrong."""
-    return Finding(id, "fault", None if value is None else float(value), unit, text, cure)
+RESAVE = "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
+_SO = "so they explain {then:.0f} % of the images' motion, as stored {now:.0f} %"
+_FINDINGS: dict[str, tuple[str, str, str]] = {
+    "unreadable": (
+        "frames",
+        "{value:.0f} of {todo} frames cannot be read; {first}",
+        "export or fetch these files again, or remove them from the lists",
+    ),
+    "unreadable/opening": ("", "{text}", "{cure}"),
+    "too-short": (
+        "frames",
+        "too few frames ({value:.0f}): motion, delays and truth cannot be compared",
+        "check a longer part",
+    ),
+    "no-depth": (
+        "",
+        "the sequence has no depth images: only the colour images were checked",
+        "add depth images to check more",
+    ),
+    "no-depth/opening": ("", "{text}", "record or export depth images: a folder is read only with depth"),
+    "depth-format": ("", "{text}", "{cure}"),
+    "depth-size": (
+        "",
+        "depth images are {columns}x{rows}, colour images {width}x{height}",
+        "register the depth to the colour images, pixel by pixel; resizing serves only if both have one view",
+    ),
+    "colour-blank": (
+        "",
+        "{count} of {frames} colour images hold one brightness only",
+        "record or export the colour again",
+    ),
+    "depth-empty": (
+        "",
+        "{count} of {frames} depth images hold no depth",
+        "record or export the depth again, or use trackers that need none",
+    ),
+    "colour-frozen": (
+        "frames",
+        "one colour image is repeated in {value:.0f} or more successive frames while the depth changes",
+        "export the colour images again",
+    ),
+    "depth-frozen": (
+        "frames",
+        "one depth image is repeated in {value:.0f} or more successive frames while the colour changes",
+        "export the depth images again",
+    ),
+    "depth-byte-order": (
+        "",
+        "neighbouring depths differ by {stated:.0f} % on average, by {swapped:.1f} % with the bytes of each value "
+        "swapped",
+        "write the 16-bit depth images in the machine's byte order (PNG stores big-endian by itself)",
+    ),
+    "depth-units": (
+        "m",
+        "the median depth is {value:.3g} m with {factor:g} raw units a metre",
+        "set depth_factor in camera.toml (here perhaps {likely:g}), or store arrays in metres",
+    ),
+    "colour-flipped": (
+        "sigma",
+        "the colour images are {how} relative to the depth: contours agree by {value:.0f} standard deviations so, by "
+        "{stored:.0f} as stored",
+        "turn the colour images as the depth images are",
+    ),
+    "depth-delay": (
+        "s",
+        "the depth images fit the colour images of {delay:.1f} frames {side} ({s:.2f} s): their contours agree "
+        "{better:.1f} times as well",
+        "make the depth's stamps {s:.3f} s {change} in depth.txt",
+    ),
+    "depth-not-registered": (
+        "px",
+        "the depth lies {value:.0f} pixels beside the colour ({right:+d} right, {down:+d} down)",
+        "register the depth to the colour camera",
+    ),
+    "no-truth": (
+        "",
+        "there is no ground truth: units of the depth, intrinsics and time were not compared with any",
+        "add groundtruth.txt to check more",
+    ),
+    "truth-other-sequence": (
+        "",
+        "the truth explains at most {share:.0f} % of the motion that {pairs} pairs of frames show, under any shift to "
+        "{limit:g} s, inverse, order of quaternions or axes",
+        "take the truth of this recording",
+    ),
+    "truth-other-sequence/time": (
+        "s",
+        "truth and images share no time: {begin:.3f} to {end:.3f} s and {first:.3f} to {last:.3f} s, {value:.3f} s "
+        "apart",
+        "take the groundtruth.txt of this recording, or put its stamps on the images' clock",
+    ),
+    "truth-other-sequence/rest": (
+        "px",
+        "the truth moves the image by {value:.0f} pixels between frames that move by {displacement:.1f}",
+        "take the truth of this recording",
+    ),
+    "truth-sparse": (
+        "frames",
+        "{value:.0f} of {frames} frames have a true pose within {within} s",
+        "export the truth of all frames again",
+    ),
+    "motion-unmeasured": (
+        "pairs",
+        "the images give a motion for {value:.0f} of {pairs} pairs of frames, fewer than {least}: truth and camera were not "
+        "compared",
+        "check a part with more texture",
+    ),
+    "motion-unmeasured/small": (
+        "pairs",
+        "only {value:.0f} pairs of frames with a small motion share time with the truth: it cannot be compared",
+        "check a longer part",
+    ),
+    "no-motion": (
+        "px",
+        "the camera rests (the image moves by {value:.1f} pixels): truth and intrinsics cannot be compared",
+        "check a part in which the camera moves",
+    ),
+    "truth-inverted": ("", f"the poses are world-to-camera: {_SO}", "invert them: p -> -R^T p, R -> R^T"),
+    "truth-inverted/rotations": (
+        "",
+        f"the rotations are world-to-camera while the positions are the camera's: {_SO}",
+        "invert the rotations: conjugate the quaternions",
+    ),
+    "truth-quaternion-order": ("", f"the quaternions are in the order qw qx qy qz: {_SO}", RESAVE),
+    "truth-quaternion-order/inverted": (
+        "",
+        f"the quaternions are in the order qw qx qy qz, and the poses are world-to-camera: {_SO}",
+        RESAVE,
+    ),
+    "truth-time-shift/late": (
+        "s",
+        "the truth is {s:.3f} s late: so it explains {then:.0f} % of the images' motion, as stored {now:.0f} %",
+        "subtract {s:.3f} s from the stamps of the truth",
+    ),
+    "truth-time-shift/early": (
+        "s",
+        "the truth is {s:.3f} s early: so it explains {then:.0f} % of the images' motion, as stored {now:.0f} %",
+        "add {s:.3f} s to the stamps of the truth",
+    ),
+    "truth-unclear": (
+        "",
+        "the truth explains {share:.0f} % of the motion between the frames, too little to compare more: it may belong "
+        "to another recording",
+        "make sure that groundtruth.txt is this recording's, or check a part with a clearer motion",
+    ),
+    "truth-axes": (
+        "degrees",
+        "the truth's axes are turned by {value:.0f} degrees against the camera's: so they explain {then:.0f} % of the "
+        "images' rotation, as stored {now:.0f} %",
+        "multiply each rotation of groundtruth.txt from the right by [{matrix}]",
+    ),
+    "truth-axes/fit": (
+        "degrees",
+        "the truth's axes are turned by {value:.1f} degrees against the camera's: {errors}",
+        "multiply each rotation of groundtruth.txt from the right by [{matrix}]",
+    ),
+    "truth-axes/positions": (
+        "degrees",
+        "the truth's positions are {how} in the {where}'s axes against its orientations: so they explain {then:.0f} % "
+        "of the images' translation, as stored {now:.0f} %",
+        "use one right-handed frame for both",
+    ),
+    "truth-scale": (
+        "",
+        "the truth's translations are {value:.4g} times the measured ones (median depth {depth_m:.2f} m): they are in "
+        "{unit}",
+        "divide the positions of groundtruth.txt by {divisor}",
+    ),
+    "truth-lever-arm": (
+        "m",
+        "the camera is {value:.3f} m (+- {sigma:.3f}) from the point that the truth tracks: {errors}",
+        "move each position by R ({lever}), R being the pose's rotation",
+    ),
+    "depth-factor": (
+        "",
+        "the depth, multiplied by {value:.3f} (+- {percent:.1f} %), agrees with the truth: {errors}",
+        "depth_factor = {new:.5g} in camera.toml (it is {old:g})",
+    ),
+    "depth-factor/translations": (
+        "",
+        "the truth's translations are {value:.4g} times the measured ones (median depth {depth_m:.2f} m)",
+        "set depth_factor = {new:.4g} in camera.toml (it is {old:g}), unless the truth is not in metres",
+    ),
+    "camera-focal-length": (
+        "",
+        "the focal length is {value:.3f} times the stated one (+- {percent:.1f} %): {errors}",
+        "fx = {fx:.1f}, fy = {fy:.1f} in camera.toml, or name the right camera",
+    ),
+    "camera-principal-point": (
+        "px",
+        "the principal point is {dx:+.0f}, {dy:+.0f} px from the stated one (+- {sigma:.0f}): {errors}",
+        "cx = {cx:.1f}, cy = {cy:.1f} in camera.toml, or name the right camera",
+    ),
+}
+"""Unit, text and cure of every finding, by its id and, where an id has several texts, what it was found by."""
+
+
+def fault(case: str, value: float | None, **facts: Any) -> Finding:
+    """A finding that makes results on the recording wrong: a row of `_FINDINGS`, with the numbers filled in."""
+    unit, text, cure = _FINDINGS[case]
+    number, facts = None if value is None else float(value), {"value": value, **facts}
+    return Finding(case.partition("/")[0], "fault", number, unit, text.format(**facts), cure.format(**facts))
+
+
+def note(case: str, value: float | None, **facts: Any) -> Finding:
+    """A finding that is good to know."""
+    return replace(fault(case, value, **facts), severity="note")
 
 
 Map = NDArray[np.float32]
@@ -379,18 +577,13 @@ def stream_findings(streams: Streams, with_depth: bool = True) -> list[Finding]:
         finding = check(streams)
         if finding is not None and (with_depth or finding.id == "colour-blank"):
             return [finding]
-    text = "the sequence has no depth images: only the colour images were checked"
-    return [] if with_depth else [Finding("no-depth", "note", None, "", text, "add depth images to check more")]
+    return [] if with_depth else [note("no-depth", None)]
 
 
 def _empty(streams: Streams) -> Finding | None:
-    for id, count, text, cure in (
-        ("colour-blank", streams.dark, "colour images hold one brightness only", "record or export the colour again"),
-        ("depth-empty", streams.empty, "depth images hold no depth",
-         "record or export the depth again, or use trackers that need none"),
-    ):  # fmt: skip
+    for id, count in (("colour-blank", streams.dark), ("depth-empty", streams.empty)):
         if count >= 0.5 * streams.frames:
-            return fault(id, count / streams.frames, "", f"{count} of {streams.frames} {text}", cure)
+            return fault(id, count / streams.frames, count=count, frames=streams.frames)
     return None
 
 
@@ -398,31 +591,22 @@ def _frozen(streams: Streams) -> Finding | None:
     colour, depth = streams.colour_run >= FROZEN_FRAMES, streams.depth_run >= FROZEN_FRAMES
     if colour == depth:  # a rendered camera at rest repeats both; the truth says whether it rests
         return None
-    run, name, other = (streams.colour_run, "colour", "depth") if colour else (streams.depth_run, "depth", "colour")
-    text = f"one {name} image is repeated in {run} or more successive frames while the {other} changes"
-    return fault(f"{name}-frozen", run, "frames", text, f"export the {name} images again")
+    return fault("colour-frozen", streams.colour_run) if colour else fault("depth-frozen", streams.depth_run)
 
 
 def _swapped(streams: Streams) -> Finding | None:
     stated, swapped = np.nanmedian(np.array(streams.rough or [(np.nan, np.nan)]), axis=0)
     if not swapped < stated / 3:
         return None
-    text = (
-        f"neighbouring depths differ by {100 * stated:.0f} % on average, by {100 * swapped:.1f} % with the bytes of "
-        "each value swapped"
-    )
-    cure = "write the 16-bit depth images in the machine's byte order (PNG stores big-endian by itself)"
-    return fault("depth-byte-order", stated, "", text, cure)
+    return fault("depth-byte-order", stated, stated=100 * stated, swapped=100 * swapped)
 
 
 def _units(streams: Streams) -> Finding | None:
     median, factor = float(np.median(streams.medians)), streams.depth_factor
     if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
         return None
-    text = f"the median depth is {median:.3g} m with {factor:g} raw units a metre"
     likely = next((f for f in (1.0, 100.0, 1000.0, 5000.0) if 0.4 < median * factor / f < 8), factor)
-    cure = f"set depth_factor in camera.toml (here perhaps {likely:g}), or store arrays in metres"
-    return fault("depth-units", median, "m", text, cure)
+    return fault("depth-units", median, factor=factor, likely=likely)
 
 
 def _flipped(streams: Streams) -> Finding | None:
@@ -433,11 +617,7 @@ def _flipped(streams: Streams) -> Finding | None:
     best = max(peaks, key=lambda name: peaks[name])
     if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
         return None
-    text = (
-        f"the colour images are {best} relative to the depth: contours agree by {peaks[best]:.0f} standard "
-        f"deviations so, by {peaks['']:.0f} as stored"
-    )
-    return fault("colour-flipped", peaks[best], "sigma", text, "turn the colour images as the depth images are")
+    return fault("colour-flipped", peaks[best], how=best, stored=peaks[""])
 
 
 def _asynchronous(streams: Streams) -> Finding | None:
@@ -461,13 +641,9 @@ def _asynchronous(streams: Streams) -> Finding | None:
     around = mean[max(column - 1, 0) : column + 2]
     if len(around) == 3 and np.isfinite(around).all():  # the vertex of the parabola through the peak
         delay += float((around[0] - around[2]) / (2 * (around[0] - 2 * around[1] + around[2])))
-    seconds = delay * streams.seconds_a_frame
-    text = (
-        f"the depth images fit the colour images of {abs(delay):.1f} frames {'before' if delay > 0 else 'after'} "
-        f"({abs(seconds):.2f} s): their contours agree {mean[column] / max(mean[MOST_DELAY], 0.01):.1f} times as well"
-    )
-    cure = f"make the depth's stamps {abs(seconds):.3f} s {'earlier' if delay > 0 else 'later'} in depth.txt"
-    return fault("depth-delay", seconds, "s", text, cure)
+    seconds, better = delay * streams.seconds_a_frame, mean[column] / max(mean[MOST_DELAY], 0.01)
+    side, change = ("before", "earlier") if delay > 0 else ("after", "later")
+    return fault("depth-delay", seconds, delay=abs(delay), s=abs(seconds), side=side, change=change, better=better)
 
 
 def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
@@ -497,11 +673,7 @@ def _shifted(streams: Streams) -> Finding | None:
     rolled = np.roll(middle, (2, 2), (1, 2))[:, :5, :5]
     if size < LEAST_SHIFT_PX or clear < CLEAR_PEAK or surface[row, column] < 1.4 * rolled.max():
         return None
-    text = (
-        f"the depth lies {size:.0f} pixels beside the colour ({-right * streams.cell_px:+d} right, "
-        f"{-down * streams.cell_px:+d} down)"
-    )
-    return fault("depth-not-registered", size, "px", text, "register the depth to the colour camera")
+    return fault("depth-not-registered", size, right=-right * streams.cell_px, down=-down * streams.cell_px)
 
 
 def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
@@ -539,20 +711,11 @@ UNRELATED = 0.48
 """The best agreement of a truth of another recording stays below; where moving things fill the view it is 0.55."""
 LEAST_UNLIKE = 12
 _STEP_S = 0.025
-RESAVE = "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
-_CURES = {
-    "inverted": ("truth-inverted", "the poses are world-to-camera", "invert them: p -> -R^T p, R -> R^T"),
-    "w first": ("truth-quaternion-order", "the quaternions are in the order qw qx qy qz", RESAVE),
-    "w first, inverted": (
-        "truth-quaternion-order",
-        "the quaternions are in the order qw qx qy qz, and the poses are world-to-camera",
-        RESAVE,
-    ),
-    "rotations inverted": (
-        "truth-inverted",
-        "the rotations are world-to-camera while the positions are the camera's",
-        "invert the rotations: conjugate the quaternions",
-    ),
+_MISREAD = {
+    "inverted": "truth-inverted",
+    "w first": "truth-quaternion-order",
+    "w first, inverted": "truth-quaternion-order/inverted",
+    "rotations inverted": "truth-inverted/rotations",
 }
 
 
@@ -568,33 +731,20 @@ def truth_findings(
         pairs: Pairs of frames and their motions.
     """
     if truth is None:
-        text = "there is no ground truth: units of the depth, intrinsics and time were not compared with any"
-        return [Finding("no-truth", "note", None, "", text, "add groundtruth.txt to check more")]
+        return [note("no-truth", None)]
     begin, end = truth.timestamps[[0, -1]]
     apart = max(begin - stamps[-1], stamps[0] - end)
     if apart > 0:
-        text = (
-            f"truth and images share no time: {begin:.3f} to {end:.3f} s and {stamps[0]:.3f} to {stamps[-1]:.3f} s, "
-            f"{apart:.3f} s apart"
-        )
-        cure = "take the groundtruth.txt of this recording, or put its stamps on the images' clock"
-        return [fault("truth-other-sequence", float(apart), "s", text, cure)]
+        return [fault("truth-other-sequence/time", apart, begin=begin, end=end, first=stamps[0], last=stamps[-1])]
     covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
     if covered < max(LEAST_COVERAGE * len(stamps), 3):
-        text = f"{covered} of {len(stamps)} frames have a true pose within {SAME_FRAME_S} s"
-        return [fault("truth-sparse", covered, "frames", text, "export the truth of all frames again")]
+        return [fault("truth-sparse", covered, frames=len(stamps), within=SAME_FRAME_S)]
     usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
     displacement = float(np.median([pair.displacement_px for pair in usable])) if usable else np.inf
     if displacement < REST_PX and len(usable) >= 3:
         return [_at_rest(TruthMotion(truth), camera, motions_of(usable, stamps), displacement)]
     if len(usable) < LEAST_PAIRS:
-        text = (
-            f"the images give a motion for {len(usable)} of {len(pairs)} pairs of frames, fewer than {LEAST_PAIRS}: "
-            "truth and camera were not compared"
-        )
-        return [
-            Finding("motion-unmeasured", "note", float(len(usable)), "pairs", text, "check a part with more texture")
-        ]
+        return [note("motion-unmeasured", len(usable), pairs=len(pairs), least=LEAST_PAIRS)]
     return _compared(stamps, truth, camera, [pair for pair in usable if pair.displacement_px >= REST_PX], len(pairs))
 
 
@@ -604,10 +754,8 @@ def _at_rest(truth: TruthMotion, camera: Camera, motions: Motions, displacement:
     moves = np.linalg.norm(turns, axis=1) + np.linalg.norm(relative[:, :3, 3], axis=1) / motions.depth_m
     expected = camera.fx * float(np.median(moves[valid])) if valid.any() else 0.0
     if expected > 10 * REST_PX:
-        text = f"the truth moves the image by {expected:.0f} pixels between frames that move by {displacement:.1f}"
-        return fault("truth-other-sequence", expected, "px", text, "take the truth of this recording")
-    text = f"the camera rests (the image moves by {displacement:.1f} pixels): truth and intrinsics cannot be compared"
-    return Finding("no-motion", "note", displacement, "px", text, "check a part in which the camera moves")
+        return fault("truth-other-sequence/rest", expected, displacement=displacement)
+    return note("no-motion", displacement)
 
 
 def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair], tried: int) -> list[Finding]:
@@ -619,8 +767,7 @@ def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[Rgbd
     matches = [candidate for candidate in every if candidate.share >= 0.5]
     near = [one for one in matches if one.reading == READINGS[0] and abs(one.shift_s) < LEAST_TIME_S]
     if not near or sum(near[0].weights) < 0.4:
-        text = f"only {len(pairs)} pairs of frames with a small motion share time with the truth: it cannot be compared"
-        return [Finding("motion-unmeasured", "note", float(len(pairs)), "pairs", text, "check a longer part")]
+        return [note("motion-unmeasured/small", len(pairs))]
     stated, best = max(near, key=total), max(matches, key=total)
     unshifted = min(near, key=lambda one: abs(one.shift_s))
     if unshifted.total > stated.total - 0.02:
@@ -641,16 +788,11 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
     findings = []
     fine = [match(motions, readings[best.reading], best.reading, best.shift_s + d) for d in np.arange(-5, 6) * 0.005]
     shift = max(fine, key=total).shift_s
-    so = f"so they explain {100 * best.clearest:.0f} % of the images' motion, as stored {100 * stated.clearest:.0f} %"
+    shares = {"then": 100 * best.clearest, "now": 100 * stated.clearest}
     if best.reading != READINGS[0]:
-        name, text, cure = _CURES[best.reading]
-        findings.append(fault(name, best.total, "", f"{text}: {so}", cure))
+        findings.append(fault(_MISREAD[best.reading], best.total, **shares))
     if abs(shift) >= LEAST_TIME_S:
-        when = "late" if shift > 0 else "early"
-        text = f"the truth is {abs(shift):.3f} s {when}: {so.replace('they explain', 'it explains')}"
-        change = "subtract {} s from" if shift > 0 else "add {} s to"
-        cure = f"{change.format(f'{abs(shift):.3f}')} the stamps of the truth"
-        findings.append(fault("truth-time-shift", shift, "s", text, cure))
+        findings.append(fault(f"truth-time-shift/{'late' if shift > 0 else 'early'}", shift, s=abs(shift), **shares))
     return findings
 
 
@@ -672,17 +814,9 @@ def _otherwise(
                 return [_axes(X, alike, stated)]
     enough = stated.weights[0] >= 0.5 and len(motions.start) >= LEAST_UNLIKE and len(motions.start) >= 0.5 * tried
     if enough and closest < UNRELATED:
-        text = (
-            f"the truth explains at most {100 * closest:.0f} % of the motion that {len(motions.start)} pairs of frames "
-            f"show, under any shift to {LARGEST_SHIFT_S:g} s, inverse, order of quaternions or axes"
-        )
-        return [fault("truth-other-sequence", closest, "", text, "take the truth of this recording")]
-    text = (
-        f"the truth explains {100 * stated.total:.0f} % of the motion between the frames, too little to compare more: "
-        "it may belong to another recording"
-    )
-    cure = "make sure that groundtruth.txt is this recording's, or check a part with a clearer motion"
-    return [Finding("truth-unclear", "note", stated.total, "", text, cure)]
+        facts = {"share": 100 * closest, "pairs": len(motions.start), "limit": LARGEST_SHIFT_S}
+        return [fault("truth-other-sequence", closest, **facts)]
+    return [note("truth-unclear", stated.total, share=100 * stated.total)]
 
 
 def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) -> Finding | None:
@@ -702,19 +836,15 @@ def _degrees(X: Array) -> float:
 
 def _axes(X: Array, alike: float, stated: Match) -> Finding:
     angle = _degrees(X)
-    text = (
-        f"the truth's axes are turned by {angle:.0f} degrees against the camera's: so they explain "
-        f"{100 * alike:.0f} % of the images' rotation, as stored {100 * stated.rotation:.0f} %"
-    )
-    return fault("truth-axes", angle, "degrees", text, _turn(X))
+    return fault("truth-axes", angle, then=100 * alike, now=100 * stated.rotation, matrix=_turn(X))
 
 
 def _turn(R_body_cam: Array) -> str:
-    """How to give a truth the camera's axes; a rotation within 20 degrees of swapped axes is written as such."""
+    """The rotation that gives a truth the camera's axes; one within 20 degrees of swapped axes is written as such."""
     swapped = np.round(R_body_cam)
     near = not np.array_equal(swapped, np.eye(3)) and np.trace(swapped.T @ R_body_cam) > 1 + 2 * np.cos(np.radians(20))
     rows = [", ".join(f"{value:g}" for value in row) for row in (swapped if near else R_body_cam.round(3)) + 0.0]
-    return f"multiply each rotation of groundtruth.txt from the right by [{'; '.join(rows)}]"
+    return "; ".join(rows)
 
 
 def _measured(
@@ -739,13 +869,11 @@ def _measured(
 
 def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
     """The true translations are `factor` times the measured ones."""
-    text = f"the truth's translations are {factor:.4g} times the measured ones (median depth {motions.depth_m:.2f} m)"
     if factor > 30 and 0.15 < motions.depth_m < 20:
         unit, divisor = ("millimetres", 1000) if factor > 300 else ("centimetres", 100)
-        cure = f"divide the positions of groundtruth.txt by {divisor}"
-        return fault("truth-scale", factor, "", f"{text}: they are in {unit}", cure)
-    cure = f"set depth_factor = {camera.depth_factor / factor:.4g} in camera.toml (it is {camera.depth_factor:g})"
-    return fault("depth-factor", factor, "", text, f"{cure}, unless the truth is not in metres")
+        return fault("truth-scale", factor, depth_m=motions.depth_m, unit=unit, divisor=divisor)
+    new, old = camera.depth_factor / factor, camera.depth_factor
+    return fault("depth-factor/translations", factor, depth_m=motions.depth_m, new=new, old=old)
 
 
 def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Match) -> list[Finding]:
@@ -757,11 +885,8 @@ def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Ma
         angle = _degrees(W)
         if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
             how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
-            text = (
-                f"the truth's positions are {how} in the {where}'s axes against its orientations: so they explain "
-                f"{100 * alike:.0f} % of the images' translation, as stored {100 * stated.translation:.0f} %"
-            )
-            return [fault("truth-axes", angle, "degrees", text, "use one right-handed frame for both")]
+            shares = {"then": 100 * alike, "now": 100 * stated.translation}
+            return [fault("truth-axes/positions", angle, how=how, where=where, **shares)]
     return []
 
 
@@ -795,29 +920,19 @@ _DEPTH_FOR_LEVER = 0.5
 
 
 def _described(name: str, fit: Fit, size: float, sigma: float, errors: str, camera: Camera) -> Finding:
+    value = fit.value[_GROUPS[name][0]]
+    factor, facts = float(np.exp(value[0])), {"sigma": sigma, "percent": 100 * sigma, "errors": errors}
     if name == "focal":
-        factor = float(np.exp(fit.value["focal"][0]))
-        text = f"the focal length is {factor:.3f} times the stated one (+- {100 * sigma:.1f} %): {errors}"
-        cure = f"fx = {camera.fx * factor:.1f}, fy = {camera.fy * factor:.1f} in camera.toml, or name the right camera"
-        return fault("camera-focal-length", factor, "", text, cure)
+        return fault("camera-focal-length", factor, fx=camera.fx * factor, fy=camera.fy * factor, **facts)
     if name == "centre":
         dx, dy = float(fit.value["cx"][0]), float(fit.value["cy"][0])
-        text = f"the principal point is {dx:+.0f}, {dy:+.0f} px from the stated one (+- {sigma:.0f}): {errors}"
-        cure = f"cx = {camera.cx + dx:.1f}, cy = {camera.cy + dy:.1f} in camera.toml, or name the right camera"
-        return fault("camera-principal-point", size, "px", text, cure)
+        return fault("camera-principal-point", size, dx=dx, dy=dy, cx=camera.cx + dx, cy=camera.cy + dy, **facts)
     if name == "scale":
-        factor = float(np.exp(fit.value["scale"][0]))
-        text = f"the depth, multiplied by {factor:.3f} (+- {100 * sigma:.1f} %), agrees with the truth: {errors}"
-        cure = f"depth_factor = {camera.depth_factor / factor:.5g} in camera.toml (it is {camera.depth_factor:g})"
-        return fault("depth-factor", factor, "", text, cure)
+        return fault("depth-factor", factor, new=camera.depth_factor / factor, old=camera.depth_factor, **facts)
     if name == "turn":
-        angle = float(np.degrees(size))
-        text = f"the truth's axes are turned by {angle:.1f} degrees against the camera's: {errors}"
-        turn = se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
-        return fault("truth-axes", angle, "degrees", text, _turn(turn))
-    text = f"the camera is {size:.3f} m (+- {sigma:.3f}) from the point that the truth tracks: {errors}"
-    lever = ", ".join(f"{value:+.3f}" for value in fit.value["lever"])
-    return fault("truth-lever-arm", size, "m", text, f"move each position by R ({lever}), R being the pose's rotation")
+        turn = se3.exp(np.concatenate([np.zeros(3), value]))[:3, :3]
+        return fault("truth-axes/fit", float(np.degrees(size)), matrix=_turn(turn), **facts)
+    return fault("truth-lever-arm", size, lever=", ".join(f"{metres:+.3f}" for metres in value), **facts)
 
 
 # Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.

@@ -12,12 +12,12 @@ from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequ
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.settings import PreprocessingSettings
-from dynslam_bench.sequences.view import Masks
+from dynslam_bench.sequences.view import Masks, Wrapped
 
 Image = NDArray[np.integer | np.floating]
 
 
-class Preprocessed:
+class Preprocessed(Wrapped):
     """A sequence whose images are undistorted, resized and normalised when they are read; the camera follows.
 
     Args:
@@ -34,11 +34,6 @@ class Preprocessed:
         self.settings = settings
         self.camera = preprocessed_camera(base.camera, settings)
         self._maps: dict[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
-
-    def __getattr__(self, name: str) -> object:
-        if name.startswith("__") or name in ("base", "settings", "camera", "_maps"):  # not yet set while unpickling
-            raise AttributeError(name)
-        return getattr(self.base, name)
 
     @property
     def masks(self) -> MaskSource | None:

@@ -13,7 +13,18 @@ from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequ
 from dynslam_bench.core.records import digest
 
 
-class SequenceView:
+class Wrapped:
+    """A sequence made of another one, `base`, from which it takes whatever it does not define itself."""
+
+    base: Sequence
+
+    def __getattr__(self, name: str) -> object:
+        if name.startswith("__") or "base" not in vars(self):  # not yet set while unpickling
+            raise AttributeError(name)
+        return getattr(self.base, name)
+
+
+class SequenceView(Wrapped):
     """Part of a sequence: every `stride`-th frame of ``start:stop``; indices and masks are renumbered.
 
     Args:
@@ -26,11 +37,6 @@ class SequenceView:
     def __init__(self, base: Sequence, start: int = 0, stop: int | None = None, stride: int = 1) -> None:
         self.base = base
         self.range = range(len(base))[start:stop:stride]
-
-    def __getattr__(self, name: str) -> object:
-        if name.startswith("__") or name in ("base", "range"):  # not yet set while unpickling
-            raise AttributeError(name)
-        return getattr(self.base, name)
 
     @property
     def timestamps(self) -> NDArray[np.float64]:
@@ -133,10 +139,8 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
 
 def _unwrapped(sequence: Any) -> tuple[Any, range]:
     """The sequence below all views and preprocessing, and which of its frames are seen."""
-    from dynslam_bench.sequences.preprocessing import Preprocessed
-
     frames = range(len(sequence))
-    while isinstance(sequence, SequenceView | Preprocessed):
+    while isinstance(sequence, Wrapped):
         if isinstance(sequence, SequenceView):
             frames = sequence.range[frames.start : frames.stop : frames.step]
         sequence = sequence.base

@@ -535,8 +535,7 @@ def _message(fields: Fields, number: int) -> Fields:
 
 
 def _text(fields: Fields, number: int) -> str:
-    text: str = fields.get(number, [_NOTHING])[0].tobytes().decode()
-    return text
+    return str(fields.get(number, [_NOTHING])[0].tobytes().decode())
 
 
 def _fields(data: memoryview) -> Fields:

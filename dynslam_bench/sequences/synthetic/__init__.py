@@ -30,7 +30,7 @@ __all__ = [
 
 
 def open_synthetic(
-    id: str | SyntheticId,
+    id: str,
     cache_root: Path | None,
     *,
     settings: RenderSettings | None = None,
@@ -49,12 +49,11 @@ def open_synthetic(
     """
     from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 
-    parsed = parse_synthetic_id(id) if isinstance(id, str) else id
-    return SyntheticSequence(parsed, cache_root, settings or RenderSettings(), threads)
+    return SyntheticSequence(parse_synthetic_id(id), cache_root, settings or RenderSettings(), threads)
 
 
 def render_synthetic(
-    id: str | SyntheticId,
+    id: str,
     cache_root: Path,
     *,
     settings: RenderSettings | None = None,

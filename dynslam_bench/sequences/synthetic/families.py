@@ -51,7 +51,6 @@ from dynslam_bench.sequences.synthetic.rooms import (
     trolley,
 )
 from dynslam_bench.sequences.synthetic.scene import Actor, Body, Optics, Placement, Variant, World
-from dynslam_bench.sequences.tags import Tag
 
 # Replicas of TUM's fr3 dynamic sequences: two people who walk or sit in an office, four camera motions.
 
@@ -85,10 +84,11 @@ def _roll(keys: tuple[Key, ...], period: float, time: float) -> tuple[Array, Arr
     return turn(angle_between(a.facing, b.facing, e) + 180.0), place
 
 
-_PEOPLE: dict[str, Tag] = {"walking": "high-dynamic", "sitting": "low-dynamic"}
 REPLICAS = {
-    f"{people}_{motion}": Variant(partial(build_replica, people, motion), tag, version=0)
-    for people, tag in _PEOPLE.items()
+    f"{people}_{motion}": Variant(
+        partial(build_replica, people, motion), "high-dynamic" if people == "walking" else "low-dynamic", version=0
+    )
+    for people in ("walking", "sitting")
     for motion in MOTIONS
 }
 
@@ -381,9 +381,8 @@ OBJECTS = {f"objects_{name}": Variant(partial(build_objects, name), "unknown-obj
 # `moved`: chairs and cartons stand elsewhere whenever the camera comes by again; each is moved while the camera is half
 # a lap away. `repeated`: every stretch of wall is the same, down to its textures.
 
-_SHAPES = ("room", "corridor", "rooms")
-_ASIDE = {"room": -32.0, "corridor": -14.0, "rooms": 0.0}
-_FRAMES = {"room": 2400, "corridor": 3900, "rooms": 6600}
+_SHAPES = {"room": (-32.0, 2400, 1), "corridor": (-14.0, 3900, 1), "rooms": (0.0, 6600, 2)}
+"""How far the camera looks aside (degrees), frames, and version of each building."""
 
 
 @dataclass
@@ -420,7 +419,9 @@ def build_loop(variant: str, scene: int) -> World:
         Body(k + 1, kind, parts, _moves(building, walk, change == "moved", k))
         for k, (kind, parts, _, _) in enumerate(building.loose)
     )
-    return World(building.parts, partial(walking_camera, walk, scene, shape, _ASIDE[shape]), (0.0, 3.0, 2.15), bodies)
+    return World(
+        building.parts, partial(walking_camera, walk, scene, shape, _SHAPES[shape][0]), (0.0, 3.0, 2.15), bodies
+    )
 
 
 def _moves(building: _Building, walk: Walk, moved: bool, number: int) -> Placement:
@@ -536,11 +537,11 @@ LOOPS = {
     f"loop_{shape}{change}": Variant(
         partial(build_loop, shape + change),
         "low-dynamic" if change == "_moved" else "static",
-        _FRAMES[shape],
-        version=2 if shape == "rooms" else 1,
+        frames,
+        version,
     )
     for change in ("", "_moved", "_repeated")
-    for shape in _SHAPES
+    for shape, (_, frames, version) in _SHAPES.items()
 }
 
 
