@@ -319,8 +319,8 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
     ),
     "motion-unmeasured": (
         "pairs",
-        "the images give a motion for {value:.0f} of {pairs} pairs of frames, fewer than {least}: truth and camera were not "
-        "compared",
+        "the images give a motion for {value:.0f} of {pairs} pairs of frames, fewer than {least}: truth and camera "
+        "were not compared",
         "check a part with more texture",
     ),
     "motion-unmeasured/small": (

@@ -56,7 +56,7 @@ def test_connections_that_break_are_resumed(get, server, packed, plan, ranges, r
 
 def test_the_next_call_goes_on_where_this_one_stopped(get, server, packed, tmp_path):
     server.plan = [{"cut": 50_000}, *[{"cut": 0}] * 3]
-    with pytest.raises(SequenceError, match=rf"stopped at 50000 of {len(packed)} bytes: .*run the same command again"):
+    with pytest.raises(DownloadError, match=rf"stopped at 50000 of {len(packed)} bytes: .*run the same command again"):
         get(attempts=3)
     assert not (tmp_path / "root" / "tum").exists()
     server.requests.clear()
@@ -66,7 +66,7 @@ def test_the_next_call_goes_on_where_this_one_stopped(get, server, packed, tmp_p
 
 def test_a_file_that_changed_on_the_server_begins_anew(get, server, packed):
     server.plan = [{"cut": 5000}, *[{"cut": 0}] * 2]
-    with pytest.raises(SequenceError):
+    with pytest.raises(DownloadError):
         get(attempts=2)
     server.etag = '"two"'
     server.data = packed + b"\0" * 100
@@ -85,7 +85,7 @@ def test_wrong_checksum(get, server, monkeypatch, tmp_path, packed):
     entry = entry_of(NAME)
     right = hashlib.sha256(packed).hexdigest()
     monkeypatch.setattr(fetching, "entry_of", lambda name: entry.model_copy(update={"sha256": "0" * 64}))
-    with pytest.raises(SequenceError, match=f"has the checksum {right} .{len(packed)} bytes., expected {'0' * 64}"):
+    with pytest.raises(DownloadError, match=f"has the checksum {right} .{len(packed)} bytes., expected {'0' * 64}"):
         get()
     assert left_behind(tmp_path / "root") == []
     monkeypatch.setattr(fetching, "entry_of", lambda name: entry.model_copy(update={"sha256": right}))
@@ -108,17 +108,17 @@ def test_without_a_known_checksum_the_first_one_counts(get, server, packed, tmp_
 
 def test_refusals(get, server):
     server.plan = [{"status": 404}]
-    with pytest.raises(SequenceError, match=r"the server answers 404 Not Found for http://127.0.0.1"):
+    with pytest.raises(DownloadError, match=r"the server answers 404 Not Found for http://127.0.0.1"):
         get()
     server.plan = [{"status": 500}] * 3
-    with pytest.raises(SequenceError, match=r"stopped at 0 bytes: the server answers 500"):
+    with pytest.raises(DownloadError, match=r"stopped at 0 bytes: the server answers 500"):
         get(attempts=3)
 
 
 def test_no_server(tmp_path):
-    with pytest.raises(SequenceError, match=r"stopped at 0 bytes: .*refused"):
+    with pytest.raises(DownloadError, match=r"stopped at 0 bytes: .*refused"):
         fetch(NAME, data_root=tmp_path, url="http://127.0.0.1:9/x.tgz", attempts=2, wait_s=0.0)
-    with pytest.raises(SequenceError, match="has to begin with http"):
+    with pytest.raises(DownloadError, match="has to begin with http"):
         fetch(NAME, data_root=tmp_path, url="file:///etc/passwd")
 
 
@@ -140,10 +140,10 @@ def fill_disk(monkeypatch):
 
 def test_full_disk_while_downloading(get, server, fill_disk, monkeypatch):
     server.plan = [{"cut": 40_000}, *[{"cut": 0}] * 2]
-    with pytest.raises(SequenceError):
+    with pytest.raises(DownloadError):
         get(attempts=2)
     fill_disk(lambda path, mode: path.name.endswith(".part") and "b" in mode)
-    with pytest.raises(SequenceError, match="make room and run the same command again"):
+    with pytest.raises(DownloadError, match="make room and run the same command again"):
         get()
     monkeypatch.undo()
     server.requests.clear()
@@ -153,7 +153,7 @@ def test_full_disk_while_downloading(get, server, fill_disk, monkeypatch):
 
 def test_too_little_room_is_noticed_at_once(get, monkeypatch, packed, tmp_path):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=1, used=1, free=len(packed) - 1))
-    with pytest.raises(SequenceError, match=r"GB free, but .* GB are still to download"):
+    with pytest.raises(DownloadError, match=r"GB free, but .* GB are still to download"):
         get()
 
 

@@ -526,38 +526,6 @@ def measure_depth(
 
 
 @dividing_kernel
-def dim(
-    row0: int, row1: int, intrinsics: Intrinsics, pose: Reals, depth: Reals, light: Reals, height: float, spots: Reals,
-    color: Reals,
-) -> None:  # fmt: skip
-    """Darken the colour of rows where a soft spot hides the lamp.
-
-    Each pixel's surface point is followed towards the lamp (direction ``light`` in the world) up to the plane
-    z = ``height``, where ``spots`` [K, 4] lie: x, y, radius (metres) and darkness.
-    """
-    fx, fy, cx, cy = intrinsics
-    width = color.shape[1]
-    for row in range(row0, row1):
-        for column in range(width):
-            z = depth[row, column]
-            x, y = (column - cx) / fx * z, (row - cy) / fy * z
-            wx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
-            wy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
-            wz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-            up = (height - wz) / light[2]
-            if z <= 0.0 or up <= 0.0:
-                continue
-            wx, wy = wx + light[0] * up, wy + light[1] * up
-            factor = 1.0
-            for k in range(spots.shape[0]):
-                near = 1.0 - ((wx - spots[k, 0]) ** 2 + (wy - spots[k, 1]) ** 2) / (spots[k, 2] * spots[k, 2])
-                if near > 0.0:
-                    factor *= 1.0 - spots[k, 3] * min(1.0, 2.0 * near)
-            for ch in range(3):
-                color[row, column, ch] *= factor
-
-
-@dividing_kernel
 def expose(
     row0: int, row1: int, seed: Scalar, color: Reals, gain: Reals, read_noise: float, shot_noise: float,
     out: Ints,

@@ -310,8 +310,16 @@ class Renderer:
         """Soft shadows of things outside the picture, sweeping over the scene."""
         light, sweep = _LAMPS[1, :3] / _LAMPS[1, 2], 1.6 * sin(2 * math.pi * time / 6.3)
         first = [sweep + light[0] * 1.2, 0.7 + 0.3 * sin(1.1 * time), 1.0, 0.5]
-        spots = np.array([first, [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4]])
-        self._rows(lambda a, b: kernels.dim(a, b, _INTRINSICS, pose, depth, light, 2.2, spots, color))
+        spots = (first, [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4])  # x, y, radius in metres, and darkness
+        v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
+        x, y = (u - CAMERA.cx) / CAMERA.fx * depth, (v - CAMERA.cy) / CAMERA.fy * depth
+        wx, wy, wz = (row[0] * x + row[1] * y + row[2] * depth + row[3] for row in pose[:3])
+        up = (2.2 - wz) / light[2]  # along the light to the plane in which the spots lie
+        wx, wy, factor = wx + light[0] * up, wy + light[1] * up, np.ones(SIZE)
+        for at_x, at_y, radius, darkness in spots:
+            near = 1.0 - ((wx - at_x) ** 2 + (wy - at_y) ** 2) / (radius * radius)
+            factor *= 1.0 - darkness * np.clip(2.0 * near, 0.0, 1.0)
+        color *= np.where((depth > 0.0) & (up > 0.0), factor, 1.0)[..., None]
 
     def _glare(self, pose: Array, time: float) -> NDArray[np.float32]:
         """A bright veil ``[H, W, 1]`` around a window beside the back wall, brightening and fading."""
