@@ -30,21 +30,32 @@ from dynslam_bench.sequences.synthetic.camera_paths import (
     walk_along,
     walking_camera,
 )
-from dynslam_bench.sequences.synthetic.parts import BOX, At, Key, Parts, angle_between, between, ease, on_track, turn
+from dynslam_bench.sequences.synthetic.parts import (
+    At,
+    Key,
+    Parts,
+    angle_between,
+    between,
+    box,
+    copies,
+    ease,
+    on_track,
+    turn,
+)
 from dynslam_bench.sequences.synthetic.people import Draw, Posture, draw_person, posture, write_script
 from dynslam_bench.sequences.synthetic.rooms import (
     Plan,
     Point,
-    add_floor,
-    add_wall,
     balloon,
     build_room,
     cartons,
     corridor_bay,
     door_leaf,
+    floor,
     notices,
     office_bay,
     office_chair,
+    partition,
     pick,
     plan_room,
     printed_box,
@@ -186,22 +197,22 @@ def build_condition(change: Change, people: bool, scene: int) -> World:
 
 def _plain(world: World, scene: int) -> World:
     """The same things without a pattern."""
-    return replace(world, static=Parts(replace(part, texture=("plain",) * 6) for part in world.static))
+    return replace(world, static=[replace(part, texture=("plain",) * 6) for part in world.static])
 
 
 def _hall(world: World, scene: int) -> World:
     """A hall whose walls and furniture stand beyond the depth sensor's reach."""
-    plan, hall, x, front, back = plan_room(scene, 0), Parts(), 7.0, -3.0, 8.6
-    add_floor(hall, (-x, front), (x, back), plan)
+    plan, x, front, back = plan_room(scene, 0), 7.0, -3.0, 8.6
     corners = [(-x, front), (x, front), (x, back), (-x, back), (-x, front)]
-    for start, end in itertools.pairwise(corners):
-        add_wall(hall, start, end, plan)
     places = [
         *((0.0, ((k - 1) * 4.3, back - 0.05, 0.0)) for k in range(3)),
         *((-90.0 * side, (side * (x - 0.05), 5.0, 0.0)) for side in (-1, 1)),
     ]
-    for k, (yaw, at) in enumerate(places):
-        hall.add_copies(office_bay(scene, k), yaw, at, f"/{k}")
+    hall = [
+        *floor((-x, front), (x, back), plan),
+        *(part for start, end in itertools.pairwise(corners) for part in partition(start, end, plan)),
+        *(part for k, (yaw, at) in enumerate(places) for part in copies(office_bay(scene, k), yaw, at, f"/{k}")),
+    ]
     return replace(world, static=hall, window=(0.0, back, 2.15))
 
 
@@ -233,7 +244,7 @@ def build_objects(variant: str, scene: int) -> World:
     plan, rng = plan_room(scene), stream(scene, "synthetic", "objects", variant)
     room = build_room(scene, plan)
     if variant == "door":
-        _add_partition(room, plan)
+        room += _doorway(plan)
     bodies, keys = _SCRIPTS[variant](partial(pick, rng, scene), scene, plan)
     person = replace(draw_person(scene, 0), instance=9)
     actors = ((person, partial(posture, keys, PERIOD_S)),) if keys else ()
@@ -326,8 +337,7 @@ def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
 def _chair(j: Draw, scene: int, plan: Plan) -> Cast:
     """A chair with a carton on it is turned and rolled; no person is in view."""
     x, y, turned = j(-0.2, 0.2), j(1.15, 1.25), j(150, 210)
-    parts = office_chair(plan, 1)
-    parts.add_copies(printed_box(1, (0.2, 0.17, 0.2)), 15.0, (0.0, -0.02, 0.69))
+    parts = [*office_chair(plan, 1), *copies(printed_box(1, (0.2, 0.17, 0.2)), 15.0, (0.0, -0.02, 0.69))]
     keys = (
         At(0, x, y), At(1.5, x, y), At(5, x + 0.1, y, 0, turned), At(7, x, y, 0, turned), At(9.5, x - 0.5, y + 0.2),
         At(11, x - 0.5, y + 0.2), At(14, x + 0.45, y + 0.1, 0, -turned), At(16, x + 0.45, y + 0.1, 0, -turned),
@@ -350,21 +360,20 @@ def _door(j: Draw, scene: int, plan: Plan) -> Cast:
     return (_body(1, "door", door_leaf(1, plan, width), keys),), ()
 
 
-def _add_partition(room: Parts, plan: Plan) -> None:
+def _doorway(plan: Plan) -> Parts:
     """A wall before the desk, with a doorway, and posters on it."""
     x, y, width = _DOOR
-    for start, end in ((plan.left_x, x - 0.02), (x + width + 0.02, plan.right_x)):
-        add_wall(room, (start, y + 0.05), (end, y + 0.05), plan)
-    for k, at in enumerate((x - 0.28, x - 0.75, x + width + 0.28, x + width + 0.75)):
-        for z in (1.0, 1.62):
-            room.add(
-                BOX,
-                np.eye(3),
-                (at, y - 0.006, z),
-                (0.19, 0.005, 0.26),
-                texture=f"poster:{(k + int(2 * z)) % 4}",
-                fit=(2,),
+    return [
+        *partition((plan.left_x, y + 0.05), (x - 0.02, y + 0.05), plan),
+        *partition((x + width + 0.02, y + 0.05), (plan.right_x, y + 0.05), plan),
+        *(
+            box(
+                np.eye(3), (at, y - 0.006, z), (0.19, 0.005, 0.26), texture=f"poster:{(k + int(2 * z)) % 4}", fit=(2,)
             )
+            for k, at in enumerate((x - 0.28, x - 0.75, x + width + 0.28, x + width + 0.75))
+            for z in (1.0, 1.62)
+        ),
+    ]  # fmt: skip
 
 
 _SCRIPTS: dict[str, Callable[[Draw, int, Plan], Cast]] = {
@@ -391,23 +400,22 @@ class _Building:
 
     scene: int
     repeated: bool
-    parts: Parts = field(default_factory=Parts)
+    parts: Parts = field(default_factory=list)
     loose: list[tuple[str, Parts, float, Point]] = field(default_factory=list)
     bays: int = 0
 
     def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, alike: int = 0) -> None:
         """Furnish a stretch of wall; where walls are repeated, all that are `alike` are the same."""
         number = alike if self.repeated else self.bays
-        self.parts.add_copies(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")
+        self.parts += copies(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")
         self.bays += 1
 
     def piece(self, kind: str, yaw: float, at: Point) -> None:
         """Put a piece that may be moved on the floor: a ``chair`` or a ``box``."""
-        number, id, piece = 0 if self.repeated else len(self.loose), len(self.loose) + 1, Parts()
+        number, id = 0 if self.repeated else len(self.loose), len(self.loose) + 1
         chair = kind == "chair"
         plain = office_chair(plan_room(self.scene, number), id) if chair else cartons(self.scene, number, id)
-        piece.add_copies(plain, 0.0, (0.0, 0.0, 0.0), f"/{number}")
-        self.loose.append((kind, piece, yaw, at))
+        self.loose.append((kind, copies(plain, 0.0, (0.0, 0.0, 0.0), f"/{number}"), yaw, at))
 
 
 def build_loop(variant: str, scene: int) -> World:
@@ -443,18 +451,18 @@ def _room(b: _Building) -> Walk:
     """A hall with desks along its walls and a partition in the middle."""
     rng, plan = stream(b.scene, "synthetic", "hall"), plan_room(b.scene, 0)
     x, y = pick(rng, b.scene, 5.2, 5.5), pick(rng, b.scene, 4.2, 4.4)
-    add_floor(b.parts, (-x, -y), (x, y), plan)
+    b.parts += floor((-x, -y), (x, y), plan)
     for start, end in _around(x, y):
-        add_wall(b.parts, start, end, plan)
+        b.parts += partition(start, end, plan)
     for yaw, side, along in ((0, y, 2.4), (0, y, -2.4), (180, -y, 2.4), (180, -y, -2.4)):
         b.bay(office_bay, yaw, (along, side - np.sign(side) * 0.05))
         b.piece("chair", yaw, (along + 0.3, side - np.sign(side) * 1.55))
     for yaw, side in ((-90, x), (90, -x)):
         b.bay(office_bay, yaw, (side - np.sign(side) * 0.05, 0.0))
         b.piece("box", yaw, (side - np.sign(side) * 1.3, 0.9))
-    names, block = (*(f"poster:{face % 4}" for face in range(4)), "plain", "plain"), Parts()
-    block.add(BOX, np.eye(3), (0.0, 0.0, 1.0), (1.2, 0.35, 1.0), texture=names, fit=(0, 1, 2, 3))
-    b.parts.add_copies(block, 0.0, (0.0, 0.0, 0.0), "/partition")
+    names = (*(f"poster:{face % 4}" for face in range(4)), "plain", "plain")
+    block = box(np.eye(3), (0.0, 0.0, 1.0), (1.2, 0.35, 1.0), texture=names, fit=(0, 1, 2, 3))
+    b.parts += copies([block], 0.0, (0.0, 0.0, 0.0), "/partition")
     b.piece("box", 20.0, (0.3, 0.75))
     return walk_along([(-x + 2.2, -y + 2.1), (x - 2.2, -y + 2.1), (x - 2.2, y - 2.1), (-x + 2.2, y - 2.1)], 0.45)
 
@@ -467,10 +475,10 @@ def _corridor(b: _Building) -> Walk:
     """A ring of four corridors, 2.4 m wide, around a core."""
     rng, plan = stream(b.scene, "synthetic", "ring"), plan_room(b.scene, 0)
     x, y, width = pick(rng, b.scene, 9.6, 10.2), pick(rng, b.scene, 5.6, 6.0), 1.2
-    add_floor(b.parts, (-x - width, -y - width), (x + width, y + width), plan)
+    b.parts += floor((-x - width, -y - width), (x + width, y + width), plan)
     for sign in (1, -1):
         for start, end in _around(x + sign * width, y + sign * width):
-            add_wall(b.parts, start, end, plan)
+            b.parts += partition(start, end, plan)
             wall = np.array(end) - start
             length = float(norm(wall))
             yaw = float(np.degrees(atan2(wall[1], wall[0]))) + (0 if sign < 0 else 180)
@@ -490,18 +498,18 @@ def _rooms(b: _Building) -> Walk:
     rng, plan = stream(b.scene, "synthetic", "floor"), plan_room(b.scene, 0)
     wide, deep, half = pick(rng, b.scene, 6.6, 7.0), pick(rng, b.scene, 5.8, 6.2), 1.2
     ends = 1.5 * wide
-    add_floor(b.parts, (-ends, -half - deep), (ends, half + deep), plan)
+    b.parts += floor((-ends, -half - deep), (ends, half + deep), plan)
     for start, end in _around(ends, half + deep):
-        add_wall(b.parts, start, end, plan)
+        b.parts += partition(start, end, plan)
     doors = (0.5 * wide, 1.5 * wide, 2.5 * wide)
     corners: list[Point] = []
     for side in (1, -1):
-        add_wall(b.parts, (-ends, side * half), (ends, side * half), plan, doors)
+        b.parts += partition((-ends, side * half), (ends, side * half), plan, doors)
         for k in range(3):
             x = side * (k - 1) * wide
             if k:
                 edge = x - side * wide / 2
-                add_wall(b.parts, (edge, side * half), (edge, side * (half + deep)), plan)
+                b.parts += partition((edge, side * half), (edge, side * (half + deep)), plan)
             _furnish(b, x, side, wide, half, half + deep)
             corners += [
                 (x + side * u, side * v)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ BOX, ROUND_CONE, QUAD = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """One shape. A local point p lies in the world at ``rotation @ (scale * p) + origin``; see `Parts.add`.
+    """One shape. A local point p lies in the world at ``rotation @ (scale * p) + origin``; see `primitive`.
 
     Attributes:
         texture: Six names, one a face.
@@ -35,51 +36,60 @@ class Primitive:
     tint: Array
 
 
-class Parts(list[Primitive]):
-    """A growing list of primitives."""
+Parts = list[Primitive]
 
-    def add(self, kind: int, rotation: Array, origin: ArrayLike, shape: tuple[float, float, float], *,
-            instance: int = 0, texture: str | tuple[str, ...] = "plain", repeat: tuple[float, float] = (1.0, 1.0),
-            shift: tuple[float, float] = (0.0, 0.0), tint: tuple[float, float, float] | Array = (1.0, 1.0, 1.0),
-            scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
-            fit: tuple[int, ...] = ()) -> None:  # fmt: skip
-        """Add one primitive.
 
-        Args:
-            kind: `BOX` (half extents), `ROUND_CONE` (height, radius below, radius above) or `QUAD` (half extents x, y).
-            rotation: 3x3, local to world.
-            origin: World position of the local origin, metres.
-            shape: See `kind`.
-            instance: 0 for the background.
-            texture: One name, or six for the faces -x +x -y +y -z +z.
-            repeat: Texture repeats a metre (around a cone: repeats a turn, repeats a metre).
-            shift: Texture offset in repeats.
-            tint: Factor of each colour channel.
-            scale: Local scale of each axis.
-            fit: Faces on which the texture is stretched to fit once.
-        """
-        names = (texture,) * 6 if isinstance(texture, str) else texture
-        uv = np.array([(*repeat, *shift)] * 6, dtype=np.float64)
-        for face in fit:
-            du, dv = ((1, 2), (0, 2), (0, 1))[face // 2]
-            uv[face] = (0.5 / shape[du], 0.5 / shape[dv], 0.5, 0.5)
-        place, size, extent, color = (np.asarray(row, dtype=np.float64) for row in (origin, scale, shape, tint))
-        self.append(Primitive(kind, rotation, place, size, extent, instance, names, uv, color))
+def primitive(kind: int, rotation: Array, origin: ArrayLike, shape: tuple[float, float, float], *, instance: int = 0,
+              texture: str | tuple[str, ...] = "plain", repeat: tuple[float, float] = (1.0, 1.0),
+              shift: tuple[float, float] = (0.0, 0.0), tint: tuple[float, float, float] | Array = (1.0, 1.0, 1.0),
+              scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
+              fit: tuple[int, ...] = ()) -> Primitive:  # fmt: skip
+    """One primitive; see `box`, `cone` and `quad`.
 
-    def add_copies(self, parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: str = "") -> None:
-        """Add copies of primitives.
+    Args:
+        kind: `BOX` (half extents), `ROUND_CONE` (height, radius below, radius above) or `QUAD` (half extents x, y).
+        rotation: 3x3, local to world.
+        origin: World position of the local origin, metres.
+        shape: See `kind`.
+        instance: 0 for the background.
+        texture: One name, or six for the faces -x +x -y +y -z +z.
+        repeat: Texture repeats a metre (around a cone: repeats a turn, repeats a metre).
+        shift: Texture offset in repeats.
+        tint: Factor of each colour channel.
+        scale: Local scale of each axis.
+        fit: Faces on which the texture is stretched to fit once.
+    """
+    names = (texture,) * 6 if isinstance(texture, str) else texture
+    uv = np.array([(*repeat, *shift)] * 6, dtype=np.float64)
+    for face in fit:
+        du, dv = ((1, 2), (0, 2), (0, 1))[face // 2]
+        uv[face] = (0.5 / shape[du], 0.5 / shape[dv], 0.5, 0.5)
+    place, size, extent, color = (np.asarray(row, dtype=np.float64) for row in (origin, scale, shape, tint))
+    return Primitive(kind, rotation, place, size, extent, instance, names, uv, color)
 
-        Args:
-            parts: The primitives.
-            yaw: Turned by this many degrees about the world's z axis, then ...
-            shift: ... moved by this much, metres.
-            suffix: Put behind the names of patterned textures, so that they are drawn again.
-        """
-        body = turn(yaw)
-        for part in parts:
-            names = tuple(name + suffix if ":" in name else name for name in part.texture)
-            origin = product(body, part.origin) + shift
-            self.append(replace(part, rotation=product(body, part.rotation), origin=origin, texture=names))
+
+box, cone, quad = partial(primitive, BOX), partial(primitive, ROUND_CONE), partial(primitive, QUAD)
+
+
+def copies(parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: str = "") -> Parts:
+    """Copies of primitives.
+
+    Args:
+        parts: The primitives.
+        yaw: Turned by this many degrees about the world's z axis, then ...
+        shift: ... moved by this much, metres.
+        suffix: Put behind the names of patterned textures, so that they are drawn again.
+    """
+    body = turn(yaw)
+    return [
+        replace(
+            part,
+            rotation=product(body, part.rotation),
+            origin=product(body, part.origin) + shift,
+            texture=tuple(name + suffix if ":" in name else name for name in part.texture),
+        )
+        for part in parts
+    ]
 
 
 def turn(degrees: float) -> Array:

@@ -14,12 +14,13 @@ import numpy as np
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, power, product, sin
 from dynslam_bench.sequences.synthetic.parts import (
-    ROUND_CONE,
     Key,
     Parts,
+    Primitive,
     along,
     angle_between,
     between,
+    cone,
     ease,
     turn,
 )
@@ -122,7 +123,7 @@ def _in(frame: Array, x: float, y: float, z: float) -> Array:
 
 
 class _Figure:
-    """A person in a posture, to whom limbs are added.
+    """A person in a posture, and how limbs of theirs are made.
 
     Attributes:
         k: Size relative to a height of 1.75 m.
@@ -135,8 +136,8 @@ class _Figure:
         neck: Where the neck begins.
     """
 
-    def __init__(self, parts: Parts, who: Person, how: Posture) -> None:
-        self.parts, self.who, self.how = parts, who, how
+    def __init__(self, who: Person, how: Posture) -> None:
+        self.who, self.how = who, how
         self.k = k = who.height / 1.75
         self.b = who.build
         gait, sit, lively, wave, body = how.gait, how.sit, how.gesture, self.wave, turn(how.facing)
@@ -169,65 +170,68 @@ class _Figure:
         """Idle movement: a sine of frequency f in Hz and phase p."""
         return sin(2 * math.pi * f * self.how.clock + p + 1.7 * self.who.instance)
 
-    def limb(self, a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any) -> None:
+    def limb(self, a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any) -> Primitive:
         """A round cone from a to c; its section is `flat` times as wide across `side`'s normal."""
         rotation, length = along(a, c, side)
-        self.parts.add(ROUND_CONE, rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)
+        return cone(rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)
 
-    def ball(self, centre: Array, rotation: Array, radii: tuple[float, float, float], **style: Any) -> None:
+    def ball(self, centre: Array, rotation: Array, radii: tuple[float, float, float], **style: Any) -> Primitive:
         """An ellipsoid."""
-        self.parts.add(ROUND_CONE, rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)
+        return cone(rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)
 
 
-def add_person(parts: Parts, who: Person, how: Posture) -> None:
-    """Add the person's primitives, always as many and in the same order."""
-    figure = _Figure(parts, who, how)
-    _add_trunk(figure)
-    _add_head(figure)
-    for index, side in enumerate((-1, 1)):
-        _add_arm(figure, side)
-        _add_leg(figure, side, index)
+def build_person(who: Person, how: Posture) -> Parts:
+    """The person's primitives, always as many and in the same order."""
+    f = _Figure(who, how)
+    limbs = ((*_arm(f, side), *_leg(f, side, index)) for index, side in enumerate((-1, 1)))
+    return [*_trunk(f), *_head(f), *itertools.chain(*limbs)]
 
 
-def _add_trunk(f: _Figure) -> None:
+def _trunk(f: _Figure) -> Parts:
     """Pelvis, belly, chest, shoulders; wider than deep."""
     k, root, trunk, hipline = f.k, f.root, f.trunk, f.hipline
     left, right = (root + _in(hipline, side * 0.055 * k, 0, 0.01) for side in (-1, 1))
-    f.limb(left, right, 0.115 * k * f.b, 0.115 * k * f.b, product(hipline, _Z), 0.95, **f.jeans)
     waist, chest = root + _in(trunk, 0.0, 0.0, 0.08 * k), root + _in(trunk, 0.0, 0.005, 0.36 * k)
     across, up = product(trunk, _X), _in(trunk, 0, 0, 0.05 * k)
-    f.limb(waist, chest, 0.148 * k * f.b, 0.168 * k * f.b, across, 0.68, repeat=(5.0, 6.0), **f.shirt)
-    left, right = (chest + side * across * 0.11 * k * f.b + up for side in (-1, 1))
-    f.limb(left, right, 0.088 * k * f.b, 0.088 * k * f.b, product(trunk, _Y), repeat=(3.0, 6.0), **f.shirt)
+    shoulders = [chest + side * across * 0.11 * k * f.b + up for side in (-1, 1)]
+    return [
+        f.limb(left, right, 0.115 * k * f.b, 0.115 * k * f.b, product(hipline, _Z), 0.95, **f.jeans),
+        f.limb(waist, chest, 0.148 * k * f.b, 0.168 * k * f.b, across, 0.68, repeat=(5.0, 6.0), **f.shirt),
+        f.limb(*shoulders, 0.088 * k * f.b, 0.088 * k * f.b, product(trunk, _Y), repeat=(3.0, 6.0), **f.shirt),
+    ]
 
 
-def _add_head(f: _Figure) -> None:
+def _head(f: _Figure) -> Parts:
     """Neck and head, which looks about, with its hair."""
     k, who, trunk, neck = f.k, f.who, f.trunk, f.neck
     skull = neck + _in(trunk, 0.0, 0.015 * k, 0.15 * k)
     looking = _yaw(0.3 * f.wave(0.13, 0.9) * (1 - f.how.gait) + 0.1 * f.how.gesture * f.wave(0.4, 0.1))
     head = product(trunk, looking, _pitch(0.06 * f.wave(0.29, 0.3) - 0.03))
     low, high = neck - _in(trunk, 0, 0, 0.04 * k), skull - _in(trunk, 0, 0.01, 0.03 * k)
-    f.limb(low, high, 0.058 * k, 0.052 * k, product(trunk, _X), **f.bare)
     face = f.style("face", who.skin, repeat=(1.0, 0.5), shift=(0.5, 0.5))
-    f.ball(skull, head, (0.077 * k, 0.098 * k, 0.122 * k), **face)
-    f.ball(skull + _in(head, 0, 0.092 * k, -0.012 * k), head, (0.015 * k, 0.022 * k, 0.026 * k), **f.bare)
-    for side in (-1, 1):
-        f.ball(skull + _in(head, side * 0.077 * k, -0.005, -0.01), head, (0.012 * k, 0.024 * k, 0.033 * k), **f.bare)
     hair = f.style("hair", who.hair, repeat=(3.0, 0.5))
+    ears = [skull + _in(head, side * 0.077 * k, -0.005, -0.01) for side in (-1, 1)]
     crown = skull + _in(head, 0, -0.018 * k, 0.03 * k)
-    f.ball(crown, product(head, _pitch(0.35)), (0.086 * k, 0.101 * k, 0.108 * k), **hair)
+    parts = [
+        f.limb(low, high, 0.058 * k, 0.052 * k, product(trunk, _X), **f.bare),
+        f.ball(skull, head, (0.077 * k, 0.098 * k, 0.122 * k), **face),
+        f.ball(skull + _in(head, 0, 0.092 * k, -0.012 * k), head, (0.015 * k, 0.022 * k, 0.026 * k), **f.bare),
+        *(f.ball(ear, head, (0.012 * k, 0.024 * k, 0.033 * k), **f.bare) for ear in ears),
+        f.ball(crown, product(head, _pitch(0.35)), (0.086 * k, 0.101 * k, 0.108 * k), **hair),
+    ]
     if who.long_hair:
         high, low = skull + _in(head, 0, -0.06, 0.0), skull + _in(head, 0, -0.075, -0.15 * k)
-        f.limb(high, low, 0.075 * k, 0.055 * k, product(head, _X), 0.6, **hair | {"repeat": (4.0, 2.0)})
+        parts.append(f.limb(high, low, 0.075 * k, 0.055 * k, product(head, _X), 0.6, **hair | {"repeat": (4.0, 2.0)}))
     if who.cap:
-        cap = hair | {"tint": who.trousers}
-        top = skull + _in(head, 0, 0.01, 0.075 * k)
-        f.ball(top, product(head, _pitch(0.15)), (0.088 * k, 0.108 * k, 0.065 * k), **cap)
-        f.ball(skull + _in(head, 0, 0.12 * k, 0.06 * k), head, (0.07 * k, 0.06 * k, 0.008 * k), **cap)
+        cap, top = hair | {"tint": who.trousers}, skull + _in(head, 0, 0.01, 0.075 * k)
+        parts += [
+            f.ball(top, product(head, _pitch(0.15)), (0.088 * k, 0.108 * k, 0.065 * k), **cap),
+            f.ball(skull + _in(head, 0, 0.12 * k, 0.06 * k), head, (0.07 * k, 0.06 * k, 0.008 * k), **cap),
+        ]
+    return parts
 
 
-def _add_arm(f: _Figure, side: int) -> None:
+def _arm(f: _Figure, side: int) -> Parts:
     """Counter-swing of the gait, gestures with the hands before the chest, hands on the lap when sitting."""
     k, b, gait, sit = f.k, f.b, f.how.gait, f.how.sit
     swing = f.how.stride + (math.pi if side < 0 else 0.0)
@@ -244,30 +248,33 @@ def _add_arm(f: _Figure, side: int) -> None:
     arm = product(f.trunk, _roll(-abduct), _pitch(pitch))
     lower = product(arm, _roll(side * 0.35 * min(bend, 1.0)), _pitch(bend))
     elbow = shoulder + _in(arm, 0, 0, -(0.29 * k))
-    wrist = elbow + _in(lower, 0, 0, -(0.26 * k))
-    f.limb(shoulder, elbow, 0.062 * k * b, 0.046 * k * b, product(arm, _Y), repeat=(2.0, 6.0), **f.shirt)
-    if f.who.long_sleeves:
-        f.limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, product(lower, _Y), repeat=(2.0, 6.0), **f.shirt)
-    else:
-        f.limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, product(lower, _Y), **f.bare)
+    wrist, across = elbow + _in(lower, 0, 0, -(0.26 * k)), product(lower, _Y)
     hand = product(lower, _pitch(0.25 * f.wave(0.7, side)))
-    f.ball(wrist + _in(hand, 0, 0.005, -0.055 * k), hand, (0.022 * k, 0.038 * k, 0.058 * k), **f.bare)
     thumb = wrist + _in(hand, 0.0, 0.035 * k, -0.035 * k)
-    f.ball(thumb, product(hand, _pitch(0.6)), (0.011 * k, 0.013 * k, 0.034 * k), **f.bare)
+    return [
+        f.limb(shoulder, elbow, 0.062 * k * b, 0.046 * k * b, product(arm, _Y), repeat=(2.0, 6.0), **f.shirt),
+        f.limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, across, repeat=(2.0, 6.0), **f.shirt)
+        if f.who.long_sleeves
+        else f.limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, across, **f.bare),
+        f.ball(wrist + _in(hand, 0, 0.005, -0.055 * k), hand, (0.022 * k, 0.038 * k, 0.058 * k), **f.bare),
+        f.ball(thumb, product(hand, _pitch(0.6)), (0.011 * k, 0.013 * k, 0.034 * k), **f.bare),
+    ]
 
 
-def _add_leg(f: _Figure, side: int, index: int) -> None:
+def _leg(f: _Figure, side: int, index: int) -> Parts:
     k, b, sit, hip, knee = f.k, f.b, f.how.sit, f.hips[index], f.knees[index]
     upper = product(f.hipline, _roll(-side * (0.02 + 0.1 * sit)), _pitch(hip))
     lower = product(upper, _pitch(-knee))
     joint = f.root + _in(f.hipline, side * 0.095 * k * b, 0.0, -0.01)
     knee_at = joint + _in(upper, 0, 0, -(0.43 * k))
     ankle = knee_at + _in(lower, 0, 0, -(0.41 * k))
-    f.limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, product(upper, _Y), **f.jeans)
-    f.limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, product(lower, _Y), **f.jeans)
     ground = product(f.hipline, _pitch((hip - knee) * 0.6 * (1 - sit)))
     heel, toe = ankle + _in(ground, 0, -0.03, -0.035 * k), ankle + _in(ground, 0, 0.15 * k, -0.05 * k)
-    f.limb(heel, toe, 0.045 * k, 0.034 * k, product(ground, _X), 0.95, **f.style("plain", f.who.shoes))
+    return [
+        f.limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, product(upper, _Y), **f.jeans),
+        f.limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, product(lower, _Y), **f.jeans),
+        f.limb(heel, toe, 0.045 * k, 0.034 * k, product(ground, _X), 0.95, **f.style("plain", f.who.shoes)),
+    ]
 
 
 # What people and chairs do: keyed timelines, looped over the whole length of a sequence.

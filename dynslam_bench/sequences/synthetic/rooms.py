@@ -14,7 +14,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import Array, atan2, norm, product
-from dynslam_bench.sequences.synthetic.parts import BOX, QUAD, ROUND_CONE, Parts, turn, wall
+from dynslam_bench.sequences.synthetic.parts import Parts, box, cone, quad, turn, wall
 from dynslam_bench.sequences.synthetic.settings import HELD_OUT_SCENES
 
 
@@ -44,7 +44,7 @@ class Plan:
 
 
 Style = dict[str, Any]
-"""Arguments of `Parts.add` that several primitives share."""
+"""Arguments of `primitive` that several primitives share."""
 
 
 def pick(rng: np.random.Generator, scene: int, low: float, high: float, steps: int = 64) -> float:
@@ -102,148 +102,136 @@ TOP = 0.74
 _EYE = np.eye(3)
 
 
-def add_desk(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> None:
+def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
     """A desk (0.8 m deep, 0.74 m high) with drawers, monitors, keyboards, books, papers, mugs and a lamp."""
-    tint, side = plan.tints, 1 if plan.mirrored else -1
-    leg = (TOP - 0.036) / 2
-    parts.add(
-        BOX, _EYE, (x, y + 0.4, TOP - 0.018), (half, 0.4, 0.018), texture="wood", repeat=(1.2, 1.6), tint=tint["desk"]
-    )
-    for end in (-1, 1):
-        parts.add(
-            BOX,
-            _EYE,
-            (x + end * (half - 0.04), y + 0.4, leg),
-            (0.02, 0.36, leg),
-            texture="wood",
-            tint=tint["desk"] * 0.9,
-        )
-    parts.add(BOX, _EYE, (x, y + 0.74, 0.45), (half - 0.06, 0.01, 0.25), texture="wood", tint=tint["desk"] * 0.85)
-    unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
-    parts.add(BOX, _EYE, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"])
+    tint, side, leg = plan.tints, 1 if plan.mirrored else -1, (TOP - 0.036) / 2
+    unit, lamp = np.array([x + side * (half - 0.3), y + 0.38, 0.3]), np.array([x + side * (0.55 - half), y + 0.62, TOP])
+    wood: Style = {"texture": "wood", "tint": tint["desk"]}
+    parts = [
+        box(_EYE, (x, y + 0.4, TOP - 0.018), (half, 0.4, 0.018), repeat=(1.2, 1.6), **wood),
+        *(
+            box(_EYE, (x + end * (half - 0.04), y + 0.4, leg), (0.02, 0.36, leg), **wood | {"tint": tint["desk"] * 0.9})
+            for end in (-1, 1)
+        ),
+        box(_EYE, (x, y + 0.74, 0.45), (half - 0.06, 0.01, 0.25), **wood | {"tint": tint["desk"] * 0.85}),
+        box(_EYE, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"]),
+    ]
     for k in range(3):
-        parts.add(
-            BOX, _EYE, unit + np.array([0, -0.305, 0.19 - 0.19 * k]), (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92
-        )
-        parts.add(BOX, _EYE, unit + np.array([0, -0.32, 0.22 - 0.19 * k]), (0.05, 0.008, 0.008), tint=tint["metal"])
-    _add_monitors(parts, rng, plan, x, y, half)
+        front, handle = unit + np.array([0, -0.305, 0.19 - 0.19 * k]), unit + np.array([0, -0.32, 0.22 - 0.19 * k])
+        parts.append(box(_EYE, front, (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92))
+        parts.append(box(_EYE, handle, (0.05, 0.008, 0.008), tint=tint["metal"]))
+    parts += _monitors(rng, plan, x, y, half)
     for k in range(5):
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
-        parts.add(
-            BOX, turn(rng.random() * 50 - 25), (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k),
-            (0.105, 0.148, 0.001), texture=f"poster:{k % 4}", fit=(5,), tint=(0.95,) * 3,
+        parts.append(
+            box(
+                turn(rng.random() * 50 - 25), (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k),
+                (0.105, 0.148, 0.001), texture=f"poster:{k % 4}", fit=(5,), tint=(0.95,) * 3,
+            )
         )  # fmt: skip
     for k in range(2):  # a pile of books at either end
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
             shade = 0.25 + 0.7 * rng.random(3)
-            parts.add(
-                BOX, turn(rng.random() * 30 - 15), (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level),
-                (0.12, 0.085, 0.017), texture=(*["books"] * 4, "plain", f"poster:{level % 4}"), fit=(5,), tint=shade,
-                repeat=(0.4, 3.0),
+            parts.append(
+                box(
+                    turn(rng.random() * 30 - 15), (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level),
+                    (0.12, 0.085, 0.017), texture=(*["books"] * 4, "plain", f"poster:{level % 4}"), fit=(5,),
+                    tint=shade, repeat=(0.4, 3.0),
+                )
             )  # fmt: skip
-    for k in range(2):
-        parts.add(
-            ROUND_CONE,
-            _EYE,
-            (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012),
-            (0.085, 0.04, 0.042),
-            texture="stripes" if k else "plain",
-            repeat=(1.0, 4.0),
-            tint=0.35 + 0.6 * rng.random(3),
+    mugs = (
+        cone(
+            _EYE, (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012), (0.085, 0.04, 0.042),
+            texture="stripes" if k else "plain", repeat=(1.0, 4.0), tint=0.35 + 0.6 * rng.random(3),
         )
-    lamp = np.array([x + side * (0.55 - half), y + 0.62, TOP])
-    parts.add(ROUND_CONE, _EYE, lamp, (0.02, 0.07, 0.06), tint=tint["metal"], scale=(1, 1, 0.4))
-    parts.add(ROUND_CONE, _EYE, lamp, (0.42, 0.012, 0.012), tint=tint["metal"])
-    parts.add(ROUND_CONE, _EYE, lamp + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=tint["bin"])
+        for k in range(2)
+    )  # fmt: skip
+    return [
+        *parts,
+        *mugs,
+        cone(_EYE, lamp, (0.02, 0.07, 0.06), tint=tint["metal"], scale=(1, 1, 0.4)),
+        cone(_EYE, lamp, (0.42, 0.012, 0.012), tint=tint["metal"]),
+        cone(_EYE, lamp + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=tint["bin"]),
+    ]
 
 
 _FRAME = ((0, 0.18, 0.285, 0.013), (0, -0.18, 0.285, 0.013), (-0.277, 0, 0.013, 0.19), (0.277, 0, 0.013, 0.19))
 """Bars around a monitor's picture: middle and half extents along both of its sides, metres."""
 
 
-def _add_monitors(parts: Parts, rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> None:
+def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
     """Monitors, each with its foot, a keyboard and a mouse."""
     plastic, spacing = plan.tints["plastic"], 2 * half / (plan.monitors + 0.6)
+    parts: Parts = []
     for k in range(plan.monitors):
         mx = x + (k - (plan.monitors - 1) / 2) * spacing + 0.06 * (rng.random() - 0.5)
         facing = turn((rng.random() - 0.5) * 24)
         my = y + 0.52 + 0.08 * rng.random()
         middle, faces = np.array([mx, my, TOP + 0.3]), ("plain", "plain", f"screen:{k}", "plain", "plain", "plain")
-        parts.add(BOX, facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,))
-        for dx, dz, hx, hz in _FRAME:
-            bar = middle + product(facing, np.array([dx, -0.012, dz]))
-            parts.add(BOX, facing, bar, (hx, 0.024, hz), tint=plastic)
-        parts.add(BOX, facing, (mx, my + 0.03, TOP + 0.09), (0.03, 0.02, 0.09), tint=plastic)
-        parts.add(BOX, facing, (mx, my + 0.01, TOP + 0.008), (0.12, 0.09, 0.008), tint=plastic)
-        parts.add(
-            BOX,
-            turn(6 * (rng.random() - 0.5)),
-            (mx - 0.03, my - 0.3, TOP + 0.012),
-            (0.22, 0.075, 0.012),
-            texture="keyboard",
-            fit=(5,),
-        )
-        parts.add(
-            ROUND_CONE,
-            turn(20),
-            (mx + 0.27, my - 0.3, TOP + 0.005),
-            (0, 1, 1),
-            scale=(0.032, 0.055, 0.025),
-            tint=plastic,
-        )
+        bars = [(middle + product(facing, np.array([dx, -0.012, dz])), (hx, 0.024, hz)) for dx, dz, hx, hz in _FRAME]
+        keys = turn(6 * (rng.random() - 0.5))
+        parts += [
+            box(facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,)),
+            *(box(facing, bar, extents, tint=plastic) for bar, extents in bars),
+            box(facing, (mx, my + 0.03, TOP + 0.09), (0.03, 0.02, 0.09), tint=plastic),
+            box(facing, (mx, my + 0.01, TOP + 0.008), (0.12, 0.09, 0.008), tint=plastic),
+            box(keys, (mx - 0.03, my - 0.3, TOP + 0.012), (0.22, 0.075, 0.012), texture="keyboard", fit=(5,)),
+            cone(turn(20), (mx + 0.27, my - 0.3, TOP + 0.005), (0, 1, 1), scale=(0.032, 0.055, 0.025), tint=plastic),
+        ]
+    return parts
 
 
-def add_shelf(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> None:
+def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     """A bookcase against the back wall with rows of books and boxes."""
     tint = plan.tints["shelf"]
     x = (plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5) - side * 0.25 * rng.random()
     y, half, height = plan.back_y - 0.17, 0.42, 1.95
-    for dx in (-half, half):
-        parts.add(BOX, _EYE, (x + dx, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint)
-    parts.add(BOX, _EYE, (x, y + 0.145, height / 2), (half, 0.008, height / 2), texture="wood", tint=tint * 0.8)
+    parts = [
+        box(_EYE, (x - half, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint),
+        box(_EYE, (x + half, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint),
+        box(_EYE, (x, y + 0.145, height / 2), (half, 0.008, height / 2), texture="wood", tint=tint * 0.8),
+    ]
     for k in range(6):
         z = 0.06 + k * (height - 0.08) / 5
-        parts.add(BOX, _EYE, (x, y, z), (half, 0.15, 0.014), texture="wood", tint=tint)
+        parts.append(box(_EYE, (x, y, z), (half, 0.15, 0.014), texture="wood", tint=tint))
         if k == 5:
-            continue
+            break
         width = half * (0.45 + 0.5 * rng.random())
         tall = 0.12 + 0.03 * rng.random()
         offset = (half - width - 0.02) * (1 if rng.random() < 0.5 else -1)
-        parts.add(
-            BOX, _EYE, (x + offset, y - 0.01, z + 0.014 + tall), (width, 0.1, tall), texture="books",
-            repeat=(0.9, 0.5 / tall), shift=(float(rng.random()), 0.5), tint=(0.9,) * 3,
+        parts.append(
+            box(
+                _EYE, (x + offset, y - 0.01, z + 0.014 + tall), (width, 0.1, tall), texture="books",
+                repeat=(0.9, 0.5 / tall), shift=(float(rng.random()), 0.5), tint=(0.9,) * 3,
+            )
         )  # fmt: skip
         if width < half * 0.75:
-            parts.add(BOX, _EYE, (x - offset * 1.9, y, z + 0.1), (0.1, 0.1, 0.085), tint=0.3 + 0.6 * rng.random(3))
+            parts.append(box(_EYE, (x - offset * 1.9, y, z + 0.1), (0.1, 0.1, 0.085), tint=0.3 + 0.6 * rng.random(3)))
+    return parts
 
 
-def add_posters(parts: Parts, rng: np.random.Generator, plan: Plan) -> None:
+def posters(rng: np.random.Generator, plan: Plan) -> Parts:
     """Posters on the back wall."""
+    parts, span = [], plan.right_x - plan.left_x - 1.6
     for k in range(plan.posters):
-        span = plan.right_x - plan.left_x - 1.6
         x = plan.left_x + 0.8 + span * (k + 0.3 + 0.4 * rng.random()) / plan.posters
         half_x, half_z = ((0.3, 0.42), (0.42, 0.3), (0.21, 0.3))[int(rng.integers(3))]
-        parts.add(
-            BOX,
-            _EYE,
-            (x, plan.back_y - 0.006, 1.55 + 0.25 * rng.random()),
-            (half_x, 0.006, half_z),
-            texture=f"poster:{k % 4}",
-            fit=(2,),
-        )
+        at = (x, plan.back_y - 0.006, 1.55 + 0.25 * rng.random())
+        parts.append(box(_EYE, at, (half_x, 0.006, half_z), texture=f"poster:{k % 4}", fit=(2,)))
+    return parts
 
 
-def add_cabinet(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -> None:
+def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     """A low cabinet with a plant and boxes on it, at the other end of the back wall; a waste bin."""
     tint, y = plan.tints, plan.back_y - 0.25
     x = plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5
-    parts.add(BOX, _EYE, (x, y, 0.42), (0.45, 0.22, 0.42), tint=tint["cabinet"])
+    parts = [box(_EYE, (x, y, 0.42), (0.45, 0.22, 0.42), tint=tint["cabinet"])]
     for dx in (-0.225, 0.225):
-        parts.add(BOX, _EYE, (x + dx, y - 0.226, 0.42), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9)
-        parts.add(BOX, _EYE, (x + dx * 0.3, y - 0.24, 0.6), (0.008, 0.01, 0.06), tint=tint["metal"])
+        parts.append(box(_EYE, (x + dx, y - 0.226, 0.42), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9))
+        parts.append(box(_EYE, (x + dx * 0.3, y - 0.24, 0.6), (0.008, 0.01, 0.06), tint=tint["metal"]))
     pot = np.array([x - 0.2 * side, y, 0.85])
-    parts.add(ROUND_CONE, _EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25))
+    parts.append(cone(_EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25)))
     for _ in range(9):
         a, lean = turn(rng.random() * 360), 0.3 + 0.7 * rng.random()
         tip = pot + product(a, np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()]))
@@ -252,54 +240,54 @@ def add_cabinet(parts: Parts, rng: np.random.Generator, plan: Plan, side: int) -
         z = (tip - stem) / length
         u = np.cross(z, product(a, np.array([0.0, 1.0, 0.0])))
         axes = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1)
-        parts.add(ROUND_CONE, axes, stem, (float(length), 0.012, 0.04), scale=(0.25, 1.0, 1.0), tint=green)
+        parts.append(cone(axes, stem, (float(length), 0.012, 0.04), scale=(0.25, 1.0, 1.0), tint=green))
     for k in range(2):
         s = 0.1 + 0.05 * rng.random()
         faces = ("plain", "plain", f"poster:{k}", "plain", "plain", "plain")
-        parts.add(
-            BOX, turn(rng.random() * 30), (x + side * (0.1 + 0.2 * k), y, 0.84 + s), (s, s * 0.8, s), texture=faces,
-            fit=(2,), tint=(0.85, 0.72, 0.55),
+        parts.append(
+            box(
+                turn(rng.random() * 30), (x + side * (0.1 + 0.2 * k), y, 0.84 + s), (s, s * 0.8, s), texture=faces,
+                fit=(2,), tint=(0.85, 0.72, 0.55),
+            )
         )  # fmt: skip
-    parts.add(
-        ROUND_CONE, _EYE, (plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13), (0.16, 0.12, 0.14), tint=tint["bin"]
-    )
+    bin_at = (plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13)
+    return [*parts, cone(_EYE, bin_at, (0.16, 0.12, 0.14), tint=tint["bin"])]
 
 
 def build_room(scene: int, plan: Plan) -> Parts:
     """All fixed primitives of the office: walls, floor and ceiling, and its furniture."""
     rng = stream(scene, "synthetic", "furniture")
-    parts, tint, back, front = Parts(), plan.tints, plan.back_y, -2.5
+    tint, back, front = plan.tints, plan.back_y, -2.5
     mid_y, half_y = (back + front) / 2, (back - front) / 2
     mid_x, half_x = (plan.left_x + plan.right_x) / 2, (plan.right_x - plan.left_x) / 2
     across, along = (half_x, HEIGHT_M / 2, 0), (half_y, HEIGHT_M / 2, 0)
-    add_floor(parts, (plan.left_x, front), (plan.right_x, back), plan, (float(rng.random()), float(rng.random())))
-    for right, x, y, half, name in (
+    sides = (
         ((0, -1, 0), plan.left_x, mid_y, along, "side"),
         ((0, 1, 0), plan.right_x, mid_y, along, "side"),
         ((1, 0, 0), mid_x, back, across, "wall"),
         ((-1, 0, 0), mid_x, front, across, "wall"),
-    ):
-        parts.add(
-            QUAD, wall(right, (0, 0, 1)), (x, y, HEIGHT_M / 2), half, texture="plaster", repeat=(0.5, 0.5),
-            tint=tint[name],
-        )  # fmt: skip
-    # Skirting board and a cable duct along the back wall.
-    parts.add(BOX, _EYE, (mid_x, back - 0.01, 0.05), (half_x, 0.01, 0.05), tint=tint["shelf"])
-    parts.add(BOX, _EYE, (mid_x, back - 0.02, 0.95), (half_x, 0.02, 0.04), tint=(0.82,) * 3)
-    add_desk(parts, rng, plan, plan.desk_x, plan.desk_y, half=1.15)
-    add_shelf(parts, rng, plan, plan.shelf_side)
-    add_posters(parts, rng, plan)
-    for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3)):
-        parts.add(
-            BOX,
-            turn(90),
-            (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55),
-            (0.36, 0.006, 0.26),
-            texture=f"poster:{k}",
-            fit=(2, 3),
-        )
-    add_cabinet(parts, rng, plan, -plan.shelf_side)
-    return parts
+    )
+    plaster: Style = {"texture": "plaster", "repeat": (0.5, 0.5)}
+    return [
+        *floor((plan.left_x, front), (plan.right_x, back), plan, (float(rng.random()), float(rng.random()))),
+        *(
+            quad(wall(right, (0, 0, 1)), (x, y, HEIGHT_M / 2), half, tint=tint[name], **plaster)
+            for right, x, y, half, name in sides
+        ),
+        box(_EYE, (mid_x, back - 0.01, 0.05), (half_x, 0.01, 0.05), tint=tint["shelf"]),  # skirting board
+        box(_EYE, (mid_x, back - 0.02, 0.95), (half_x, 0.02, 0.04), tint=(0.82,) * 3),  # cable duct
+        *desk(rng, plan, plan.desk_x, plan.desk_y, half=1.15),
+        *shelf(rng, plan, plan.shelf_side),
+        *posters(rng, plan),
+        *(
+            box(
+                turn(90), (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55), (0.36, 0.006, 0.26),
+                texture=f"poster:{k}", fit=(2, 3),
+            )
+            for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3))
+        ),
+        *cabinet(rng, plan, -plan.shelf_side),
+    ]  # fmt: skip
 
 
 # Larger interiors: floors, walls with doorways, furnished stretches of wall, and pieces that may be moved.
@@ -310,21 +298,20 @@ _LINTEL_M = 2.1
 Point = tuple[float, float]
 
 
-def add_floor(parts: Parts, low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> None:
+def floor(low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> Parts:
     """Floor and ceiling of a rectangle; `shift` is that of the carpet's texture."""
     middle = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
-    half = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0)
-    parts.add(
-        QUAD, wall((1, 0, 0), (0, 1, 0)), (*middle, 0.0), half, texture="carpet", tint=plan.tints["floor"], shift=shift
-    )
-    parts.add(QUAD, wall((1, 0, 0), (0, -1, 0)), (*middle, HEIGHT_M), half, tint=(0.95,) * 3)
+    half, tint = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0), plan.tints["floor"]
+    return [
+        quad(wall((1, 0, 0), (0, 1, 0)), (*middle, 0.0), half, texture="carpet", tint=tint, shift=shift),
+        quad(wall((1, 0, 0), (0, -1, 0)), (*middle, HEIGHT_M), half, tint=(0.95,) * 3),
+    ]
 
 
-def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = ()) -> None:
+def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = ()) -> Parts:
     """A wall 0.1 m thick with doorways.
 
     Args:
-        parts: Where to.
         start: One end, metres.
         end: The other.
         plan: Its colour.
@@ -336,67 +323,67 @@ def add_wall(parts: Parts, start: Point, end: Point, plan: Plan, doors: tuple[fl
     edges = [0.0, *(door + side * DOOR_M / 2 for door in doors for side in (-1, 1)), length]
     pieces = [(a, b, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     pieces += [(door - DOOR_M / 2, door + DOOR_M / 2, _LINTEL_M) for door in doors]
-    for a, b, bottom in pieces:
-        half = ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2)
-        at = np.array([*start, 0.0]) + (a + b) / 2 * direction + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2])
-        parts.add(BOX, facing, at, half, texture="plaster", repeat=(0.5, 0.5), tint=plan.tints["wall"])
+    return [
+        box(
+            facing,
+            np.array([*start, 0.0]) + (a + b) / 2 * direction + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2]),
+            ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2),
+            texture="plaster",
+            repeat=(0.5, 0.5),
+            tint=plan.tints["wall"],
+        )
+        for a, b, bottom in pieces
+    ]
 
 
-def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator, Parts]:
-    """The plan of a stretch of wall about its own origin, its stream, and its primitives, still none."""
+def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator]:
+    """The plan of a stretch of wall about its own origin, and its stream."""
     plan = replace(plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0)
-    return plan, stream(scene, "synthetic", "bay", number), Parts()
+    return plan, stream(scene, "synthetic", "bay", number)
 
 
 def office_bay(scene: int, number: int) -> Parts:
     """Four metres of an office's wall: desk, shelf, cabinet, posters."""
-    plan, rng, parts = _stretch(scene, number, 2.0)
-    add_desk(parts, rng, plan, plan.desk_x, plan.desk_y, half=0.92)
-    add_shelf(parts, rng, plan, plan.shelf_side)
-    add_posters(parts, rng, plan)
-    add_cabinet(parts, rng, replace(plan, desk_x=9e3), -plan.shelf_side)
-    return parts
+    plan, rng = _stretch(scene, number, 2.0)
+    return [
+        *desk(rng, plan, plan.desk_x, plan.desk_y, half=0.92),
+        *shelf(rng, plan, plan.shelf_side),
+        *posters(rng, plan),
+        *cabinet(rng, replace(plan, desk_x=9e3), -plan.shelf_side),
+    ]
 
 
 def corridor_bay(scene: int, number: int) -> Parts:
     """Two metres of a corridor's wall: posters, a shelf, a closed door or a notice board."""
-    plan, rng, parts = _stretch(scene, number, 0.7)
+    plan, rng = _stretch(scene, number, 0.7)
     kind, tint = number % 4, plan.tints
     if kind == 0:
-        add_posters(parts, rng, replace(plan, left_x=-1.5, right_x=1.5))
-    elif kind == 1:
-        add_shelf(parts, rng, plan, 1)
-    elif kind == 2:
-        parts.add(BOX, _EYE, (0, -0.02, 1.03), (0.5, 0.02, 1.03), tint=tint["shelf"])
-        parts.add(BOX, _EYE, (0, -0.04, 1.0), (0.44, 0.02, 1.0), texture="wood", tint=tint["door"])
-        parts.add(BOX, _EYE, (0.36, -0.09, 1.02), (0.05, 0.012, 0.012), tint=tint["metal"])
-        parts.add(BOX, _EYE, (0.0, -0.062, 1.5), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,))
-    else:
-        for k in range(6):
-            parts.add(
-                BOX,
-                turn(8 * rng.random() - 4),
-                (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)),
-                (0.15, 0.005, 0.21),
-                texture=f"poster:{k % 4}",
-                fit=(2,),
-            )
-    return parts
+        return posters(rng, replace(plan, left_x=-1.5, right_x=1.5))
+    if kind == 1:
+        return shelf(rng, plan, 1)
+    if kind == 2:
+        return [
+            box(_EYE, (0, -0.02, 1.03), (0.5, 0.02, 1.03), tint=tint["shelf"]),
+            box(_EYE, (0, -0.04, 1.0), (0.44, 0.02, 1.0), texture="wood", tint=tint["door"]),
+            box(_EYE, (0.36, -0.09, 1.02), (0.05, 0.012, 0.012), tint=tint["metal"]),
+            box(_EYE, (0.0, -0.062, 1.5), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,)),
+        ]
+    return [
+        box(
+            turn(8 * rng.random() - 4), (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)), (0.15, 0.005, 0.21),
+            texture=f"poster:{k % 4}", fit=(2,),
+        )
+        for k in range(6)
+    ]  # fmt: skip
 
 
 def notices(scene: int, number: int) -> Parts:
     """Nearly two metres of wall with four sheets on it at different heights."""
-    rng, parts = stream(scene, "synthetic", "notices", number), Parts()
+    rng, parts = stream(scene, "synthetic", "notices", number), []
     for k in range(4):
         half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
-        parts.add(
-            BOX,
-            _EYE,
-            (-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random()),
-            half,
-            texture=f"poster:{k}",
-            fit=(2,),
-        )
+        at = (-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random())
+        parts.append(box(_EYE, at, half, texture=f"poster:{k}", fit=(2,)))
     return parts
 
 
@@ -408,79 +395,80 @@ _PRINT: Style = {"texture": tuple(f"poster:{face}" for face in range(6)), "fit":
 
 def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
     """An office chair facing -y: seat, back, column, five-pointed base; the origin lies on the floor."""
-    parts, tint, metal = Parts(), plan.tints["chair"] * shade, plan.tints["metal"]
+    metal, hub = plan.tints["metal"], np.array([0, 0, 0.09])
     lean = np.array([[1.0, 0, 0], [0, 0.985, -0.17], [0, 0.17, 0.985]])
-    cloth: Style = {"instance": instance, "texture": "denim", "repeat": (3, 3), "tint": tint}
+    cloth: Style = {"instance": instance, "texture": "denim", "repeat": (3, 3), "tint": plan.tints["chair"] * shade}
     frame: Style = {"instance": instance, "tint": metal}
-    parts.add(BOX, _EYE, (0, 0, 0.45), (0.23, 0.22, 0.035), **cloth)
-    parts.add(BOX, lean, (0, 0.26, 0.76), (0.21, 0.028, 0.25), **cloth)
-    parts.add(BOX, lean, (0, 0.255, 0.47), (0.035, 0.012, 0.1), **frame)
-    parts.add(ROUND_CONE, _EYE, (0, 0, 0.1), (0.32, 0.03, 0.028), **frame)
-    hub = np.array([0, 0, 0.09])
+    parts = [
+        box(_EYE, (0, 0, 0.45), (0.23, 0.22, 0.035), **cloth),
+        box(lean, (0, 0.26, 0.76), (0.21, 0.028, 0.25), **cloth),
+        box(lean, (0, 0.255, 0.47), (0.035, 0.012, 0.1), **frame),
+        cone(_EYE, (0, 0, 0.1), (0.32, 0.03, 0.028), **frame),
+    ]
     for k in range(5):
         a = turn(72 * k + 18)
-        tip = product(a, np.array([0.28, 0, 0.05]))
+        tip, u = product(a, np.array([0.28, 0, 0.05])), product(a, np.array([0.0, 1.0, 0.0]))
         z = (tip - hub) / norm(tip - hub)
-        u = product(a, np.array([0.0, 1.0, 0.0]))
-        parts.add(ROUND_CONE, np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame)
-        parts.add(ROUND_CONE, _EYE, tip - (0, 0, 0.015), (0, 0.032, 0.032), **frame | {"tint": metal * 0.7})
+        parts.append(cone(np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame))
+        parts.append(cone(_EYE, tip - (0, 0, 0.015), (0, 0.032, 0.032), **frame | {"tint": metal * 0.7}))
     for side in (-1, 1):
-        parts.add(BOX, _EYE, (side * 0.27, 0.03, 0.66), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8})
-        parts.add(BOX, _EYE, (side * 0.27, 0.05, 0.55), (0.015, 0.02, 0.1), **frame)
+        parts.append(box(_EYE, (side * 0.27, 0.03, 0.66), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8}))
+        parts.append(box(_EYE, (side * 0.27, 0.05, 0.55), (0.015, 0.02, 0.1), **frame))
     return parts
 
 
 def cartons(scene: int, number: int, id: int) -> Parts:
     """Two printed cartons on each other."""
-    parts, rng, bottom = Parts(), stream(scene, "synthetic", "cartons", number), 0.0
+    parts, rng, bottom = [], stream(scene, "synthetic", "cartons", number), 0.0
     for k in range(2):
         half = (0.19 + 0.08 * rng.random(), 0.16 + 0.06 * rng.random(), 0.14 + 0.05 * rng.random())
         names = (*(f"poster:{(face + k) % 4}" for face in range(4)), "plain", "plain")
-        style: Style = {"instance": id, "texture": names, "fit": (0, 1, 2, 3)}
-        parts.add(BOX, turn(30 * rng.random()), (0.0, 0.0, bottom + half[2]), half, tint=(0.9, 0.8, 0.66), **style)
+        style: Style = {"instance": id, "texture": names, "fit": (0, 1, 2, 3), "tint": (0.9, 0.8, 0.66)}
+        parts.append(box(turn(30 * rng.random()), (0.0, 0.0, bottom + half[2]), half, **style))
         bottom += 2 * half[2]
     return parts
 
 
 def printed_box(id: int, half: tuple[float, float, float]) -> Parts:
     """A carton with a print on every side; its origin is its middle."""
-    parts = Parts()
-    parts.add(BOX, _EYE, np.zeros(3), half, instance=id, **_PRINT)
-    return parts
+    return [box(_EYE, np.zeros(3), half, instance=id, **_PRINT)]
 
 
 def balloon(id: int, radius: float) -> Parts:
     """A printed balloon with its knot; the origin is its middle."""
-    parts, scale = Parts(), (1.0, 1.0, 1.15)
-    parts.add(ROUND_CONE, _EYE, np.zeros(3), (0.0, radius, radius), instance=id, texture="print:balloon",
-              repeat=(2.0, 2.0), scale=scale)  # fmt: skip
-    parts.add(ROUND_CONE, _EYE, (0.0, 0.0, -1.2 * radius), (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3))
-    return parts
+    skin: Style = {"texture": "print:balloon", "repeat": (2.0, 2.0), "scale": (1.0, 1.0, 1.15)}
+    return [
+        cone(_EYE, np.zeros(3), (0.0, radius, radius), instance=id, **skin),
+        cone(_EYE, (0.0, 0.0, -1.2 * radius), (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3)),
+    ]
 
 
 def trolley(id: int, scene: int, plan: Plan) -> Parts:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
-    parts, rng, bottom = Parts(), stream(scene, "synthetic", "trolley"), 0.18
-    metal: Style = {"instance": id, "tint": plan.tints["metal"]}
-    parts.add(BOX, _EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal)
-    for x, y in ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24)):
-        parts.add(ROUND_CONE, _EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3)
-    for y in (-0.26, 0.26):
-        parts.add(ROUND_CONE, _EYE, (-0.43, y, 0.16), (0.85, 0.015, 0.015), **metal)
-    parts.add(BOX, _EYE, (-0.43, 0, 1.01), (0.015, 0.27, 0.015), **metal)
+    rng, bottom, metal = stream(scene, "synthetic", "trolley"), 0.18, {"instance": id, "tint": plan.tints["metal"]}
+    wheels = ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24))
+    parts = [
+        box(_EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal),
+        *(cone(_EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3) for x, y in wheels),
+        *(cone(_EYE, (-0.43, y, 0.16), (0.85, 0.015, 0.015), **metal) for y in (-0.26, 0.26)),
+        box(_EYE, (-0.43, 0, 1.01), (0.015, 0.27, 0.015), **metal),
+    ]
     for _ in range(3):
         half = (0.26 + 0.12 * rng.random(), 0.2 + 0.08 * rng.random(), 0.15 + 0.06 * rng.random())
-        parts.add(BOX, _EYE, np.array([0.02, 0.0, bottom + half[2]]), half, instance=id, **_PRINT)
+        parts.append(box(_EYE, np.array([0.02, 0.0, bottom + half[2]]), half, instance=id, **_PRINT))
         bottom += 2 * half[2]
     return parts
 
 
 def door_leaf(id: int, plan: Plan, width: float) -> Parts:
     """A door leaf whose hinge stands at the origin and which runs along +x; posters on both sides."""
-    parts, half = Parts(), (width / 2, 0.02, 1.02)
-    parts.add(BOX, _EYE, (width / 2, 0.0, 1.03), half, instance=id, texture="wood", tint=plan.tints["door"])
-    for k, (x, z) in enumerate(((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))):
-        names = ("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain")
-        parts.add(BOX, _EYE, (x * width, 0.0, z), (0.15, 0.024, 0.2), instance=id, texture=names, fit=(2, 3))
-    parts.add(BOX, _EYE, (width - 0.08, 0.0, 1.03), (0.06, 0.05, 0.012), instance=id, tint=plan.tints["metal"])
-    return parts
+    leaf, places = (width / 2, 0.02, 1.02), ((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))
+    faces = [("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain") for k in range(4)]
+    return [
+        box(_EYE, (width / 2, 0.0, 1.03), leaf, instance=id, texture="wood", tint=plan.tints["door"]),
+        *(
+            box(_EYE, (x * width, 0.0, z), (0.15, 0.024, 0.2), instance=id, texture=names, fit=(2, 3))
+            for (x, z), names in zip(places, faces, strict=True)
+        ),
+        box(_EYE, (width - 0.08, 0.0, 1.03), (0.06, 0.05, 0.012), instance=id, tint=plan.tints["metal"]),
+    ]

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic import textures
 from dynslam_bench.sequences.synthetic.arithmetic import Array, norm, product
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE, Parts
-from dynslam_bench.sequences.synthetic.people import Person, Posture, add_person
+from dynslam_bench.sequences.synthetic.people import Person, Posture, build_person
 from dynslam_bench.sequences.synthetic.settings import CAMERA, DEFAULT_FRAMES, FPS, RenderSettings
 from dynslam_bench.sequences.tags import Tag
 
@@ -160,11 +161,8 @@ class Scene:
         self.world, self.seed = world, scene
         self.moves = settings.people == "moving"
         self.actors = () if settings.people == "none" else world.actors
-        parts = Parts(world.static)
-        for body in world.bodies:
-            parts.extend(body.parts)
-        for person, posture in self.actors:
-            add_person(parts, person, posture(0.0))
+        people = (build_person(person, posture(0.0)) for person, posture in self.actors)
+        parts = [*world.static, *chain(*(body.parts for body in world.bodies), *people)]
         columns = {
             name: np.array([getattr(part, name) for part in parts])
             for name in ("kind", "instance", "scale", "shape", "uv", "tint", "rotation", "origin")
@@ -199,9 +197,7 @@ class Scene:
             turned, shift = body.path(time)
             rotation[part], origin[part] = product(turned, rotation[part]), product(origin[part], turned.T) + shift
             end = part.stop
-        people = Parts()
-        for person, posture in self.actors:
-            add_person(people, person, posture(time))
+        people = list(chain(*(build_person(person, posture(time)) for person, posture in self.actors)))
         if people:
             rotation[end:] = [part.rotation for part in people]
             origin[end:] = [part.origin for part in people]
