@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.settings import REPAIR_BAND_PX, SegmentationSettings, expand_classes
 
 HOLE_RADIUS_PX = 3
@@ -42,21 +41,12 @@ def dynamic_mask(
     Args:
         instances: The objects that the segmenter returned.
         settings: Classes, confidence, repair and dilation.
-        depth: float32 ``[H, W]`` metres, 0 missing, for ``repair = depth``; None fills holes only.
+        depth: float32 ``[H, W]`` metres, 0 missing, of the masks' size, for ``repair = depth``; None fills holes only.
 
     Returns:
         Bool ``[H, W]``; all false without dynamic objects.
-
-    Raises:
-        SegmentationError: The depth image does not have the masks' size.
     """
     chosen = select(instances, settings)
-    height, width = instances.masks.shape[1:]
-    if depth is not None and depth.shape != (height, width):
-        raise SegmentationError(
-            f"the depth image is {depth.shape[1]}x{depth.shape[0]}, the masks {width}x{height}",
-            "masks must have the frame's size",
-        )
     union = chosen.masks.any(axis=0)
     if settings.repair == "depth" and chosen.class_names:
         union = np.any([repair(mask, depth, settings.repair_depth_m) for mask in chosen.masks], axis=0)

@@ -280,8 +280,7 @@ class OracleSegmenter:
         """The objects of frame `frame.index`.
 
         Raises:
-            SegmentationError: The masks do not have the frame's size, or the sequence has none for this frame, or they
-                cannot be read.
+            SegmentationError: The sequence has no masks for this frame, or they cannot be read.
         """
         try:
             masks = self.source[frame.index]
@@ -291,11 +290,6 @@ class OracleSegmenter:
             raise
         except Exception as error:  # the masks of a plug-in's data set may raise anything
             raise SegmentationError(f"the exact masks of frame {frame.index} cannot be read: {error}") from error
-        (height, width), (rows, columns) = np.shape(masks.instances)[:2], frame.rgb.shape[:2]
-        if (height, width) != (rows, columns):
-            raise SegmentationError(
-                f"exact masks of frame {frame.index}: the mask is {width}x{height}, the frame {columns}x{rows}"
-            )
         instances = instances_of(masks, where=f"exact masks of frame {frame.index}")
         return instances if self.motion else replace(instances, moving=None)
 

@@ -123,12 +123,13 @@ def test_oracle_refuses_what_does_not_fit():
         build_segmenter(SegmentationSettings(source="oracle"), sequence_id="tum/fr3/walking_xyz")
     nameless = [FrameMasks(np.full((24, 32), 9, np.uint8), {1: "person"}, frozenset())]
     for masks, wrong, words in (
-        (Masks(), frame(shape=(30, 40)), "32x24, the frame 40x30"),
         (Masks(), frame(7), "frame 7"),
         (nameless, frame(), "object 9 has no class name"),
     ):
         with pytest.raises(SegmentationError, match=words):
             OracleSegmenter(masks).segment(wrong)
+    with pytest.raises(SegmentationError, match="the frame is 40x30"):
+        build_segmenter(SegmentationSettings(source="oracle"), masks=Masks()).segment(frame(shape=(30, 40)))
 
 
 # --- recorded ----------------------------------------------------------------------------------------------------

@@ -42,13 +42,7 @@ class MaskTally:
         self._ignored: list[NDArray[np.bool_]] = []
 
     def add(self, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]) -> None:
-        """Compare the detections in an image with its labels: masks ``[M, H, W]``, ``[N, H, W]`` and scores ``[N]``.
-
-        Raises:
-            SegmentationError: The masks differ in size.
-        """
-        if true.shape[1:] != guess.shape[1:]:
-            raise SegmentationError(f"masks of {guess.shape[1:]} cannot be compared with {true.shape[1:]}")
+        """Compare the detections in an image with its labels: masks ``[M, H, W]``, ``[N, H, W]`` and scores ``[N]``."""
         order = np.argsort(-scores, kind="stable")
         guess, scores = guess[order], scores[order]
         overlap = mask_iou(guess, true)

@@ -276,10 +276,8 @@ def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageLis
     """Images with a stamp each, in nanoseconds, put in order of time.
 
     Raises:
-        SequenceError: The numbers differ, or stamps are equal or less than 1 us apart.
+        SequenceError: Stamps are equal or less than 1 us apart.
     """
-    if len(files) != len(stamps):
-        raise SequenceError(f"{where} holds {len(files)} images but {len(stamps)} stamps")
     order = np.argsort(stamps, kind="stable")
     ordered, equal = stamps[order], np.flatnonzero(np.diff(stamps[order]) == 0)
     if len(equal):
