@@ -193,11 +193,11 @@ def _trunk(f: _Figure) -> Parts:
     left, right = (root + _in(hipline, side * 0.055 * k, 0, 0.01) for side in (-1, 1))
     waist, chest = root + _in(trunk, 0.0, 0.0, 0.08 * k), root + _in(trunk, 0.0, 0.005, 0.36 * k)
     across, up = product(trunk, _X), _in(trunk, 0, 0, 0.05 * k)
-    shoulders = [chest + side * across * 0.11 * k * f.b + up for side in (-1, 1)]
+    one, other = (chest + side * across * 0.11 * k * f.b + up for side in (-1, 1))
     return [
         f.limb(left, right, 0.115 * k * f.b, 0.115 * k * f.b, product(hipline, _Z), 0.95, **f.jeans),
         f.limb(waist, chest, 0.148 * k * f.b, 0.168 * k * f.b, across, 0.68, repeat=(5.0, 6.0), **f.shirt),
-        f.limb(*shoulders, 0.088 * k * f.b, 0.088 * k * f.b, product(trunk, _Y), repeat=(3.0, 6.0), **f.shirt),
+        f.limb(one, other, 0.088 * k * f.b, 0.088 * k * f.b, product(trunk, _Y), repeat=(3.0, 6.0), **f.shirt),
     ]
 
 

@@ -445,7 +445,8 @@ def balloon(id: int, radius: float) -> Parts:
 
 def trolley(id: int, scene: int, plan: Plan) -> Parts:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
-    rng, bottom, metal = stream(scene, "synthetic", "trolley"), 0.18, {"instance": id, "tint": plan.tints["metal"]}
+    rng, bottom = stream(scene, "synthetic", "trolley"), 0.18
+    metal: Style = {"instance": id, "tint": plan.tints["metal"]}
     wheels = ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24))
     parts = [
         box(_EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal),
