@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -33,7 +34,6 @@ class Preprocessed(Wrapped):
         self.base = base
         self.settings = settings
         self.camera = preprocessed_camera(base.camera, settings)
-        self._maps: dict[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
 
     @property
     def masks(self) -> MaskSource | None:
@@ -61,19 +61,20 @@ class Preprocessed(Wrapped):
 
     def _geometry(self, image: Image, *, colour: bool) -> Any:
         if self.settings.undistort and self.base.camera.is_distorted:
-            maps = self._undistortion((image.shape[1], image.shape[0]))
+            maps = _undistortion(self.base.camera.resized(image.shape[1], image.shape[0]))
             interpolation = cv2.INTER_LINEAR if colour else cv2.INTER_NEAREST
             image = cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return resize(image, self.camera.width, self.camera.height, colour=colour)
 
-    def _undistortion(self, size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        if size not in self._maps:
-            camera = self.base.camera.resized(*size)
-            map_x, map_y = cv2.initUndistortRectifyMap(
-                camera.matrix, np.asarray(camera.distortion), np.eye(3), camera.matrix, size, cv2.CV_32FC1
-            )
-            self._maps[size] = (np.asarray(map_x, dtype=np.float32), np.asarray(map_y, dtype=np.float32))
-        return self._maps[size]
+
+@lru_cache(maxsize=4)
+def _undistortion(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where each pixel of an undistorted image lies in the distorted one: columns and rows, ``[H, W]``."""
+    size = camera.width, camera.height
+    map_x, map_y = cv2.initUndistortRectifyMap(
+        camera.matrix, np.asarray(camera.distortion), np.eye(3), camera.matrix, size, cv2.CV_32FC1
+    )
+    return np.asarray(map_x, dtype=np.float32), np.asarray(map_y, dtype=np.float32)
 
 
 def preprocessed_camera(camera: Camera, settings: PreprocessingSettings) -> Camera:

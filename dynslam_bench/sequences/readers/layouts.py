@@ -139,10 +139,10 @@ def read_seven_scenes(folder: Path, fps: float | None) -> Contents:
     colour = stamped(files, stamps, str(folder))
     depth = stamped([f"frame-{number}.depth.png" for number in frames], stamps, str(folder))
     poses = [_kinect_fusion_pose(folder / f"frame-{number}.pose.txt") for number in frames]
-    known = [i for i, pose in enumerate(poses) if pose is not None]
-    tracked = np.array([pose for pose in poses if pose is not None])
-    truth = Trajectory(to_seconds(stamps[known]), tracked, stamps[known]) if known else None
-    lost = len(poses) - len(known)
+    tracked = [i for i, pose in enumerate(poses) if pose is not None]
+    matrices = np.array([pose for pose in poses if pose is not None])
+    truth = Trajectory(to_seconds(stamps[tracked]), matrices, stamps[tracked]) if tracked else None
+    lost = len(poses) - len(tracked)
     dropped = f"ground truth: {lost} of {len(poses)} poses lost" if lost else ""
     return Contents(colour, depth, True, truth, dropped, _SEVEN_SCENES_CAMERA, rate, missing_depth=65535)
 

@@ -105,10 +105,7 @@ class FrameStore:
     def read(self, kind: str, stamp: float) -> NDArray[Any] | None:
         """An image (RGB order), or None if it is missing or damaged; raises as `bytes_of`."""
         data = self.bytes_of(kind, stamp)
-        try:
-            image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            return None
+        image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image is not None and kind == "rgb" else image
 
     def write(self, stamp: float, frame: Rendered) -> None:
