@@ -355,7 +355,7 @@ SPECS = (
     system(
         "ds-slam",
         "DS-SLAM (our back end)",
-        (("moving_vote:MovingVoteFilter", "moving_vote", "segmentation"),),
+        (("epipolar:MovingVoteFilter", "moving_vote", "segmentation"),),
         {"segmentation": WHOLE_OBJECTS, "moving_vote": MovingVoteSettings()},
         summary="moving-consistency check on Lucas-Kanade tracks, one vote for all people",
         provenance="faithful-code",
