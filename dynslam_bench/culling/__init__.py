@@ -11,9 +11,9 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult
+from dynslam_bench.contracts import DynamicFilter, FilterResult
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 S = TypeVar("S", bound=Settings)

@@ -9,14 +9,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.regions import NEAR
 from dynslam_bench.culling.settings import CorrelationSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera, pixel_index
+from dynslam_bench.geometry import Camera, pixel_index, se3
 
 Numbers = NDArray[np.floating]
 

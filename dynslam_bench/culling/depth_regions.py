@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxDepthSettings, DepthBlockSettings, DepthRansacSettings
-from dynslam_bench.geometry.camera import inside
+from dynslam_bench.geometry import inside
 from dynslam_bench.segmentation.postprocess import dilate, select
 
 MIN_POINTS = 3

@@ -8,12 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, coherent
 from dynslam_bench.culling.settings import RigidMotionSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera, pixel_index
+from dynslam_bench.geometry import Camera, pixel_index, se3
 
 MIN_POINTS = 12
 TURN_PX = (12.0, 6.0, 4.0)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Number, ObjectRule, Rule
 from dynslam_bench.culling.ego_motion import rigid_flow
 from dynslam_bench.culling.regions import NEAR, coherent
@@ -23,7 +23,7 @@ from dynslam_bench.culling.settings import (
     MovingVoteSettings,
     Unmatched,
 )
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry import Camera, inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, select
 
 Points = NDArray[np.float64]

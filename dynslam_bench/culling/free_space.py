@@ -7,13 +7,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.regions import coherent
 from dynslam_bench.culling.settings import FreeSpaceSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera, pixel_index
+from dynslam_bench.geometry import Camera, pixel_index, se3
 
 KEYFRAMES = 8
 """Number of the latest keyframes that are compared."""

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import ProbabilitySettings
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry import Camera, inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

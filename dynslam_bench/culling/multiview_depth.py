@@ -8,15 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, KeyframeView, Need, Provenance
-from dynslam_bench.contracts.flow import FlowResult
+from dynslam_bench.contracts import FilterResult, FilterState, FlowResult, FrameBundle, KeyframeView, Need, Provenance
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.features.matching import CellGrid, Features, as_words, search_in_radius
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry import Camera, inside, se3
 from dynslam_bench.segmentation.postprocess import dilate
 
 MAX_REFERENCE_DEPTH_M = 6.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.orb import EDGE, level_quotas, spread

@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import inside, pixel_index
+from dynslam_bench.geometry import inside, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import select
 
 STEP = 8

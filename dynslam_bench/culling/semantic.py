@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
-from dynslam_bench.geometry.camera import inside
+from dynslam_bench.geometry import inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 

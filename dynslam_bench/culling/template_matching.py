@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 
 
 class TemplateFilter(ObjectRule[TemplateSettings]):

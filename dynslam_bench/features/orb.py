@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.geometry.camera import inside
+from dynslam_bench.geometry import inside
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
+from dynslam_bench.contracts import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
 from dynslam_bench.core.errors import PluginError
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.plugins import Registry, build_plugin

@@ -2,9 +2,9 @@
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.association import associate, nearest_gap
-from dynslam_bench.geometry.camera import Camera, inside
+from dynslam_bench.geometry.camera import Camera, inside, pixel_index
 from dynslam_bench.geometry.se3 import Array
-from dynslam_bench.geometry.stamps import format_ns, from_seconds, ns_of, refuse_close
+from dynslam_bench.geometry.stamps import format_ns, from_seconds, ns_of, parse_ns, refuse_close, to_seconds
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 from dynslam_bench.geometry.trajectory_files import (
     FileNotes,
@@ -12,7 +12,10 @@ from dynslam_bench.geometry.trajectory_files import (
     format_tum,
     is_number,
     load_trajectory,
+    load_tum,
     read_kitti,
+    read_stamps,
+    read_table,
     read_tum,
     write_kitti,
     write_tum,
@@ -32,12 +35,18 @@ __all__ = [
     "inside",
     "is_number",
     "load_trajectory",
+    "load_tum",
     "nearest_gap",
     "ns_of",
+    "parse_ns",
+    "pixel_index",
     "read_kitti",
+    "read_stamps",
+    "read_table",
     "read_tum",
     "refuse_close",
     "se3",
+    "to_seconds",
     "write_kitti",
     "write_tum",
 ]

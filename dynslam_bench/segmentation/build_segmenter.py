@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
-from dynslam_bench.contracts.sequence import Frame, MaskSource, Sequence
+from dynslam_bench.contracts import Frame, Instances, MaskSource, Segmenter, SegmenterContext, SegmenterSpec, Sequence
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, path_digest
 from dynslam_bench.core.plugins import Registry, build_plugin

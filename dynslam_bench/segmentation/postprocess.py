@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts import Instances
 from dynslam_bench.segmentation.settings import REPAIR_BAND_PX, SegmentationSettings, expand_classes
 
 HOLE_RADIUS_PX = 3

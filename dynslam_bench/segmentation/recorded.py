@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.segmenter import Instances, SegmenterContext
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
+from dynslam_bench.contracts import Frame, FrameMasks, Instances, MaskSource, SegmenterContext, Sequence
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.images import read_image

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.segmenter import Instances, Segmenter
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.contracts import Frame, Instances, Segmenter
+from dynslam_bench.geometry import Camera
 from dynslam_bench.segmentation.build_segmenter import ConfiguredSegmenter
 from dynslam_bench.segmentation.postprocess import boxes_of, region, select
 from dynslam_bench.segmentation.settings import MAX_CARRY, SegmentationSettings

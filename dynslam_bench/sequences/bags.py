@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import DynslamError, SequenceError
 from dynslam_bench.core.files import atomic_folder
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.stamps import parse_ns
+from dynslam_bench.geometry import Camera, parse_ns
 from dynslam_bench.sequences.cameras import CAMERA_FILE, write_camera
 from dynslam_bench.sequences.catalogue import open_folder
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts import Sequence
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 from dynslam_bench.geometry.se3 import hat
 from dynslam_bench.sequences.rgbd_motion import Array, follow_corners
 

@@ -15,12 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts import Frame, Sequence
 from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.association import nearest_gap
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, nearest_gap, se3
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.rgbd_motion import (
     READINGS,

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence
+from dynslam_bench.contracts import Frame, FrameMasks, MaskSource, Sequence
 from dynslam_bench.core.records import digest
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.view import Masks, Wrapped
 

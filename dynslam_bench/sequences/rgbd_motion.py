@@ -14,12 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.contracts import Frame
+from dynslam_bench.geometry import Array, Camera, Trajectory, se3
 
-Array = NDArray[np.float64]
 Pixels = NDArray[np.float32]
 
 CORNERS = 300

@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory, se3
 
 Tag = Literal["static", "low-dynamic", "high-dynamic", "unknown-objects"]
 """What moves in a scene: nothing, people who stay where they are, people who walk, things that are no people."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, MaskSource, Sequence, timestamps_ns
+from dynslam_bench.contracts import Frame, FrameMasks, MaskSource, Sequence, timestamps_ns
 from dynslam_bench.core.records import digest
 
 

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.segmenter import Instances, SegmenterContext
-from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts import Frame, Instances, SegmenterContext
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights

@@ -21,8 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.segmenter import Instances, SegmenterContext
-from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts import Frame, Instances, SegmenterContext
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.postprocess import boxes_of

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.contracts import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.records import Record, schema

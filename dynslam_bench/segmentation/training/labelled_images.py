@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Sequence as RgbdSequence
+from dynslam_bench.contracts import Sequence as RgbdSequence
 from dynslam_bench.core.errors import SegmentationError, did_you_mean
 from dynslam_bench.core.files import atomic_folder
 from dynslam_bench.core.images import read_image

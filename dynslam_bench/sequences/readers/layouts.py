@@ -14,12 +14,18 @@ import numpy as np
 
 from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.core.reading import read_text
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.association import nearest_gap
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.stamps import from_seconds, to_seconds
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import TumFile, load_tum, read_stamps, read_table
+from dynslam_bench.geometry import (
+    Camera,
+    Trajectory,
+    TumFile,
+    from_seconds,
+    load_tum,
+    nearest_gap,
+    read_stamps,
+    read_table,
+    se3,
+    to_seconds,
+)
 from dynslam_bench.sequences.readers.lists import (
     Contents,
     ImageList,

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.images import image_size
 from dynslam_bench.core.reading import MEGABYTE, read_bytes, read_lines
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.stamps import format_ns, ns_of, parse_ns, refuse_close, to_seconds
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, format_ns, ns_of, parse_ns, refuse_close, to_seconds
 
 MOST_LINES = 1_000_000
 """Nine hours at 30 frames a second; a longer list is refused before it fills the memory."""

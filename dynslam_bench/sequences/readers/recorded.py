@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.sequence import Frame, MaskSource
+from dynslam_bench.contracts import Frame, MaskSource
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.sanitise import inside
-from dynslam_bench.geometry.association import associate, nearest_gap
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
 from dynslam_bench.sequences.readers.lists import Contents, Dropped, ImageList
 

@@ -15,13 +15,8 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.core.reading import read_lines, read_text
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.stamps import parse_ns, refuse_close, to_seconds
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import is_number
+from dynslam_bench.geometry import Array, Trajectory, is_number, parse_ns, refuse_close, se3, to_seconds
 from dynslam_bench.sequences.readers.lists import MOST_LINES
-
-Array = NDArray[np.float64]
 
 MOST_BYTES = 1 << 16
 """A calibration has a few kilobytes."""

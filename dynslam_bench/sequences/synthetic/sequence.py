@@ -21,14 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks
+from dynslam_bench.contracts import Frame, FrameMasks
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import digest
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.geometry import Camera, Trajectory, write_tum
 from dynslam_bench.sequences.cameras import write_camera
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
 from dynslam_bench.sequences.synthetic.renderer import Rendered, Renderer, default_threads

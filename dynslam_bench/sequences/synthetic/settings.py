@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 
 RENDERER_VERSION = 6
 """Raised whenever any pixel, pose or mask of any sequence changes; part of every digest and cache folder."""
