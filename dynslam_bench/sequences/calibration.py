@@ -24,9 +24,9 @@ from scipy.stats import t as student
 
 from dynslam_bench.contracts import Sequence
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.geometry import Camera
+from dynslam_bench.geometry import Array, Camera
 from dynslam_bench.geometry.se3 import hat
-from dynslam_bench.sequences.rgbd_motion import Array, follow_corners
+from dynslam_bench.sequences.rgbd_motion import follow_corners
 
 WINDOW_FRAMES = 16
 """Frames of a window, half of which the next one shares: 0.5 s at 30 Hz, in which a hand changes the velocity."""

@@ -17,13 +17,12 @@ from scipy.optimize import least_squares
 
 from dynslam_bench.contracts import Frame, Sequence
 from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
-from dynslam_bench.geometry import Camera, Trajectory, nearest_gap, se3
+from dynslam_bench.geometry import Array, Camera, Trajectory, nearest_gap, se3
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.rgbd_motion import (
     READINGS,
     ROTATION_GAIN,
     ROTATION_NOISE,
-    Array,
     Match,
     Motions,
     RgbdPair,

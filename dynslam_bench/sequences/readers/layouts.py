@@ -15,6 +15,7 @@ import numpy as np
 from dynslam_bench.core.errors import SequenceError, TrajectoryError
 from dynslam_bench.core.reading import read_text
 from dynslam_bench.geometry import (
+    Array,
     Camera,
     Trajectory,
     TumFile,
@@ -37,7 +38,6 @@ from dynslam_bench.sequences.readers.lists import (
     stamped,
 )
 from dynslam_bench.sequences.readers.tables import (
-    Array,
     camera_on_body,
     nanoseconds,
     numbers,
