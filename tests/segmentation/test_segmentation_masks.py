@@ -64,12 +64,10 @@ def test_dilation_is_a_disc_of_that_radius(radius):
     assert not dilate(np.zeros((H, W), bool), radius).any()
 
 
-def test_dynamic_mask_of_nothing_and_of_wrong_depth():
+def test_dynamic_mask_of_nothing():
     assert not dynamic_mask(Instances.empty(H, W), SegmentationSettings()).any()
     found = instances(block(10, 50, 10, 50), scores=[0.05])
     assert not dynamic_mask(found, SegmentationSettings()).any()
-    with pytest.raises(SegmentationError, match="depth image is 80x60, the masks 160x120"):
-        dynamic_mask(found, SegmentationSettings(), np.zeros((60, 80), np.float32))
 
 
 def test_holes_are_filled_and_bays_stay():
