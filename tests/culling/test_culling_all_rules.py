@@ -15,8 +15,7 @@ from dynslam_bench.contracts.filter import DynamicFilter, FilterState
 from dynslam_bench.core.settings import Settings, parameters
 from dynslam_bench.culling.correlation_graph import CorrelationFilter
 from dynslam_bench.culling.depth_regions import BoxDepthFilter, person_set
-from dynslam_bench.culling.epipolar import ClassRuleFilter
-from dynslam_bench.culling.moving_vote import MovingVoteFilter
+from dynslam_bench.culling.epipolar import ClassRuleFilter, MovingVoteFilter
 from dynslam_bench.culling.multiview_depth import MultiViewFilter
 from dynslam_bench.culling.reseeding import ReseedingFilter
 from dynslam_bench.culling.settings import (

@@ -21,9 +21,8 @@ from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.settings import build
 from dynslam_bench.culling.depth_regions import BoxDepthFilter, DepthBlockFilter, DepthRansacFilter, covered_blocks
-from dynslam_bench.culling.epipolar import BoxEpipolarFilter, ClassRuleFilter
+from dynslam_bench.culling.epipolar import BoxEpipolarFilter, ClassRuleFilter, MovingVoteFilter
 from dynslam_bench.culling.moving_probability import ProbabilityFilter, expand
-from dynslam_bench.culling.moving_vote import MovingVoteFilter
 from dynslam_bench.culling.reseeding import ReseedingFilter
 from dynslam_bench.culling.residual_clusters import ResidualFilter
 from dynslam_bench.culling.semantic import SemanticFilter

@@ -11,7 +11,7 @@ import torch
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
-from dynslam_bench.segmentation.networks import boxes as box_ops
+from dynslam_bench.segmentation.networks import network as box_ops
 from dynslam_bench.segmentation.networks.backbone import RESNET18, NetworkConfig
 from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network, save_network

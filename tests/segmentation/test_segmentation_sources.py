@@ -29,9 +29,8 @@ from dynslam_bench.segmentation.build_segmenter import (
 from dynslam_bench.segmentation.networks import checkpoints
 from dynslam_bench.segmentation.networks import onnx_export as static
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
-from dynslam_bench.segmentation.networks.boxes import box_iou, nms
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
-from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.networks.network import MaskRCNN, box_iou, nms
 from dynslam_bench.segmentation.networks.onnx_export import (
     StaticMaskRCNN,
     export_network,

@@ -14,19 +14,21 @@ from coco_file import coco
 
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
-from dynslam_bench.segmentation.networks.boxes import IGNORED, NEGATIVE, match, sample
 from dynslam_bench.segmentation.networks.loading import FORMAT, load_network
-from dynslam_bench.segmentation.networks.network import MaskRCNN, crop_masks
+from dynslam_bench.segmentation.networks.network import IGNORED, NEGATIVE, MaskRCNN, crop_masks, match, sample
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
 from dynslam_bench.segmentation.training.labelled_images import (
     LabelledImage,
+    PreparedImages,
     coco_images,
     decode_runs,
     open_labelled,
+    prepare,
+    shrink,
+    vary,
     yolo_images,
 )
-from dynslam_bench.segmentation.training.prepared import PreparedImages, prepare, shrink, vary
 from dynslam_bench.segmentation.training.settings import TrainSettings
 from dynslam_bench.segmentation.training.train import network_config, train
 

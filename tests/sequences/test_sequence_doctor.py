@@ -18,12 +18,10 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences import PreprocessingSettings, open_sequence
 from dynslam_bench.sequences.calibration import Window, adjust, calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
-from dynslam_bench.sequences.doctor import Diagnosis, diagnose, examine, stretches
+from dynslam_bench.sequences.doctor import Diagnosis, Finding, diagnose, examine, stretches, truth_findings
 from dynslam_bench.sequences.preprocessing import Preprocessed
 from dynslam_bench.sequences.rgbd_motion import READINGS, read_as, rgbd_pairs
-from dynslam_bench.sequences.stream_checks import Finding
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
-from dynslam_bench.sequences.truth_checks import truth_findings
 
 FRAMES = 80
 
