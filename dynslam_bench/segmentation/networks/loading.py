@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -65,15 +66,17 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     """
     path = path.expanduser()
     try:
-        size = path.stat().st_size
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+    except OSError as error:
+        raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
+    try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 unpacked = sum(entry.file_size for entry in archive.infolist())
             if unpacked > MAX_EXPANSION * size:
                 raise ValueError(f"it claims to unpack to {unpacked} bytes")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
     except Exception as error:  # torch raises many types for a damaged file
         reason = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
         raise SegmentationError(
