@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import dynslam_bench
 from dynslam_bench.core.errors import ReportError
@@ -597,7 +598,7 @@ def publish(
     made = f"Made by dynslam-bench report publish, version {dynslam_bench.__version__}."
     site = sections_page([], title=title, pages=pages, protocol=note, footer=made)
     write_atomic(output / "index.html", site.replace(f'="{ASSETS}/', f'="leaderboard/{ASSETS}/'))
-    lines = [f"- [{prose(name)}]({Path(href).parent.as_posix()}): {prose(words)}" for href, name, words in pages]
+    lines = [f"- [{prose(name)}]({quote(str(Path(href).parent))}): {prose(words)}" for href, name, words in pages]
     how = "The pages are HTML: get the repository, and open `index.html` in a browser."
     text = [f"# {prose(title)}", prose(note), *lines, how, made]
     write_atomic(output / README, "\n\n".join(filter(None, text)) + "\n")

@@ -113,7 +113,7 @@ def _write_pages(
 
     A page whose inputs are as they were stays as it is.
     """
-    pages, common = [], [package_digest(_CODE), protocol.digest(), *share.items()]
+    pages, common = [], digest([package_digest(_CODE), protocol.digest(), *share.items()])
     for row in rows:
         name, files = f"run-{row.run_id}", _files(row, output)
         stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]

@@ -258,6 +258,11 @@ def test_a_failed_run_explains_itself(browser, report):
     browser.until("byId('time').layout", tries=100)
     shaded = browser.run("byId('time').layout.shapes[0]")
     assert shaded["x0"] == pytest.approx(29 / 30, abs=0.05) and shaded["x1"] == pytest.approx(4.0)
+    browser.open(report.html)
+    linked = browser.run("select('#panel-0 td a').find((link) => link.textContent === '7/8').href")
+    assert "run.html#" in linked, "the number of successes leads to the failure"
+    browser.open(report.run, anchor="#" + linked.partition("#")[2])
+    browser.until("byId('verdict').classList.contains('red')", tries=100)
 
 
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
