@@ -53,22 +53,13 @@ STRATEGIES: dict[SearchName, Strategy] = {
 }
 
 
-class Plan(NamedTuple):
-    """How a search spends its budget.
+def make_plan(settings: DaisySettings) -> tuple[int, tuple[int, ...], tuple[Any, ...]]:
+    """Divide `FlowSettings.budget`; small budgets get fewer sweeps and smaller populations.
 
-    Attributes:
-        population: Labels kept a point.
-        ends: Evaluations a point at which each phase ends; between phases labels are exchanged.
-        options: Last arguments of `run_phase`.
+    Returns:
+        The number of labels kept a point; the evaluations a point at which each phase ends (between phases labels are
+        exchanged); the last arguments of `run_phase`.
     """
-
-    population: int
-    ends: tuple[int, ...]
-    options: tuple[Any, ...]
-
-
-def make_plan(settings: DaisySettings) -> Plan:
-    """Divide `FlowSettings.budget`; small budgets get fewer sweeps and smaller populations."""
     budget = settings.budget
     rules, shrink, propagates = STRATEGIES[settings.search]
     sweeps = min(settings.sweeps, max(1, budget // 16)) if propagates else 0
@@ -80,8 +71,8 @@ def make_plan(settings: DaisySettings) -> Plan:
     table = moth_flame.flight_table(population, iterations, rules or moth_flame.MFO)
     # of Eq. 13, per dimension of a label: px, px, octaves, radians
     steps = np.array([*[settings.cauchy_step_px] * 2, 0.1, np.deg2rad(5.0)], dtype=np.float32)
-    tables = (table, moth_flame.spiral_table(), moth_flame.cauchy_table(), steps)
-    return Plan(population, ends, (*tables, rules is not None, np.float32(shrink)))
+    tables = table, moth_flame.spiral_table(), moth_flame.cauchy_table(), steps
+    return population, ends, (*tables, rules is not None, np.float32(shrink))
 
 
 class SearchState(NamedTuple):
@@ -189,7 +180,6 @@ def run_phase(
     initial = population * (2 if table.opposition else 1)
     low, high = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
     trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
-    label = np.empty(4, dtype=np.float32)
     for i in range(start, stop):
         lower, upper, moths = state.lower[i], state.upper[i], state.moths[i]
         flames, costs = state.flames[i], state.costs[i]
@@ -212,9 +202,7 @@ def run_phase(
             elif moth_flame:
                 iteration = min(max((used - initial) // population, 0), iterations - 1)
                 random = move_moths(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, random)
-                for m in range(population):
-                    for j in range(4):
-                        trials[m, j] = moths[m, j]
+                trials[:population] = moths
             elif shrink == 0:
                 break
             else:
@@ -224,8 +212,7 @@ def run_phase(
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
             for k in range(min(count, end - used)):
-                for j in range(4):
-                    label[j] = trials[k, j]
+                label = trials[k]
                 cost = label_cost(
                     i, label[0], label[1], label[2], label[3], reference, target, tables, costs[population - 1]
                 )
@@ -239,8 +226,7 @@ def run_phase(
             elif stage == OPPOSITES:
                 for m in range(population):  # the best N of X and its opposites
                     if costs[m] < tables.ceiling:
-                        for j in range(4):
-                            moths[m, j] = flames[m, j]
+                        moths[m] = flames[m]
                 stage = SEARCH
         state.used[i] = used
 
@@ -300,8 +286,8 @@ def move_moths(
 ) -> Scalar:  # fmt: skip
     """Move every moth once (Eq. 8-18); returns the next random state."""
     population = len(moths)
-    span, own, best = table.span[iteration], table.own[iteration], table.best[iteration]
-    stepping, pulling = table.stepping[iteration], best > 0
+    now = table.coefficients[iteration]
+    span, own, best, stepping, pulling = now[0], now[1], now[2], now[3] > 0, now[2] > 0
     fewest = table.counts[iteration] - 1
     for m in range(population):
         flame = min(m, fewest)  # Eq. 8

@@ -122,6 +122,36 @@ def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
     return 8 * (level[0] + (yh >> 1) * level[1] + (xh >> 1)), 2 * (yh & 1) + (xh & 1)
 
 
+@inlined
+def read_descriptor(x: Scalar, y: Scalar, image: Side, tables: CostTables, turned: Ints) -> None:
+    """Fill int32 ``[4, 136]`` with the unrotated descriptor of a position, its bins shifted by -1, 0, 1 and 2."""
+    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
+    cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
+    cell1, phase1 = cell_of(x, y, tables.ring1[neutral])
+    for k in range(17):
+        if k < 9:
+            cell = cell0 + tables.samples[neutral, straight, phase0, k]
+        else:
+            cell = cell1 + tables.samples[neutral, straight, phase1, k]
+        for b in range(8):
+            value = np.int32(image.histograms[cell + b])
+            for turn in range(4):
+                turned[turn, 8 * k + ((b + turn - 1) & 7)] = value
+
+
+@inlined
+def rotate_descriptor(turned: Ints, a: int, out: Bytes, first: int) -> None:
+    """Write the descriptor for rotation index `a`: 136 bytes of `out` from `first` on."""
+    # bin b of the histogram rotated by theta is the unrotated one's at b - theta / 45 degrees
+    sixths = a - 6
+    whole = sixths // 6
+    far_weight = np.int32((sixths - 6 * whole) * 171)  # 1026 / 6
+    near_weight = np.int32(1026) - far_weight
+    near, far, rotated = turned[whole + 1], turned[whole + 2], out[first : first + 136]
+    for b in range(136):
+        rotated[b] = np.uint8((near_weight * near[b] + far_weight * far[b] + np.int32(512)) >> 10)
+
+
 @kernel
 def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTables, out: Bytes) -> None:
     """Reference descriptors of points, with their bins rotated by each quantised angle.
@@ -135,60 +165,15 @@ def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTab
         out: uint8, flat ``[N, S, ROTATIONS, 17 * 8]``.
     """
     height, width = image.gray.shape
-    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
-    turned = np.empty((4, 136), dtype=np.int32)  # bins shifted by -1, 0, 1, 2
+    turned = np.empty((4, 136), dtype=np.int32)
     supports = len(tables.support)
     for i in range(start, stop):
         for q in range(supports):
             x = min(max(points[i, 0] + np.float32(tables.support[q, 0]), np.float32(0)), np.float32(width - 1))
             y = min(max(points[i, 1] + np.float32(tables.support[q, 1]), np.float32(0)), np.float32(height - 1))
-            cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
-            cell1, phase1 = cell_of(x, y, tables.ring1[neutral])
-            for k in range(17):
-                if k < 9:
-                    cell = cell0 + tables.samples[neutral, straight, phase0, k]
-                else:
-                    cell = cell1 + tables.samples[neutral, straight, phase1, k]
-                for b in range(8):
-                    value = np.int32(image.histograms[cell + b])
-                    for turn in range(4):
-                        turned[turn, 8 * k + ((b + turn - 1) & 7)] = value
+            read_descriptor(x, y, image, tables, turned)
             for a in range(13):
-                # bin b of the histogram rotated by theta is the unrotated one's at b - theta / 45 degrees
-                sixths = a - 6
-                whole = sixths // 6
-                far_weight = np.int32((sixths - 6 * whole) * 171)  # 1026 / 6
-                near_weight = np.int32(1026) - far_weight
-                near, far = turned[whole + 1], turned[whole + 2]
-                first = ((i * supports + q) * 13 + a) * 136
-                rotated = out[first : first + 136]
-                for b in range(136):
-                    rotated[b] = np.uint8((near_weight * near[b] + far_weight * far[b] + np.int32(512)) >> 10)
-
-
-@inlined
-def describe_once(x: Scalar, y: Scalar, a: int, image: Side, tables: CostTables, out: Bytes, first: int) -> None:
-    """The descriptor of one position for rotation index `a`, without support: 136 bytes of `out` from `first` on."""
-    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
-    cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
-    cell1, phase1 = cell_of(x, y, tables.ring1[neutral])
-    sixths = a - 6
-    whole = sixths // 6
-    far_weight = np.int32((sixths - 6 * whole) * 171)
-    near_weight = np.int32(1026) - far_weight
-    for k in range(17):
-        cell = cell0 + tables.samples[neutral, straight, phase0, k]
-        if k >= 9:
-            cell = cell1 + tables.samples[neutral, straight, phase1, k]
-        rotated = out[first + 8 * k : first + 8 * k + 8]
-        if a == 6:
-            for b in range(8):
-                rotated[b] = image.histograms[cell + b]
-            continue
-        for b in range(8):
-            near = np.int32(image.histograms[cell + ((b - whole) & 7)])
-            far = np.int32(image.histograms[cell + ((b - whole - 1) & 7)])
-            rotated[b] = np.uint8((near_weight * near + far_weight * far + np.int32(512)) >> 10)
+                rotate_descriptor(turned, a, out, ((i * supports + q) * 13 + a) * 136)
 
 
 @inlined

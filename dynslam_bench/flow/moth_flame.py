@@ -133,22 +133,16 @@ def opposites(members: Any, least: Any, greatest: Any, low: Any, high: Any, unif
 
 
 class FlightTable(NamedTuple):
-    """`Flight` of iterations 1..T for the compiled search, and the number of flames in each (Eq. 11).
+    """Iterations 1..T of the compiled search.
 
     Attributes:
-        counts: int64 ``[T]``.
-        span: float32 ``[T]``.
-        own: float32 ``[T]``.
-        best: float32 ``[T]``.
-        stepping: bool ``[T]``.
+        counts: int64 ``[T]``, number of flames (Eq. 11).
+        coefficients: float32 ``[T, 4]``, the fields of `Flight`.
         opposition: Of the first population.
     """
 
     counts: NDArray[np.int64]
-    span: NDArray[np.float32]
-    own: NDArray[np.float32]
-    best: NDArray[np.float32]
-    stepping: NDArray[np.bool_]
+    coefficients: NDArray[np.float32]
     opposition: bool
 
 
@@ -156,9 +150,7 @@ class FlightTable(NamedTuple):
 def flight_table(population: int, iterations: int, rules: MothFlameRules) -> FlightTable:
     """The flights of T iterations, computed in float32."""
     rows = [flight(np.float32(k) / np.float32(iterations), rules) for k in range(1, iterations + 1)]
-    span, own, best = (np.array([row[k] for row in rows], dtype=np.float32) for k in range(3))
-    stepping = np.array([row.stepping for row in rows], dtype=np.bool_)
-    return FlightTable(flame_counts(population, iterations, rules), span, own, best, stepping, rules.opposition)
+    return FlightTable(flame_counts(population, iterations, rules), np.array(rows, np.float32), rules.opposition)
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,7 @@ they share twice.
 
 from __future__ import annotations
 
-import sys
+import weakref
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -41,45 +41,13 @@ NORM_FLOOR = 0.01 * 255.0
 """Added to a histogram's norm before dividing, so that flat regions stay near zero (0.01 for images in [0, 1])."""
 FIXED_POINT = 256
 """Units a grey level in the blurred derivatives."""
-Arrays = tuple[NDArray[np.uint8], ...]
+Buffers = list[tuple[NDArray[np.uint8], ...]]
+"""Arrays of maps that were deleted. The first access to a page of fresh memory costs more than computing its content
+(`docs/lab/README.md`)."""
 RING = 16
 """Lines stored of each level; a power of two above twice the farthest tap."""
 SPILL = 64
 """Numbers that vector code may access beyond a line's end."""
-
-
-def _references(arrays: Arrays) -> int:
-    """The largest number of references to one of a set's arrays, this function's own included."""
-    return max(sys.getrefcount(array) for array in arrays)
-
-
-_UNREFERENCED = _references((np.zeros(1, dtype=np.uint8),))
-"""Of a set that only its tuple refers to."""
-
-
-class BufferPool:
-    """Sets of zeroed uint8 arrays, reused once nothing else refers to any of them or to a view.
-
-    The first access to a page of fresh memory costs more than computing its content (`docs/lab/README.md`).
-    A reused set keeps its old content: callers must not write where they rely on zeros.
-
-    Args:
-        most: Sets kept at most; older ones are left to the garbage collector.
-    """
-
-    def __init__(self, most: int = 4) -> None:
-        self._most = most
-        self._sets: list[Arrays] = []
-
-    def take(self, *shapes: tuple[int, ...]) -> Arrays:
-        """Arrays of these shapes: a used set where one is free, else new ones, zeroed."""
-        for number, arrays in enumerate(self._sets):
-            if tuple(array.shape for array in arrays) == shapes and _references(arrays) <= _UNREFERENCED:
-                self._sets.append(self._sets.pop(number))  # the longest unused first
-                return tuple([*arrays])  # a tuple of its own, so that its holder counts as a reference
-        fresh = tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
-        self._sets = [*self._sets, fresh][-self._most :]
-        return tuple([*fresh])
 
 
 class Side(NamedTuple):
@@ -91,7 +59,7 @@ class Side(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OrientationMaps:
-    """One prepared image.
+    """One prepared image. Its arrays are used again once it is deleted.
 
     Attributes:
         gray: uint8 ``[H, W]``, the image.
@@ -110,25 +78,26 @@ class OrientationMaps:
 
 
 def orientation_maps(
-    gray: NDArray[np.uint8], workers: Workers | None = None, buffers: BufferPool | None = None
+    gray: NDArray[np.uint8], workers: Workers | None = None, buffers: Buffers | None = None
 ) -> OrientationMaps:
     """Compute the maps of a uint8 ``[H, W]`` image; the result does not depend on the number of threads.
 
     Args:
         gray: The image.
         workers: Threads over which rows are divided; None for the calling thread alone.
-        buffers: Reuses the memory of maps that are no longer referenced; None allocates.
+        buffers: Takes the memory of maps once they are deleted, and gives it to the next ones of that size.
     """
-    run, buffers = (workers or Workers()).run, buffers or BufferPool()
+    run, buffers = (workers or Workers()).run, [] if buffers is None else buffers
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
     (rows, quarter_rows), (columns, quarter_columns) = ((max(1, n // 2), max(1, n // 4)) for n in gray.shape)
-    histograms, whole, half = buffers.take(
-        (geometry.total, layout.BINS),
-        (height + 2 * BORDER, width + 2 * BORDER),
-        (rows + 2 * BORDER, columns + 2 * BORDER),
-    )
+    framed, framed_half = (height + 2 * BORDER, width + 2 * BORDER), (rows + 2 * BORDER, columns + 2 * BORDER)
+    shapes = (geometry.total, layout.BINS), framed, framed_half
+    while buffers and tuple(array.shape for array in buffers[-1]) != shapes:
+        buffers.pop()
+    arrays = buffers.pop() if buffers else tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
+    histograms, whole, half = arrays  # used ones keep the zeros of their margins
     coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
     floor = np.float32(NORM_FLOOR * FIXED_POINT)
     blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)
@@ -137,9 +106,11 @@ def orientation_maps(
     run(fine_levels, 0, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
     run(coarse_levels, 0, quarter_rows, coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells)
     whole[BORDER:-BORDER, BORDER:-BORDER] = gray
-    for framed in (half, whole):
-        repeat_edges(framed)
-    return OrientationMaps(gray, whole, half, histograms, Side(cells, gray))
+    repeat_edges(half)
+    repeat_edges(whole)
+    maps = OrientationMaps(gray, whole, half, histograms, Side(cells, gray))
+    weakref.finalize(maps, buffers.append, arrays)
+    return maps
 
 
 def repeat_edges(framed: NDArray[np.uint8]) -> None:

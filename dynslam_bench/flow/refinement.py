@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.flow.simd import Bytes, Doubles, Floats, Ints, load, load_bytes, sample, spread, store, total
+from dynslam_bench.flow.simd import Bytes, Floats, Ints, load, load_bytes, sample, spread, store, total
+from dynslam_bench.geometry.cholesky import cholesky_solve
 
 BORDER = 48
 """Pixels repeated around the images that are refined on."""
@@ -30,7 +31,7 @@ class Window(NamedTuple):
         step: Full-image pixels a pixel of the images.
         radius: In pixels of the images.
         margin: Largest translation within one warp, in their pixels, at least 1.
-        warps: Times the target is warped, at most.
+        warps: Times the target is warped, at most: once, or twice with a change of scale and rotation between.
         iterations: Translations a warp, at most.
         tolerance: Stop below this change, in their pixels.
     """
@@ -117,7 +118,7 @@ def similarity_lucas_kanade(
         for x in range(side):
             k = y * pitch + x
             mask[k], right[k], down[k] = np.float32(1), np.float32(x - radius), np.float32(y - radius)
-    h = np.empty((4, 4), dtype=np.float64)
+    h, g = np.empty((4, 4), dtype=np.float64), np.empty(4, dtype=np.float64)
     rows, columns = target_image.shape
     n = np.float64(side * side)
     half, zero = np.float32(0.5), spread(np.float32(0))
@@ -157,8 +158,6 @@ def similarity_lucas_kanade(
         energy, rest0, rest1 = np.float64(total(tt)), np.float64(total(xt)), np.float64(total(yt))
         if energy < n * FLAT_VARIANCE:
             continue
-        j2 = j3 = rest2 = rest3 = 0.0
-        factored = False
         scale = np.float32(np.exp2(labels[i, 2]))
         a, b = scale * np.float32(np.cos(labels[i, 3])), scale * np.float32(np.sin(labels[i, 3]))
         tx = (points[i, 0] + labels[i, 0] + half) * scale_down - half + border
@@ -167,13 +166,12 @@ def similarity_lucas_kanade(
         best_a, best_b, best_x, best_y = a, b, tx, ty
         for warp in range(warps):
             span = (abs(a) + abs(b)) * np.float32(reach) + np.float32(2)
-            if not (tx >= span and ty >= span and tx < columns - span and ty < rows - span):
-                break
-            if not (tx >= border and ty >= border and tx <= columns - border - 1 and ty <= rows - border - 1):
+            least, most_x, most_y = max(span, np.float32(border)), columns - border - 1, rows - border - 1
+            if not (least <= tx <= most_x and least <= ty <= most_y and tx < columns - span and ty < rows - span):
                 break
             warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, patch)
             ox = oy = np.float32(0)
-            g0 = g1 = mean = 0.0
+            mean = 0.0
             at, w00, w01, w10, w11 = np.int64(0), zero, zero, zero, zero
             for iteration in range(iterations + 1):
                 left, top = ox + np.float32(margin), oy + np.float32(margin)
@@ -200,11 +198,11 @@ def similarity_lucas_kanade(
                 if score > best:
                     best, best_a, best_b = score, a, b
                     best_x, best_y = tx + a * ox - b * oy, ty + b * ox + a * oy
-                g0, g1 = total(wx) - mean * j0 - rest0, total(wy) - mean * j1 - rest1
+                g[0], g[1] = total(wx) - mean * j0 - rest0, total(wy) - mean * j1 - rest1
                 if iteration == iterations:
                     break
-                d0 = np.float32(2 * (h11 * g0 - h01 * g1) / determinant)
-                d1 = np.float32(2 * (h00 * g1 - h01 * g0) / determinant)
+                d0 = np.float32(2 * (h11 * g[0] - h01 * g[1]) / determinant)
+                d1 = np.float32(2 * (h00 * g[1] - h01 * g[0]) / determinant)
                 ox, oy = ox - d0, oy - d1
                 if not (abs(ox) < limit and abs(oy) < limit):
                     ox, oy = min(max(ox, -limit), limit), min(max(oy, -limit), limit)
@@ -215,37 +213,30 @@ def similarity_lucas_kanade(
             tx, ty = tx + mx, ty + my
             if warp == warps - 1:
                 break
-            if not factored:
-                sum_s, sum_r, sx, sy, rx, ry = zero, zero, zero, zero, zero, zero
-                ss, rr, rs, st, rt = zero, zero, zero, zero, zero
-                for k in range(0, length, 16):
-                    gx, gy, dx, dy = load(gradient_x, k), load(gradient_y, k), load(right, k), load(down, k)
-                    swell, turn, t = gx * dx + gy * dy, gy * dx - gx * dy, load(template, k)
-                    sum_s, sum_r = sum_s + swell, sum_r + turn
-                    sx, sy, rx, ry = sx + swell * gx, sy + swell * gy, rx + turn * gx, ry + turn * gy
-                    ss, rr, rs = ss + swell * swell, rr + turn * turn, rs + turn * swell
-                    st, rt = st + swell * t, rt + turn * t
-                j2, j3 = np.float64(total(sum_s)), np.float64(total(sum_r))
-                rest2, rest3 = np.float64(total(st)), np.float64(total(rt))
-                h[0, 0], h[1, 0], h[1, 1] = h00, h01, h11
-                h[2, 0], h[2, 1] = total(sx) - j2 * j0 / n, total(sy) - j2 * j1 / n
-                h[3, 0], h[3, 1] = total(rx) - j3 * j0 / n, total(ry) - j3 * j1 / n
-                damping = SIMILARITY_DAMPING * trace * (radius * radius)
-                h[2, 2], h[3, 3] = total(ss) - j2 * j2 / n + damping, total(rr) - j3 * j3 / n + damping
-                h[3, 2] = total(rs) - j3 * j2 / n
-                if not cholesky4(h):
-                    break
-                factored = True
-            ws, wr = zero, zero
+            # the change of scale and rotation
+            sum_s, sum_r, sx, sy, rx, ry = zero, zero, zero, zero, zero, zero
+            ss, rr, rs, st, rt, ws, wr = zero, zero, zero, zero, zero, zero, zero
             for k in range(0, length, 16):
                 j = at + k
                 w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
                 w = w + w11 * load(patch, j + pitch + 1) - mean_t
                 gx, gy, dx, dy = load(gradient_x, k), load(gradient_y, k), load(right, k), load(down, k)
-                ws, wr = ws + w * (gx * dx + gy * dy), wr + w * (gy * dx - gx * dy)
-            g2, g3 = total(ws) - mean * j2 - rest2, total(wr) - mean * j3 - rest3
-            d0, d1, d2, d3 = solve4(h, g0, g1, g2, g3)
-            da, db = np.float32(1) + 2 * d2, 2 * d3
+                swell, turn, t = gx * dx + gy * dy, gy * dx - gx * dy, load(template, k)
+                sum_s, sum_r = sum_s + swell, sum_r + turn
+                sx, sy, rx, ry = sx + swell * gx, sy + swell * gy, rx + turn * gx, ry + turn * gy
+                ss, rr, rs = ss + swell * swell, rr + turn * turn, rs + turn * swell
+                st, rt, ws, wr = st + swell * t, rt + turn * t, ws + w * swell, wr + w * turn
+            j2, j3 = np.float64(total(sum_s)), np.float64(total(sum_r))
+            g[2], g[3] = total(ws) - mean * j2 - np.float64(total(st)), total(wr) - mean * j3 - np.float64(total(rt))
+            h[0, 0], h[1, 0], h[1, 1] = h00, h01, h11
+            h[2, 0], h[2, 1] = total(sx) - j2 * j0 / n, total(sy) - j2 * j1 / n
+            h[3, 0], h[3, 1] = total(rx) - j3 * j0 / n, total(ry) - j3 * j1 / n
+            damping = SIMILARITY_DAMPING * trace * (radius * radius)
+            h[2, 2], h[3, 3] = total(ss) - j2 * j2 / n + damping, total(rr) - j3 * j3 / n + damping
+            h[3, 2] = total(rs) - j3 * j2 / n
+            if not cholesky_solve(h, g):
+                break
+            da, db = np.float32(1) + 2 * np.float32(g[2]), 2 * np.float32(g[3])
             size = da * da + db * db
             if not 0.25 < size < 4:
                 break
@@ -257,33 +248,3 @@ def similarity_lucas_kanade(
             labels[i, 1] = (best_y - border + half) * np.float32(step) - half - points[i, 1]
             labels[i, 2] = half * np.float32(np.log2(best_a * best_a + best_b * best_b))
             labels[i, 3] = np.float32(np.arctan2(best_b, best_a))
-
-
-@inlined
-def cholesky4(h: Doubles) -> bool:
-    """Lower Cholesky factor of a 4 x 4 matrix, in place; False if it is not positive definite."""
-    for j in range(4):
-        for k in range(j):
-            h[j, j] -= h[j, k] * h[j, k]
-        if not h[j, j] > 1e-9:
-            return False
-        h[j, j] = np.sqrt(h[j, j])
-        for r in range(j + 1, 4):
-            for k in range(j):
-                h[r, j] -= h[r, k] * h[j, k]
-            h[r, j] /= h[j, j]
-    return True
-
-
-@inlined
-def solve4(h: Doubles, g0: Scalar, g1: Scalar, g2: Scalar, g3: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Solve with the factor of `cholesky4`."""
-    y0 = g0 / h[0, 0]
-    y1 = (g1 - h[1, 0] * y0) / h[1, 1]
-    y2 = (g2 - h[2, 0] * y0 - h[2, 1] * y1) / h[2, 2]
-    y3 = (g3 - h[3, 0] * y0 - h[3, 1] * y1 - h[3, 2] * y2) / h[3, 3]
-    x3 = y3 / h[3, 3]
-    x2 = (y2 - h[3, 2] * x3) / h[2, 2]
-    x1 = (y1 - h[2, 1] * x2 - h[3, 1] * x3) / h[1, 1]
-    x0 = (y0 - h[1, 0] * x1 - h[2, 0] * x2 - h[3, 0] * x3) / h[0, 0]
-    return np.float32(x0), np.float32(x1), np.float32(x2), np.float32(x3)

@@ -42,9 +42,12 @@ def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu
     """
     settings = settings or FlowSettings()
     spec = FLOWS.get(settings.plugin or settings.method)
-    protocol: type[FlowEstimator] = FlowEstimator  # type: ignore[type-abstract]
     return build_plugin(
-        "flow", spec, protocol, PluginError, lambda build: build(settings, device=device, threads=threads)
+        "flow",
+        spec,
+        FlowEstimator,  # type: ignore[type-abstract]
+        PluginError,
+        lambda build: build(settings, device=device, threads=threads),
     )
 
 

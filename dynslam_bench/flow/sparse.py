@@ -24,7 +24,7 @@ from dynslam_bench.flow.matching_cost import (
     parabola,
     reference_appearance,
 )
-from dynslam_bench.flow.orientation_maps import BufferPool, OrientationMaps, orientation_maps
+from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, orientation_maps
 from dynslam_bench.flow.propagation import (
     common_motions,
     dissenting_labels,
@@ -66,7 +66,7 @@ class SparseDaisyFlow:
     def __init__(self, settings: FlowSettings | None = None, *, threads: int = 1) -> None:
         self.settings = settings or FlowSettings()
         self.workers = Workers(threads)
-        self._buffers = BufferPool()
+        self._buffers: Buffers = []
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SparseDaisyFlow:
         """A flow of the same settings with threads of its own: nothing is stored between frames."""
@@ -161,9 +161,9 @@ class SparseDaisyFlow:
         rotation = np.deg2rad(settings.rotation_range_deg)
         extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32)
         lower, upper = start[:, 0] - extent, start[:, 0] + extent
-        plan = make_plan(settings)
-        costs = np.full((n, plan.population), pair.tables.ceiling, np.int64)  # nothing has been evaluated
-        flames = np.repeat(start, plan.population, axis=1)
+        population, ends, options = make_plan(settings)
+        costs = np.full((n, population), pair.tables.ceiling, np.int64)  # nothing has been evaluated
+        flames = np.repeat(start, population, axis=1)
         state = SearchState(np.zeros_like(flames), flames, costs, np.zeros(n, np.int64), lower, upper)
         candidates = start
         if STRATEGIES[settings.search].shrink == 0:  # nothing is drawn: zero flow is tried beside the prediction
@@ -171,7 +171,7 @@ class SparseDaisyFlow:
             candidates = np.concatenate([start, np.broadcast_to(zero, start.shape)], axis=1)
         neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
         motions = np.full((2, 4), np.nan, dtype=np.float32)
-        for phase, end in enumerate(plan.ends):
+        for phase, end in enumerate(ends):
             if phase > 0:
                 best = state.flames[:, 0].copy()
                 if settings.similarity_seeds:
@@ -180,7 +180,7 @@ class SparseDaisyFlow:
                 sources = (points, best, label_turns(best), neighbours, motions)
                 run(transported_labels, 0, n, *sources, lower, upper, candidates)
             images = described, pair.target.side, pair.tables
-            run(run_phase, 0, n, *images, state, candidates, end, phase, np.uint64(seed), *plan.options)
+            run(run_phase, 0, n, *images, state, candidates, end, phase, np.uint64(seed), *options)
         return state
 
     def refine_together(

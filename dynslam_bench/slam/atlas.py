@@ -199,14 +199,13 @@ def packed(atlas: Atlas) -> dict[str, NDArray[Any]]:
     slots, points = world.keyframes, world.points
     points = points[np.argsort(world.id[points], kind="stable")]
     features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
-    observations = world.observations(points)
+    keyframe, feature = world.observations(points)
     arrays = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
     arrays |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
     arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
     row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
-    arrays["obs_kf"] = row_of_keyframe[world.obs_kf[observations]]
-    arrays["obs_ft"] = world.obs_ft[observations]
+    arrays["obs_kf"], arrays["obs_ft"] = row_of_keyframe[keyframe], feature
     submaps = atlas.submaps.values()
     arrays["submap_start"] = np.array([submap.start for submap in submaps]).reshape(-1, 3)
     arrays["submap_anchor"] = np.array([submap.anchor for submap in submaps]).reshape(-1, 3)
@@ -224,15 +223,11 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     """
     arrays, header = saved.arrays, saved.header
     count, n_obs = arrays["kf_count"], arrays["n_obs"]
-    tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS, *OBSERVATION_ARRAYS)}
-    in_use = np.arange(int(count.max(initial=0))) < count[:, None]
-    for name in FEATURE_ARRAYS:
-        rows = arrays[name]
-        tables[name] = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
-        tables[name][in_use] = rows
-    tables["kf_point"] = np.full(in_use.shape, -1, np.int32)
+    tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS)}
+    tables |= {name: _padded(arrays[name], count) for name in FEATURE_ARRAYS}
+    tables |= {name: _padded(arrays[name], n_obs) for name in OBSERVATION_ARRAYS}
+    tables["kf_point"] = np.full(tables["kf_octave"].shape, -1, np.int32)
     tables["kf_point"][arrays["obs_kf"], arrays["obs_ft"]] = np.repeat(np.arange(len(n_obs)), n_obs)
-    tables["obs_at"], tables["obs_capacity"] = np.cumsum(n_obs, dtype=np.int64) - n_obs, n_obs.copy()
     tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
     tables["kf_stamp"] = np.full(len(count), np.nan)
@@ -242,3 +237,11 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     priors = zip(arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True)
     submaps = [Submap(start.copy(), anchor.copy(), float(bound)) for start, anchor, bound in priors]
     return Atlas(world, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)
+
+
+def _padded(rows: NDArray[Any], counts: NDArray[np.integer]) -> NDArray[Any]:
+    """A table with so many of the rows in each of its lines, filled up with zeros."""
+    in_use = np.arange(int(counts.max(initial=1))) < counts[:, None]
+    table = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
+    table[in_use] = rows
+    return table

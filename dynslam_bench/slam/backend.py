@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -11,26 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle
-from dynslam_bench.contracts.tracker import MapOutputs, TrackingState
+from dynslam_bench.contracts.tracker import MapOutputs, TrackingState, TrackResult
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.slam.atlas import open_atlas, save_atlas
 from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser
-from dynslam_bench.slam.keyframes import DEPTH_IMAGES, KeyframePolicy, MapView, MapViews
-from dynslam_bench.slam.local_mapping import LocalMapper, MapState
+from dynslam_bench.slam.local_mapping import KeyframePolicy, LocalMapper, refined
 from dynslam_bench.slam.loop_closing import LoopCloser
-from dynslam_bench.slam.map import Array
+from dynslam_bench.slam.map import DEPTH_IMAGES, Array, Map, MapView, MapViews, map_outputs
 from dynslam_bench.slam.map_files import MapFeatures
-from dynslam_bench.slam.motion_model import JITTER, CameraMotion, FramePose, rescale, trajectory
-from dynslam_bench.slam.relocalisation import PoseSearch, RelocalisationGate
-from dynslam_bench.slam.rolling_shutter import (
+from dynslam_bench.slam.motion_model import (
+    JITTER,
     MIN_AGREEING,
+    CameraMotion,
     CameraVelocity,
+    FramePose,
     RollingShutter,
     compensate_rolling_shutter,
+    rescale,
+    trajectory,
 )
+from dynslam_bench.slam.relocalisation import PoseSearch, RelocalisationGate
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 from dynslam_bench.slam.tracking import (
     InitialPose,
@@ -47,40 +51,6 @@ MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
 KNOWN_POSE = 1e6 * np.eye(6)
 """Information of a pose that defines a map's frame of reference."""
-
-
-@dataclass(frozen=True, eq=False)
-class BackendResult:
-    """The pose of a frame, and what the frame did to the map.
-
-    Attributes:
-        T_world_cam: Camera-to-world pose ``[4, 4]``, after bundle adjustment if the frame became a keyframe; a
-            prediction while `state` is ``lost``; None before the first keyframe.
-        state: ``ok`` (tracked), ``lost`` or ``initialising``.
-        map_points: Points in the map afterwards.
-        keyframes: Keyframes in the map afterwards.
-        maps: Maps that they are of: the root map, and submaps that were not merged with it.
-        loops: Loops that were closed so far.
-        timings: Seconds of ``tracking``, ``mapping``, ``bundle_adjustment`` and ``loop_closing``, where they worked.
-        keyframe: Whether the frame became a keyframe.
-        matches: Features matched with points of the map or of the last frame.
-        inliers: How many of them fit the pose and observe a map point.
-        residual_px: Median reprojection error of the inliers in pixels of octave 0; 0 where there is no pose.
-        relocalised: Whether the initial pose came from keyframes' descriptors.
-    """
-
-    T_world_cam: Array | None
-    state: TrackingState
-    map_points: int
-    keyframes: int
-    maps: int
-    loops: int
-    timings: Mapping[str, float] = field(default_factory=dict)
-    keyframe: bool = False
-    matches: int = 0
-    inliers: int = 0
-    residual_px: float = 0.0
-    relocalised: bool = False
 
 
 class RgbdBackend:
@@ -106,13 +76,11 @@ class RgbdBackend:
     ) -> None:
         self.settings = settings
         self._features = MapFeatures(extractor=extractor, levels=max(levels, 1), scale_factor=scale_factor)
-        self._scales = self._features.scales
-        self._ready = False
 
     def configure(self, settings: BackendSettings) -> None:
         """Put other settings into force from the next frame on."""
         self.settings = settings
-        if self._ready:
+        if hasattr(self, "mapper"):
             self.mapper.settings = self.loops.settings = settings
             self._keyframes.settings = settings.keyframes
 
@@ -147,12 +115,11 @@ class RgbdBackend:
         self._reference = -1
         self._last: TrackedFrame | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
-        self._before_full: MapState | None = None
-        self._ready = True
+        self._refined: Map | None = None
 
     # ------------------------------------------------------------------ one frame
 
-    def track(self, frame: FrameBundle, keep: NDArray[np.bool_], weight: NDArray[np.float32]) -> BackendResult:
+    def track(self, frame: FrameBundle, keep: NDArray[np.bool_], weight: NDArray[np.float32]) -> TrackResult:
         """Find the frame's pose and, if it shows enough new, make it a keyframe.
 
         Args:
@@ -161,17 +128,22 @@ class RgbdBackend:
             weight: float32 ``[N]`` in [0, 1], confidence that a feature is static.
 
         Returns:
-            The pose (after bundle adjustment if the frame became a keyframe), state, counts and timings.
+            The pose, after bundle adjustment if the frame became a keyframe, and None before the first keyframe; the
+            state. Stats: ``matches`` (features matched with points of the map or of the last frame), ``inliers`` (how
+            many of them fit the pose and observe a map point), ``residual_px`` (their median reprojection error in
+            pixels of octave 0; 0 without a pose), ``relocalised`` (whether the initial pose came from keyframes), and
+            what the map holds afterwards: ``map_points``, ``keyframes``, ``maps`` (the root map, and submaps that were
+            not merged with it), ``loops`` (closed so far), ``keyframe`` (whether the frame became one). Timings:
+            seconds of ``tracking``, ``mapping``, ``bundle_adjustment`` and ``loop_closing``, where they worked.
         """
-        assert self._ready, "reset() comes before track()"
         begin = perf_counter()
-        self._resume()
-        observations = observe(frame, keep, weight, self.camera, self._scales)
+        self._refined = None
+        observations = observe(frame, keep, weight, self.camera, self._features.scales)
         result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
         stages = {"tracking": perf_counter() - begin - sum(result.timings.values())}
         return replace(result, timings={**stages, "mapping": 0.0, "bundle_adjustment": 0.0, **result.timings})
 
-    def _track(self, frame: FrameBundle, raw: Observations) -> BackendResult:
+    def _track(self, frame: FrameBundle, raw: Observations) -> TrackResult:
         """Predict, match the last frame or relocalise, track the local map, insert a keyframe."""
         last, stamp, tracking = self._last_frame(frame, raw), frame.timestamp, self.settings.tracking
         rolling = bool(tracking.rolling_shutter and self.camera.readout_s and self._tracked)
@@ -190,7 +162,7 @@ class RgbdBackend:
         if self._grows:
             self.world.visible[fit.in_view] += 1
         required = tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
-        if fit.count < required or not np.isfinite(fit.estimate.T_cam_world).all():
+        if fit.count < required:
             result = self._lose(frame, raw, last, prediction)
         else:
             tracked = self._accept(frame, observations, fit, last)
@@ -199,7 +171,8 @@ class RgbdBackend:
             if first is not None and velocity is not None:
                 return self._restart(frame, raw, first, velocity, fit.count)
             result = self._update_map(frame, tracked, fit, root)
-        return replace(result, matches=len(fit.matches.point), inliers=fit.count, relocalised=initial.relocalised)
+        counts = {"matches": len(fit.matches), "inliers": fit.count, "relocalised": initial.relocalised}
+        return replace(result, stats={**result.stats, **counts})
 
     def _initial_pose(
         self, frame: FrameBundle, raw: Observations, observations: Observations, last: TrackedFrame, prediction: Array
@@ -211,7 +184,7 @@ class RgbdBackend:
         )
         initial = None
         if candidate is not None and trusted and self._tracked:
-            initial = candidate.initial_pose(relocalised=False)
+            initial = candidate
             if not self.atlas.active:
                 return initial, None
         if self._tracked:
@@ -222,7 +195,7 @@ class RgbdBackend:
             keyframes = keyframes[np.isin(world.kf_map[keyframes], (0, self.atlas.active))]
             bound = self._gate.while_lost(last, raw, frame.timestamp)
         search = PoseSearch(
-            world, observations, reference, keyframes, not self._tracked, bound, self.settings, self.seed, frame.index
+            observations, reference, keyframes, not self._tracked, bound, self.settings, self.seed, frame.index
         )
         root = search.in_root_map() if self._tracked and self.atlas.active else None
         initial = initial or search.relocalised(candidate)
@@ -244,7 +217,7 @@ class RgbdBackend:
                 "make the map with the same features",
             )
         nothing = np.zeros(len(frame.xy))
-        none = observe(frame, nothing.astype(bool), nothing.astype(np.float32), self.camera, self._scales)
+        none = observe(frame, nothing.astype(bool), nothing.astype(np.float32), self.camera, self._features.scales)
         return TrackedFrame(none, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
     def _accept(self, frame: FrameBundle, observations: Observations, fit: MapFit, last: TrackedFrame) -> TrackedFrame:
@@ -264,7 +237,7 @@ class RgbdBackend:
 
     def _lose(
         self, frame: FrameBundle, observations: Observations, last: TrackedFrame, prediction: Array
-    ) -> BackendResult:
+    ) -> TrackResult:
         """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
         self.state, self._first = "lost", None
         textured = int(((observations.z > 0) | (not self.uses_depth)).sum()) >= MIN_INITIAL
@@ -287,22 +260,21 @@ class RgbdBackend:
         self.atlas.active = int(self.world.kf_map[self._reference])
         self.state = "ok" if self._tracked and self.atlas.active == 0 else "lost"
 
-    def _result(self, T_cam_world: Array | None, timings: Mapping[str, float] | None = None) -> BackendResult:
+    def _result(
+        self, T_cam_world: Array | None, timings: Mapping[str, float] | None = None, **stats: float
+    ) -> TrackResult:
         """A frame's result with the state and the map as they are now; with `timings` if it became a keyframe."""
-        return BackendResult(
-            T_world_cam=None if T_cam_world is None else se3.inverse(T_cam_world),
-            state=self.state,
-            map_points=self.world.point_count,
-            keyframes=self.world.keyframe_count,
-            maps=self.world.map_count,
-            loops=len(self.loops.closed),
-            timings=timings or {},
-            keyframe=bool(timings),
-        )
+        world, pose = self.world, None if T_cam_world is None else se3.inverse(T_cam_world)
+        counts = {
+            "matches": 0, "inliers": 0, "map_points": len(world.points), "keyframes": world.keyframe_count,
+            "keyframe": bool(timings), "maps": len(set(world.kf_map[world.kf_alive].tolist())),
+            "loops": len(self.loops.closed), "residual_px": 0.0, "relocalised": False,
+        }  # fmt: skip
+        return TrackResult(pose, self.state, counts | stats, timings or {})
 
     # ------------------------------------------------------------------ beginning a map
 
-    def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
+    def _initialise(self, frame: FrameBundle, observations: Observations) -> TrackResult:
         """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
         if np.count_nonzero(observations.z > 0) < MIN_INITIAL:
             return self._result(None)
@@ -311,7 +283,7 @@ class RgbdBackend:
         self._first = (frame, observations) if rolling else None
         return result
 
-    def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> BackendResult:
+    def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> TrackResult:
         """The frame becomes the first keyframe of the active map."""
         self._tracked = True
         self._last = tracked = TrackedFrame(
@@ -321,7 +293,7 @@ class RgbdBackend:
         self._update_state()
         self._remember(frame, np.eye(4), KNOWN_POSE)
         points = int(np.count_nonzero(tracked.point >= 0))
-        return replace(self._result(T_cam_world, timings), matches=points, inliers=points)
+        return self._result(T_cam_world, timings, matches=points, inliers=points)
 
     def _restart(
         self,
@@ -330,7 +302,7 @@ class RgbdBackend:
         first: tuple[FrameBundle, Observations],
         velocity: CameraVelocity,
         inliers: int,
-    ) -> BackendResult:
+    ) -> TrackResult:
         """Begin the map again: the second frame tells the camera's motion in the first, whose points were distorted.
 
         Where fewer points agree then than the `inliers` before, the first frame is left uncompensated.
@@ -341,11 +313,11 @@ class RgbdBackend:
             observations = first[1] if assumed is None else compensate_rolling_shutter(first[1], self.camera, assumed)
             self._begin_map(first[0], observations, np.eye(4))
             result = self._track(frame, raw)
-            if result.state == "ok" and result.inliers >= MIN_AGREEING * inliers:
+            if result.state == "ok" and result.stats["inliers"] >= MIN_AGREEING * inliers:
                 break
         return result
 
-    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> BackendResult | None:
+    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> TrackResult | None:
         """Begin a submap where the camera was lost, rotated as the images tell; None if not yet."""
         self._note_submap(last, frame.timestamp)
         return self._begin_map(frame, observations, self._gate.rotated(last))
@@ -360,7 +332,7 @@ class RgbdBackend:
 
     def _update_map(
         self, frame: FrameBundle, tracked: TrackedFrame, fit: MapFit, root: InitialPose | None
-    ) -> BackendResult:
+    ) -> TrackResult:
         """Make the tracked frame a keyframe if the policy or a merge asks for it, and add its pose to the history."""
         timings, pose = {}, fit.estimate.T_cam_world
         needed = root is not None or self._keyframes.needed(self.world, tracked, frame.index, self._reference)
@@ -370,7 +342,7 @@ class RgbdBackend:
             self.motion.relocated(pose)
         self._remember(frame, pose @ se3.inverse(self.world.kf_pose[self._reference]), fit.estimate.information)
         self._update_state()
-        result = replace(self._result(tracked.T_cam_world, timings), residual_px=fit.estimate.residual_px)
+        result = self._result(tracked.T_cam_world, timings, residual_px=fit.estimate.residual_px)
         if root is None or not self.atlas.active or not self.loops.in_root_map:
             return result
         # the camera is in the root map, too: there its pose counts, and it may continue there
@@ -432,12 +404,11 @@ class RgbdBackend:
 
     def view(self) -> MapView:
         """What filters may read of the map that the camera is in, as it was before a `finalize`."""
-        self._resume()
         return self._views.of(self.atlas.active)
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and pictures."""
-        return self._views.outputs()
+        return map_outputs(self._refined or self.world)
 
     def save_map(self, path: Path, made_by: str = "") -> None:
         """Write the map to a file from which a later run may start (`backend.map.file`).
@@ -450,23 +421,18 @@ class RgbdBackend:
             TrackerError: There is no map yet, or it is too large for a file.
             DynslamError: The file cannot be written.
         """
-        save_atlas(path, self.atlas, self._features, depth=self.uses_depth, made_by=made_by)
-
-    def _resume(self) -> None:
-        """The run goes on after a `finalize`: the map is again what it was before."""
-        if self._before_full is not None:
-            self.mapper.restore(self._before_full)
-            self._before_full = None
+        atlas = copy(self.atlas)
+        atlas.world = self._refined or self.world
+        save_atlas(path, atlas, self._features, depth=self.uses_depth, made_by=made_by)
 
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
 
-        With `bundle_adjustment.full` the whole map is refined first, unless the run only localises in it; the next
-        frame undoes that.
+        With `bundle_adjustment.full` a copy of the whole map is refined first, unless the run only localises in it.
         """
-        if self._grows and self.settings.bundle_adjustment.full and self._before_full is None:
-            self._before_full = self.mapper.adjust_all()
-        return trajectory(self.history, self.world, self.settings.motion)
+        if self._grows and self.settings.bundle_adjustment.full and self._refined is None:
+            self._refined = refined(self.world)
+        return trajectory(self.history, self._refined or self.world, self.settings.motion)
 
 
 class MonocularBackend(RgbdBackend):
@@ -483,7 +449,7 @@ class MonocularBackend(RgbdBackend):
         super().reset(camera, seed)
         self._initialiser = TwoViewInitialiser()
 
-    def _initialise(self, frame: FrameBundle, observations: Observations) -> BackendResult:
+    def _initialise(self, frame: FrameBundle, observations: Observations) -> TrackResult:
         """Frames are ``initialising`` until one determines the motion together with an earlier one."""
         begin = perf_counter()
         initial = self._initialiser.add(frame, observations, self.camera, self.settings.two_views)
@@ -491,7 +457,7 @@ class MonocularBackend(RgbdBackend):
             return self._result(None)
         return self._begin_from_two(initial, np.eye(4), perf_counter() - begin)
 
-    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> BackendResult | None:
+    def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> TrackResult | None:
         """Begin a submap as the root map began; its unit of length is the median depth of its own views."""
         begin = perf_counter()
         if self._unrecognised == self.settings.relocalisation.new_map_after:
@@ -505,7 +471,7 @@ class MonocularBackend(RgbdBackend):
         T_first_world[:3] = initial.motion.T_second_first[:3, :3].T @ self._gate.rotated(last)[:3]
         return self._begin_from_two(initial, T_first_world, seconds)
 
-    def _begin_from_two(self, initial: InitialMap, T_first_world: Array, seconds: float) -> BackendResult:
+    def _begin_from_two(self, initial: InitialMap, T_first_world: Array, seconds: float) -> TrackResult:
         """The two views become keyframes; the second, which is the current frame, is tracked."""
         first, second = initial.insert_into(self.world, T_first_world, self.atlas.active)
         frame, observations, pose = initial.second.frame, initial.second.observations, self.world.kf_pose[second].copy()
@@ -520,7 +486,7 @@ class MonocularBackend(RgbdBackend):
         self._update_state()
         self._remember(frame, np.eye(4), KNOWN_POSE)
         count = len(initial.motion.points)
-        return replace(self._result(pose, {"mapping": seconds}), matches=count, inliers=count)
+        return self._result(pose, {"mapping": seconds}, matches=count, inliers=count)
 
 
 def build_backend(settings: BackendSettings, scale_factor: float, levels: int, extractor: str) -> RgbdBackend:

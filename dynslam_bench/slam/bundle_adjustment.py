@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry.cholesky import cholesky_solve
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import (
     CHI2_DEPTH,
     CHI2_MONO,
     apply_twist,
-    cholesky_solve,
     observation_chi2,
 )
 
@@ -329,8 +329,8 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, max_observ
     poses = np.concatenate([variable, fixed])
     pose_number = np.full(world.kf_alive.size, -1, np.int64)
     pose_number[poses] = np.arange(len(poses))
-    rows = world.observations(points)
-    of_point, pose = np.repeat(np.arange(len(points)), world.n_obs[points]), pose_number[world.obs_kf[rows]]
+    keyframes, all_features = world.observations(points)
+    of_point, pose = np.repeat(np.arange(len(points)), world.n_obs[points]), pose_number[keyframes]
     support = np.bincount(of_point[pose >= 0], minlength=len(points))
     supported = np.flatnonzero(support >= 2)
     order = supported[np.lexsort((world.id[points[supported]], -support[supported]))]  # long tracks first
@@ -342,7 +342,7 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, max_observ
     point_number[order] = np.arange(len(order))
     used = (pose >= 0) & (point_number[of_point] >= 0)
     obs_point, obs_pose, points = point_number[of_point[used]], pose[used], points[order]
-    features = world.obs_ft[rows[used]].astype(np.int64)
+    features = all_features[used].astype(np.int64)
     at = poses[obs_pose]
     problem = BundleProblem(
         world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point,

@@ -217,10 +217,8 @@ def _homography(
     xy_first: Array, xy_second: Array, info: Array, camera: Camera
 ) -> tuple[list[Array], NDArray[np.bool_]]:
     """The motions of the homography of most matches, and which matches fit it in both images."""
-    model = None
-    if len(xy_first) >= 8:
-        limit = np.sqrt(CHI2_POINT)
-        model, _ = cv2.findHomography(xy_first, xy_second, cv2.RANSAC, limit, None, RANSAC_ITERATIONS, CONFIDENCE)
+    limit = np.sqrt(CHI2_POINT)
+    model, _ = cv2.findHomography(xy_first, xy_second, cv2.RANSAC, limit, None, RANSAC_ITERATIONS, CONFIDENCE)
     if model is None or abs(np.linalg.det(model)) < 1e-12:
         return [], np.zeros(len(xy_first), bool)
     errors = [
@@ -234,12 +232,10 @@ def _homography(
 
 def _essential(xy_first: Array, xy_second: Array, info: Array, camera: Camera) -> tuple[list[Array], NDArray[np.bool_]]:
     """The motions of the essential matrix of most matches, and which matches fit it in both images."""
-    model = None
-    if len(xy_first) >= 8:
-        limit = np.sqrt(CHI2_LINE)
-        model, _ = cv2.findEssentialMat(
-            xy_first, xy_second, camera.matrix, cv2.RANSAC, CONFIDENCE, limit, RANSAC_ITERATIONS
-        )
+    limit = np.sqrt(CHI2_LINE)
+    model, _ = cv2.findEssentialMat(
+        xy_first, xy_second, camera.matrix, cv2.RANSAC, CONFIDENCE, limit, RANSAC_ITERATIONS
+    )
     if model is None or model.shape != (3, 3):
         return [], np.zeros(len(xy_first), bool)
     inverse = np.linalg.inv(camera.matrix)

@@ -1,4 +1,4 @@
-"""Local mapping: the work on the map at each new keyframe.
+"""Local mapping: when a frame becomes a keyframe, and the work on the map at each new one.
 
 New points from depth and by triangulation, fusion of duplicates, local bundle adjustment, culling of points and
 keyframes (ORB-SLAM2, Section III).
@@ -6,8 +6,8 @@ keyframes (ORB-SLAM2, Section III).
 
 from __future__ import annotations
 
+from copy import deepcopy
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,13 @@ from dynslam_bench.features.matching import FAR, CellGrid, Features, Words, dist
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.bundle_adjustment import (
     Bundle,
-    BundleResult,
     adjust_bundle,
     full_bundle,
     local_bundle,
 )
 from dynslam_bench.slam.map import Array, Map, Slots
-from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import CLOSE_BASELINES, Observations
-
-MapState = tuple[Slots, Array, Slots, dict[str, NDArray[Any]]]
-"""Keyframes and their poses, points and what refinement changes of them."""
+from dynslam_bench.slam.settings import BackendSettings, KeyframeSettings
+from dynslam_bench.slam.tracking import CLOSE_BASELINES, Observations, TrackedFrame
 
 MAX_DISTANCE = 50
 """Largest Hamming distance in fusion and triangulation (ORB-SLAM2's lower threshold)."""
@@ -45,6 +41,17 @@ RECENT_SHARE = 4
 """Of the largest number of keyframes, one in so many, the newest, are kept where there are too many."""
 COMPARED = 16
 """Keyframes of which the most redundant one is culled where there are too many; the next time others are compared."""
+
+MIN_KEYFRAME_INLIERS = 15
+"""Inliers that a keyframe needs more than (ORB-SLAM2's number)."""
+ESTABLISHED = 3
+"""Keyframes that observe an established point at least."""
+MIN_CLOSE, NEW_CLOSE = 100, 70
+"""A keyframe is made when fewer close points are tracked and more close features are not in the map (ORB-SLAM2)."""
+VIEW_SHARE = 0.9
+"""A keyframe is made when less than this share of the last keyframe's points lies in the image."""
+MOVED_SHARE = 0.97
+"""The view has moved when less than this share of the last keyframe's points lies in the image."""
 
 
 class LocalMapper:
@@ -113,8 +120,6 @@ class LocalMapper:
         """Points for features without one: all close ones, and the nearest hundred in any case."""
         world = self.world
         free = np.flatnonzero((world.kf_point[slot, : len(observations)] < 0) & (observations.z > 0))
-        if not len(free):
-            return
         free = free[np.argsort(observations.z[free], kind="stable")]
         if not everything:
             free = free[: max(np.count_nonzero(observations.z[free] < self.close_m), MIN_DEPTH_POINTS)]
@@ -127,8 +132,7 @@ class LocalMapper:
         """Points for features that have no point yet, by triangulation with the neighbours."""
         for other in neighbours.tolist():
             features, others, position = triangulate(self.world, slot, other, self.settings.mapping.min_parallax_sigmas)
-            if len(features):
-                self._add_points(slot, features, position, observations, (other, others))
+            self._add_points(slot, features, position, observations, (other, others))
 
     def _add_points(
         self,
@@ -174,8 +178,6 @@ class LocalMapper:
         observed[own[own >= 0]] = True
         candidates = candidates[world.alive[candidates] & ~observed[candidates]]
         points, uv, right, octave, _ = world.project(world.kf_pose[keyframe], candidates)
-        if not len(points):
-            return
         xy = world.kf_xy[keyframe, :n]
         grid = CellGrid.of(xy, world.camera.width, world.camera.height)
         levels = world.kf_octave[keyframe, :n].astype(np.int64)
@@ -198,42 +200,12 @@ class LocalMapper:
 
     def adjust(self, slot: int) -> None:
         """Local bundle adjustment around a keyframe; observations that do not fit afterwards are removed."""
-        settings = self.settings.bundle_adjustment
-        bundle = local_bundle(self.world, slot, settings.window)
-        result = self._solve(bundle, settings.iterations)
-        if bundle is not None and result is not None:
-            world, points, out = self.world, bundle.points, ~result.inliers
+        world, settings = self.world, self.settings.bundle_adjustment
+        bundle = local_bundle(world, slot, settings.window)
+        if bundle is not None:
+            points, out = bundle.points, ~adjust(world, bundle, settings.iterations)
             world.unobserve(bundle.poses[bundle.problem.obs_pose[out]], bundle.features[out])
             world.refresh(points[world.alive[points]])
-
-    def adjust_all(self) -> MapState:
-        """Full bundle adjustment, as at the end of a run; returns what `restore` needs to undo it."""
-        world, keyframes, points = self.world, self.world.keyframes, self.world.points
-        tables = {name: getattr(world, name)[points] for name in ("position", "normal", "far", "words")}
-        before = keyframes, world.kf_pose[keyframes], points, tables
-        if self._solve(full_bundle(world), FULL_ITERATIONS) is not None:
-            world.refresh(points)
-        return before
-
-    def restore(self, before: MapState) -> None:
-        """The run goes on: the map is again what it was before `adjust_all`."""
-        keyframes, poses, points, tables = before
-        for slot, pose in zip(keyframes.tolist(), poses, strict=True):
-            self.world.set_pose(slot, pose)
-        for name, values in tables.items():
-            getattr(self.world, name)[points] = values
-
-    def _solve(self, bundle: Bundle | None, iterations: int) -> BundleResult | None:
-        """Put refined poses and points into the map; None if there are none."""
-        if bundle is None:
-            return None
-        result = adjust_bundle(bundle.problem, iterations)
-        if not (np.isfinite(result.poses).all() and np.isfinite(result.points).all()):
-            return None
-        for k in range(bundle.problem.variable):
-            self.world.set_pose(int(bundle.poses[k]), result.poses[k])
-        self.world.position[bundle.points] = result.points
-        return result
 
     # ------------------------------------------------------------------ keyframes
 
@@ -283,6 +255,89 @@ class LocalMapper:
         relative = world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement])
         self.culled.append((slot, replacement, relative))
         world.remove_keyframe(slot)
+
+
+def adjust(world: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
+    """Put refined poses and points into the map; returns which observations of the bundle fit them."""
+    result = adjust_bundle(bundle.problem, iterations)
+    for slot, pose in zip(bundle.poses[: bundle.problem.variable].tolist(), result.poses, strict=False):
+        world.set_pose(slot, pose)
+    world.position[bundle.points] = result.points
+    return result.inliers
+
+
+def refined(world: Map) -> Map:
+    """A copy of the map after full bundle adjustment, as at the end of a run."""
+    copy, bundle = deepcopy(world), full_bundle(world)
+    if bundle is not None:
+        adjust(copy, bundle, FULL_ITERATIONS)
+        copy.refresh(copy.points)
+    return copy
+
+
+# ---------------------------------------------------------------------- when a frame becomes a keyframe
+
+
+class KeyframePolicy:
+    """Decides whether a tracked frame becomes a keyframe: too little of the map is in view, and the frame adds to it.
+
+    Points that many keyframes observe count (ORB-SLAM2's rule). On moving people young points come and go, and a
+    keyframe for each of them would carry the map along with the people. Where the view itself moves on, young points
+    count as well.
+
+    Args:
+        settings: The thresholds.
+        close_m: Depth below which a feature's depth is trusted, metres.
+    """
+
+    def __init__(self, settings: KeyframeSettings, close_m: float) -> None:
+        self.settings = settings
+        self._close_m = close_m
+        self.made(-1)
+
+    def made(self, frame: int) -> None:
+        """The frame of this index has become a keyframe."""
+        self._last = frame
+        self._most_inliers = 0
+
+    def needed(self, world: Map, tracked: TrackedFrame, frame: int, reference: int) -> bool:
+        """Whether a tracked frame should become a keyframe.
+
+        Args:
+            world: The map.
+            tracked: The frame, with the points that it observes.
+            frame: Its index.
+            reference: Slot of the keyframe that shares most points with it.
+        """
+        s, gap = self.settings, frame - self._last
+        close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
+        matched = tracked.point >= 0
+        inliers = int(np.count_nonzero(matched))
+        self._most_inliers = max(self._most_inliers, inliers)
+        if inliers <= MIN_KEYFRAME_INLIERS:
+            return False
+        few_close = np.count_nonzero(close & matched) < MIN_CLOSE
+        if np.count_nonzero(close & ~matched) > NEW_CLOSE and (few_close or gap >= s.max_gap):
+            return True
+        if inliers < s.tracked_share * established_points(world, reference):
+            return True
+        view = share_in_view(world, int(np.where(world.kf_alive, world.kf_id, -1).argmax()), tracked.T_cam_world)
+        return view < VIEW_SHARE or (view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers)
+
+
+def established_points(world: Map, keyframe: int) -> int:
+    """How many of a keyframe's points `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
+    points = world.kf_point[keyframe]
+    young = np.count_nonzero(world.kf_alive & (world.kf_map == world.kf_map[keyframe]))
+    return int(np.count_nonzero(world.n_obs[points[points >= 0]] >= min(ESTABLISHED, young)))
+
+
+def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
+    """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
+    points = world.kf_point[keyframe]
+    position = world.position[points[points >= 0]]
+    _, inside = world.camera.view(position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
+    return float(np.mean(inside)) if len(inside) else 1.0
 
 
 # ---------------------------------------------------------------------- triangulation

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_array, diags_array
+from scipy.sparse import bsr_array, coo_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
@@ -28,16 +28,12 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.local_mapping import LocalMapper
 from dynslam_bench.slam.map import Array, Slots
-from dynslam_bench.slam.place_recognition import (
-    PlaceHypothesis,
-    PlaceMatch,
+from dynslam_bench.slam.relocalisation import (
     around,
     is_aliased,
-    match_keyframe,
     pose_uncertainty,
-    ransac_matches,
+    recognise_place,
     recognition_scores,
-    verify_place,
 )
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.slam.tracking import InitialPose, Observations, weakly_connected
@@ -51,7 +47,7 @@ MIN_SHARE = 0.3
 MERGE_INLIERS, MERGE_SHARE = 100, 0.5
 """The same, and the number of inliers, where two maps are merged, which no drift bounds."""
 MERGE_UNCERTAINTY = 0.4
-"""Largest `place_recognition.pose_uncertainty` of a pose by which maps are merged."""
+"""Largest `relocalisation.pose_uncertainty` of a pose by which maps are merged."""
 STRONG_COVISIBILITY = 100
 """Keyframes that share so many points have an edge in the pose graph (ORB-SLAM2's number)."""
 SLACK_M, SLACK_DEG = 0.1, 3.0
@@ -97,6 +93,17 @@ class Correction:
     scale: float
 
     @property
+    def moved_m(self) -> float:
+        """Distance that the camera centre moves."""
+        centres = se3.inverse(np.stack([self.T_cam_before, self.T_cam_now]))[:, :3, 3]
+        return float(np.linalg.norm(centres[1] - centres[0]))
+
+    @property
+    def rotated_deg(self) -> float:
+        """Angle that the camera rotates by, degrees."""
+        return float(np.degrees(se3.rotation_angle(self.T_cam_now @ se3.inverse(self.T_cam_before))))
+
+    @property
     def T_now_before(self) -> Array:
         """From the keyframe's world, once its lengths are multiplied, to that of the place, ``[4, 4]``."""
         before = self.T_cam_before.copy()
@@ -121,32 +128,20 @@ class Correction:
         return bool(distance < AGREE_M and np.degrees(rotation) < AGREE_DEG and scale < AGREE_SCALE)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Loop:
     """A place that was recognised.
 
     Attributes:
-        keyframe: Slot, at that time, of the keyframe that was recognised.
-        frame: Index of that keyframe's frame.
-        T_cam_world: Pose ``[4, 4]`` of the newest keyframe by the points around it, world to camera.
-        inliers: Points that fit it.
-        share: Which share of the keyframe's own points in view is among them.
+        place: Pose of the newest keyframe by the points around the one that was recognised.
+        correction: What follows for the newest keyframe; its scale is 1 with depth.
         merges: Whether the place lies in another submap.
-        moved_m: Distance of the correction.
-        rotated_deg: Rotation of the correction, degrees.
-        scale: What lengths around the newest keyframe are to be multiplied by; 1 with depth.
         fits: Whether the submap can have begun where the merge puts its start; not so after much drift.
     """
 
-    keyframe: int
-    frame: int
-    T_cam_world: Array
-    inliers: int
-    share: float
+    place: InitialPose
+    correction: Correction
     merges: bool
-    moved_m: float
-    rotated_deg: float
-    scale: float
     fits: bool = True
 
 
@@ -187,16 +182,13 @@ class LoopCloser:
         self._met_at: int | None = None
         self._loop_edges: list[Edge] = []
 
-    def close(self, slot: int, observations: Observations, root: InitialPose | None = None) -> bool:
+    def close(self, slot: int, observations: Observations, root: InitialPose | None = None) -> None:
         """Look for a loop at a new keyframe; correct and fuse the map if enough consecutive keyframes agree on one.
 
         Args:
             slot: The keyframe.
             observations: Its features.
             root: Its pose in the root map, if the camera is in a submap and was found there.
-
-        Returns:
-            Whether a loop was closed; every pose and point may have changed then.
         """
         self.rescaled, self.in_root_map, self.leaves_submap = {}, False, False
         self._extend_path(slot)
@@ -207,29 +199,29 @@ class LoopCloser:
         self._met_at = self._met_at if self.in_root_map else None
         if loop is None:
             self._row.clear()
-            return False
-        correction = Correction(self.world.kf_pose[slot].copy(), loop.T_cam_world, loop.scale)
-        if self._row and not correction.agrees(self._row[-1], self.world.kf_centre[slot]):
+            return
+        if self._row and not loop.correction.agrees(self._row[-1], self.world.kf_centre[slot]):
             self._row.clear()
-        self._row.append(correction)
+        self._row.append(loop.correction)
         if len(self._row) < self.settings.loop_closing.confirmations:
-            return False
-        loop = replace(loop, scale=float(np.median([correction.scale for correction in self._row])))
+            return
+        scale = float(np.median([correction.scale for correction in self._row]))
+        loop = replace(loop, correction=replace(loop.correction, scale=scale))
         self._row.clear()
         if not loop.fits:
             self.leaves_submap = self.in_root_map = root is not None
-            return False
+            return
         if loop.merges and root is None and self._aliased(slot, observations, loop):
-            return False
+            return
         if loop.merges:
             self._merge(slot, loop)
         else:
             self._correct(slot, loop)
-        self._fuse(slot, loop.keyframe)
-        self._shortcuts.append((self._path_at(loop.keyframe), self._path_length))
+        recognised = loop.place.keyframe
+        self._fuse(slot, recognised)
+        self._shortcuts.append((self._path_at(recognised), self._path_length))
         self.closed.append(loop)
         self._last_pose = self.world.kf_pose[slot].copy()  # a correction adds no path
-        return True
 
     # ------------------------------------------------------------------ detect and verify
 
@@ -264,56 +256,44 @@ class LoopCloser:
         self, slot: int, candidate: int, observations: Observations, rng: np.random.Generator
     ) -> Loop | None:
         """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
-        s, matches = self.settings.loop_closing, match_keyframe(self.world, candidate, observations)
-        ransac = None
-        if len(matches) >= MIN_MATCHES:
-            ransac = ransac_matches(matches, observations, self.world.camera, rng, MIN_MATCHES // 2)
-        if ransac is None:
+        s, tracking = self.settings.loop_closing, self.settings.tracking
+        least = MIN_MATCHES, MIN_MATCHES // 2
+        place = recognise_place(self.world, candidate, observations, tracking, rng, *least)
+        if place is None or len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
             return None
-        pose, inliers = ransac
-        place = verify_place(self.world, candidate, observations, inliers, pose, self.settings.tracking)
-        if len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
-            return None
-        loop = self._loop(slot, candidate, place)
+        loop = self._loop(slot, place)
         if loop is None or (loop.merges and pose_uncertainty(self.world, observations, place, rng) > MERGE_UNCERTAINTY):
             return None
         return loop if self._within_drift(slot, loop) else None
 
     def _loop_to_root(self, slot: int, observations: Observations, root: InitialPose) -> Loop | None:
         """The loop to the place in the root map where a submap's camera is, if it determines the merge well enough."""
-        s, world, frame = self.settings.loop_closing, self.world, int(self.world.kf_frame[slot])
-        loop = self._loop(slot, root.keyframe, PlaceMatch(root.T_cam_world, root.matches, root.share))
-        if loop is None or not world.kf_alive[root.keyframe]:
+        frame, loop = int(self.world.kf_frame[slot]), self._loop(slot, root)
+        if loop is None or not self.world.kf_alive[root.keyframe]:
             return None
         if (loop.fits or self._scale_is_known) and self._aliased(slot, observations, loop):
             return None
-        enough = loop.inliers >= s.min_inliers and loop.share >= MERGE_SHARE
+        enough = len(root.matches) >= self.settings.loop_closing.min_inliers and root.share >= MERGE_SHARE
         well = enough and root.uncertainty <= MERGE_UNCERTAINTY
         self.in_root_map = loop.fits
         self._met_at = frame if self._met_at is None else self._met_at
         self.leaves_submap = self.in_root_map and not well and frame - self._met_at >= PATIENCE
         return loop if well else None
 
-    def _loop(self, slot: int, candidate: int, place: PlaceMatch) -> Loop | None:
+    def _loop(self, slot: int, place: InitialPose) -> Loop | None:
         """The correction to a place; None where too few points determine the scale."""
-        world = self.world
         scale = 1.0 if self._scale_is_known else self._scale(slot, place)
         if scale is None:
             return None
-        T_cam_world = place.T_cam_world
-        moved = float(np.linalg.norm(se3.inverse(T_cam_world)[:3, 3] - world.kf_centre[slot]))
-        rotated = float(np.degrees(se3.rotation_angle(T_cam_world @ se3.inverse(world.kf_pose[slot]))))
-        frame, merges = int(world.kf_frame[candidate]), bool(world.kf_map[candidate] != world.kf_map[slot])
-        loop = Loop(candidate, frame, T_cam_world, len(place.matches), place.share, merges, moved, rotated, scale)
-        return replace(loop, fits=self._fits(slot, loop)) if merges else loop
+        correction = Correction(self.world.kf_pose[slot].copy(), place.T_cam_world, scale)
+        loop = Loop(place, correction, bool(self.world.kf_map[place.keyframe] != self.world.kf_map[slot]))
+        return replace(loop, fits=self._fits(slot, loop)) if loop.merges else loop
 
-    def _scale(self, slot: int, place: PlaceMatch) -> float | None:
+    def _scale(self, slot: int, place: InitialPose) -> float | None:
         """Median ratio of the depths of common points by the first visit and by this one; None where too few."""
         world, first = self.world, place.matches
         own = world.kf_point[slot, first.feature].astype(np.int64)
         both = (own >= 0) & (own != first.point)
-        if np.count_nonzero(both) < MIN_SCALE_POINTS:
-            return None
         then = se3.transform(place.T_cam_world, world.position[first.point[both]])[:, 2]
         now = se3.transform(world.kf_pose[slot], world.position[own[both]])[:, 2]
         ahead = (then > 0) & (now > 0)
@@ -321,34 +301,38 @@ class LoopCloser:
 
     def _within_drift(self, slot: int, loop: Loop) -> bool:
         """Whether drift explains the correction; between submaps, whether the camera can have moved from one there."""
+        place, correction = loop.place, loop.correction
         if loop.merges:
-            if loop.inliers < MERGE_INLIERS or loop.share < MERGE_SHARE:
+            if len(place.matches) < MERGE_INLIERS or place.share < MERGE_SHARE:
                 return False
-            here, there = (int(self.world.kf_map[keyframe]) for keyframe in (slot, loop.keyframe))
-            return loop.fits and bool(np.radians(loop.rotated_deg) <= self.atlas.slack(here, there))
-        if not 1 / MAX_SCALE < loop.scale < MAX_SCALE:
+            slack = self.atlas.slack(*self.world.kf_map[[slot, place.keyframe]].tolist())
+            return loop.fits and bool(np.radians(correction.rotated_deg) <= slack)
+        if not 1 / MAX_SCALE < correction.scale < MAX_SCALE:
             return False
-        path, share = self._path_since(loop.keyframe), self.settings.loop_closing.drift_share
-        return loop.moved_m <= SLACK_M + share * path and loop.rotated_deg <= SLACK_DEG + DRIFT_DEG * path
+        path, share = self._path_since(place.keyframe), self.settings.loop_closing.drift_share
+        return correction.moved_m <= SLACK_M + share * path and correction.rotated_deg <= SLACK_DEG + DRIFT_DEG * path
 
     def _fits(self, slot: int, loop: Loop) -> bool:
         """Whether the younger of two submaps can have begun where the merge puts its start."""
         younger, _, correction = self._merge_of(slot, loop)
         share = 0.0 if self._scale_is_known else self.settings.loop_closing.drift_share
         left = self._path_at(int(self.world.submap(younger)[0]))
-        ends = (slot, loop.keyframe) if self.world.kf_map[slot] == younger else (loop.keyframe, slot)
+        place = loop.place.keyframe
+        ends = (slot, place) if self.world.kf_map[slot] == younger else (place, slot)
         on_younger, on_older = (abs(self._path_at(keyframe) - left) for keyframe in ends)
         path = correction.scale * on_younger + on_older  # from the meeting place back to where the older was left
         return self.atlas.admits_start(younger, correction.moved, share * path)
 
     def _aliased(self, slot: int, observations: Observations, loop: Loop) -> bool:
         """Whether the keyframe fits two places: nothing but what is seen tells how two maps lie to each other."""
-        world = self.world
-        here, there = (int(world.kf_map[keyframe]) for keyframe in (slot, loop.keyframe))
-        own = world.kf_point[slot, world.kf_point[slot] >= 0]
-        depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[own])[:, 2]))
-        hypotheses = {here: PlaceHypothesis(world.kf_pose[slot], loop.share, depth)}
-        hypotheses[there] = PlaceHypothesis(loop.T_cam_world, loop.share, depth * loop.scale)
+        world, place = self.world, loop.place
+        own, other = world.kf_map[[slot, place.keyframe]].tolist()
+        points = world.kf_point[slot, world.kf_point[slot] >= 0]
+        depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[points])[:, 2]))
+        hypotheses = {
+            own: replace(place, T_cam_world=world.kf_pose[slot], depth=depth),
+            other: replace(place, depth=depth * loop.correction.scale),
+        }
         tracking = self.settings.tracking
         return is_aliased(world, observations, hypotheses, weakly_connected(world, slot), tracking, self._seed)
 
@@ -367,19 +351,18 @@ class LoopCloser:
 
     def _correct(self, slot: int, loop: Loop) -> None:
         """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
-        world = self.world
-        loop_edge = replace(self._edge(loop.keyframe, slot, loop.T_cam_world), weight=LOOP_WEIGHT)
+        world, correction = self.world, loop.correction
+        loop_edge = replace(self._edge(loop.place.keyframe, slot, correction.T_cam_now), weight=LOOP_WEIGHT)
         older = edges_within(world.kf_id[world.keyframes], self._loop_edges)
         self._loop_edges = [*older, loop_edge]
-        correction = np.array([loop.moved_m, loop.rotated_deg, abs(np.log(loop.scale))])
-        if (correction < NEGLIGIBLE).all():
+        if (np.array([correction.moved_m, correction.rotated_deg, abs(np.log(correction.scale))]) < NEGLIGIBLE).all():
             return
         submap = int(world.kf_map[slot])
         slots = world.submap(submap)
         before, ids = world.kf_pose.copy(), world.kf_id[slots]
         edges, scales = self._covisibility_edges(slots), np.ones(world.kf_alive.size)
         if not self._scale_is_known:
-            scales[slots] = spread_scale(ids, [*edges, *edges_within(ids, older)], loop_edge, loop.scale)
+            scales[slots] = spread_scale(ids, [*edges, *edges_within(ids, older)], loop_edge, correction.scale)
             edges = rescaled_edges(edges, ids, scales[slots])
             self._note_scales(slots, scales[slots])
         after = optimise_poses(ids, before[slots], [*edges, *edges_within(ids, self._loop_edges)])
@@ -387,7 +370,7 @@ class LoopCloser:
             world.set_pose(at, pose)
         self.atlas.move_nearby(submap, before[slots], after, scales[slots])
         points = world.points_of(slots)
-        reference = world.obs_kf[world.obs_at[points]]
+        reference = world.obs_kf[points, 0]
         local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
         local *= scales[reference, None]
         now = se3.inverse(world.kf_pose[reference])
@@ -396,9 +379,8 @@ class LoopCloser:
 
     def _merge_of(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
         """The younger of the two submaps, the older one, and the correction of the younger."""
-        here, there = (int(self.world.kf_map[keyframe]) for keyframe in (slot, loop.keyframe))
-        correction = Correction(self.world.kf_pose[slot].copy(), loop.T_cam_world, loop.scale)
-        return (here, there, correction) if here > there else (there, here, correction.inverse)
+        own, other = self.world.kf_map[[slot, loop.place.keyframe]].tolist()
+        return (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
 
     def _merge(self, slot: int, loop: Loop) -> None:
         """Move the younger of two submaps as a whole to where the older one has the place."""
@@ -407,7 +389,7 @@ class LoopCloser:
         slots = world.submap(younger)
         world.move_submap(younger, correction.T_now_before, older, correction.scale)
         self._note_scales(slots, np.full(len(slots), correction.scale))
-        self._loop_edges.append(replace(self._edge(loop.keyframe, slot, world.kf_pose[slot]), weight=LOOP_WEIGHT))
+        self._loop_edges.append(replace(self._edge(loop.place.keyframe, slot, world.kf_pose[slot]), weight=LOOP_WEIGHT))
 
     def _note_scales(self, slots: Slots, scales: Array) -> None:
         """Lengths around keyframes were multiplied."""
@@ -569,14 +551,9 @@ def _graph_step(poses: Array, one: Slots, other: Slots, error: Array, sigmas: Ar
     weight = 1.0 / sigmas[:, :, None]
     by_other = weight * jacobian_log
     by_one = -by_other @ _adjoint(poses[other] @ se3.inverse(poses[one]))
-    row = np.arange(error.size).reshape(-1, 6, 1)
-    rows, columns, values = [], [], []
-    for at, block in ((one, by_one), (other, by_other)):
-        rows.append(np.broadcast_to(row, block.shape).ravel())
-        columns.append(np.broadcast_to(6 * at[:, None, None] + np.arange(6), block.shape).ravel())
-        values.append(block.ravel())
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    jacobian = coo_array(entries, shape=(error.size, 6 * len(poses))).tocsc()[:, 6:]
+    blocks, columns = np.stack([by_one, by_other], axis=1).reshape(-1, 6, 6), np.stack([one, other], axis=1).ravel()
+    block_rows = blocks, columns, 2 * np.arange(len(error) + 1)
+    jacobian = bsr_array(block_rows, shape=(error.size, 6 * len(poses))).tocsc()[:, 6:]
     normal = (jacobian.T @ jacobian).tocsc()
     normal = normal + diags_array(damping * normal.diagonal() + 1e-12)
     twists = np.zeros((len(poses), 6))

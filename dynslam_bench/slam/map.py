@@ -6,11 +6,14 @@ Keyframes and points live in numbered slots; a freed slot is used again, after t
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts.features import Keypoints
+from dynslam_bench.contracts.filter import KeyframeView
+from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import se3
@@ -37,19 +40,20 @@ FEATURE_TABLES = {
 POINT_TABLES = {
     "alive": (bool,), "id": (np.int64,), "position": (float, 3), "normal": (float, 3), "far": (float,),
     "words": (np.uint64, 4), "rgb": (np.uint8, 3), "visible": (np.int32,), "found": (np.int32,), "born": (np.int64,),
-    "n_obs": (np.int32,), "obs_at": (np.int64,), "obs_capacity": (np.int32,),
+    "n_obs": (np.int32,), "obs_kf": (np.int32, 8), "obs_ft": (np.int32, 8),
 }  # fmt: skip
 """Of each point."""
-OBSERVATION_TABLES = {"obs_kf": (np.int32,), "obs_ft": (np.int32,)}
-"""Of each observation."""
-MIN_CAPACITY = 4
-"""Observations that a point has room for when it gets its first one."""
 MIN_COSINE = 0.5
 """Smallest cosine between a point's mean viewing direction and the ray to the camera (ORB-SLAM2's number)."""
 WIDEN_RANGE = 1.25
 """Factor by which the scale range of a point is widened."""
 REDUNDANT_VIEWS = 3
 """Other keyframes that see a redundant point (ORB-SLAM2's number)."""
+
+VIEWS = 20
+"""Newest keyframes that filters may read (DynaSLAM's window)."""
+DEPTH_IMAGES = 8
+"""Newest keyframes that keep their depth image, for filters."""
 
 
 class Map:
@@ -64,14 +68,12 @@ class Map:
     Attributes (points, by slot):
         alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]`` largest distance at which
         the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible and found (frames that
-        should have and did observe it), born (id of the keyframe that made it), n_obs, obs_at and obs_capacity (how
-        many observations it has, where they begin in obs_kf and obs_ft, and how many fit there).
+        should have and did observe it), born (id of the keyframe that made it), n_obs (how many observations it has),
+        obs_kf and obs_ft ``[M, O]`` (observing keyframe slots and feature numbers, oldest first; O is the largest
+        number of observations so far, rounded up).
 
     Attributes (others):
-        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors (`place_recognition`).
-
-    Attributes (observations ``[O]``, those of each point in a row, oldest first):
-        obs_kf, obs_ft (observing keyframe slots and feature numbers).
+        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors (`relocalisation`).
     """
 
     def __init__(self, camera: Camera, scales: Array) -> None:
@@ -82,15 +84,11 @@ class Map:
         self._free_points: list[int] = []
         self._freed_points: list[int] = []
         self._top = 0
-        self._observations = 0
-        self._features = 0
         self.substrings: dict[int, tuple[int, NDArray[np.uint16]]] = {}
-        for name, (kind, *shape) in (KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES | OBSERVATION_TABLES).items():
+        for name, (kind, *shape) in (KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES).items():
             setattr(self, name, np.zeros((0, *shape), kind))
 
     if TYPE_CHECKING:
-        obs_kf: Ints
-        obs_ft: Ints
 
         def __getattr__(self, name: str) -> NDArray[Any]: ...
 
@@ -125,11 +123,6 @@ class Map:
         """Number of keyframes."""
         return int(np.count_nonzero(self.kf_alive))
 
-    @property
-    def map_count(self) -> int:
-        """Number of maps: the root map, and the submaps that were not merged with it."""
-        return len(set(self.kf_map[self.kf_alive].tolist()))
-
     def add_keyframe(
         self, observations: Observations, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
     ) -> int:
@@ -137,10 +130,10 @@ class Map:
         n, words = observations.words.shape
         if not self.next_keyframe:
             self.kf_words, self.words = np.zeros((0, 0, words), np.uint64), np.zeros((0, words), np.uint64)
-        if n > self._features:
+        features = self.kf_point.shape[1]
+        if n > features:
             self._grow(FEATURE_TABLES, n, axis=1)
-            self.kf_point[:, self._features :] = -1
-            self._features = n
+            self.kf_point[:, features:] = -1
         free = np.flatnonzero(~self.kf_alive)
         if not len(free):
             free = np.array([self.kf_alive.size])
@@ -155,11 +148,11 @@ class Map:
         self.kf_count[slot] = n
         self.set_pose(slot, T_cam_world)
         raw = observations.keypoints
-        features = (
+        described = (
             raw.xy, raw.response, observations.xy, observations.right, observations.z, observations.octave,
             observations.angle, observations.info, observations.info_right, observations.words,
         )  # fmt: skip
-        for name, values in zip(FEATURE_TABLES, features, strict=False):
+        for name, values in zip(FEATURE_TABLES, described, strict=False):
             getattr(self, name)[slot, :n] = values
         self.kf_point[slot] = -1
         return slot
@@ -171,10 +164,9 @@ class Map:
 
     def take_over(self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int) -> None:
         """Become the map of complete tables, in which every slot is in use; see `atlas`."""
-        for name in KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES | OBSERVATION_TABLES:
+        for name in KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES:
             setattr(self, name, tables[name])
-        self._features = self.kf_words.shape[1]
-        self._top, self._observations = self.alive.size, self.obs_kf.size
+        self._top = self.alive.size
         self.next_keyframe, self.next_point = next_keyframe, next_point
         for slot, pose in enumerate(self.kf_pose):
             self.set_pose(slot, pose)
@@ -185,7 +177,7 @@ class Map:
 
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
-        observers = self.obs_kf[self.observations(points[points >= 0])]
+        observers, _ = self.observations(points[points >= 0])
         counts = np.bincount(observers, minlength=self.kf_alive.size)
         if exclude >= 0:
             counts[exclude] = 0
@@ -220,11 +212,6 @@ class Map:
     # ------------------------------------------------------------------ points
 
     @property
-    def point_count(self) -> int:
-        """Number of points."""
-        return int(np.count_nonzero(self.alive[: self._top]))
-
-    @property
     def points(self) -> Slots:
         """Slots of all points, ascending."""
         return np.flatnonzero(self.alive[: self._top])
@@ -254,7 +241,7 @@ class Map:
         """Add observations: features of a keyframe show points."""
         if not len(points):
             return
-        self._reserve(points, 1)
+        self._reserve(int(self.n_obs[points].max()) + 1)
         _link(*self._observed, self.kf_point, keyframe, features, points)
 
     def unobserve(self, keyframes: Slots, features: Slots) -> None:
@@ -268,16 +255,13 @@ class Map:
         """Remove points and their observations."""
         points = np.unique(points)
         points = points[self.alive[points]]
-        rows = self.observations(points)
-        self.kf_point[self.obs_kf[rows], self.obs_ft[rows]] = -1
+        self.kf_point[self.observations(points)] = -1
         self.n_obs[points], self.alive[points] = 0, False
         self._freed_points.extend(points.tolist())
 
     def replace_point(self, old: int, new: int) -> None:
         """Replace a point by another that is the same point of the scene."""
-        if old == new or not self.alive[old] or not self.alive[new]:
-            return
-        self._reserve(np.array([new]), int(self.n_obs[old]))
+        self._reserve(int(self.n_obs[new] + self.n_obs[old]))
         _replace(*self._observed, self.kf_point, old, new)
         self.visible[new] += self.visible[old]
         self.found[new] += self.found[old]
@@ -295,40 +279,20 @@ class Map:
         self._freed_points.clear()
 
     @property
-    def _observed(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Slots, NDArray[np.int32]]:
-        return self.obs_kf, self.obs_ft, self.obs_at, self.n_obs
+    def _observed(self) -> tuple[Ints, Ints, Ints]:
+        return self.obs_kf, self.obs_ft, self.n_obs
 
-    def observations(self, points: NDArray[np.integer]) -> Slots:
-        """Rows of `obs_kf` and `obs_ft` that belong to points, one point after the other."""
+    def observations(self, points: NDArray[np.integer]) -> tuple[Ints, Ints]:
+        """Keyframe slots and feature numbers of the observations of points, one point after the other."""
         count = self.n_obs[points].astype(np.int64)
-        begin = self.obs_at[points] - (np.cumsum(count) - count)
-        return np.repeat(begin, count) + np.arange(count.sum())
+        row, column = np.repeat(points, count), np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        return self.obs_kf[row, column], self.obs_ft[row, column]
 
-    def _reserve(self, points: Slots, more: int) -> None:
-        """Make room for so many more observations of each of the points."""
-        full = self.n_obs[points] + more > self.obs_capacity[points]
-        if not full.any():
-            return
-        short = np.unique(points[full])
-        room = np.maximum(2 * self.obs_capacity[short], self.n_obs[short] + more).clip(min=MIN_CAPACITY)
-        if self._observations + room.sum() > self.obs_kf.size:
-            placed = np.flatnonzero(self.obs_capacity)
-            present = self.obs_capacity[placed]
-            self._place(placed, present, int(1.5 * (present.sum() + room.sum())))
-        self._place(short, room)
-
-    def _place(self, points: Slots, room: Ints, length: int = 0) -> None:
-        """Move the observations of points to where each has `room`: behind all others, or into a pool of `length`."""
-        rows = self.observations(points)
-        keyframes, features = self.obs_kf[rows], self.obs_ft[rows]
-        if length:
-            self.obs_kf, self.obs_ft = np.zeros(length, np.int32), np.zeros(length, np.int32)
-            self._observations = 0
-        self.obs_at[points] = self._observations + np.cumsum(room, dtype=np.int64) - room
-        self.obs_capacity[points] = room
-        self._observations += int(room.sum())
-        rows = self.observations(points)
-        self.obs_kf[rows], self.obs_ft[rows] = keyframes, features
+    def _reserve(self, observations: int) -> None:
+        """Make room for so many observations of a point."""
+        room = self.obs_kf.shape[1]
+        if observations > room:
+            self._grow(("obs_kf", "obs_ft"), max(observations, room + room // 2), axis=1)
 
     # ------------------------------------------------------------------ views
 
@@ -352,66 +316,149 @@ class Map:
         return int(total), int(redundant)
 
 
+# ---------------------------------------------------------------------- what filters and files read
+
+
+class MapView(NamedTuple):
+    """What filters may read of the map.
+
+    Attributes:
+        keyframes: The newest keyframes, newest first, at most `VIEWS`.
+        ids: int64 ``[M]``, ids of all points.
+        positions: World positions ``[M, 3]`` of the points, metres.
+    """
+
+    keyframes: tuple[KeyframeView, ...]
+    ids: Slots
+    positions: Array
+
+
+def points_in(world: Map, submap: int) -> Slots:
+    """Slots of the points of a submap, ascending."""
+    points = world.points
+    return np.asarray(points[world.kf_map[world.obs_kf[points, 0]] == submap])
+
+
+def map_outputs(world: Map) -> MapOutputs:
+    """Keyframes and map points for files and pictures; of points the root map's alone."""
+    points = points_in(world, 0)
+    records = tuple(
+        KeyframeRecord(
+            int(world.kf_id[slot]),
+            int(world.kf_frame[slot]),
+            float(world.kf_stamp[slot]),
+            se3.inverse(world.kf_pose[slot]),
+            int(world.kf_count[slot]),
+            int(np.count_nonzero(world.kf_point[slot] >= 0)),
+            int(world.kf_map[slot]),
+        )
+        for slot in world.keyframes.tolist()
+    )
+    observations = world.n_obs[points].astype(np.int64)
+    return MapOutputs(records, world.id[points], world.position[points], world.rgb[points], observations)
+
+
+class MapViews:
+    """Views of a map for filters, made again after a keyframe or in another submap.
+
+    Args:
+        world: The map.
+        depth_images: How many of the newest keyframes keep their depth image.
+    """
+
+    def __init__(self, world: Map, depth_images: int) -> None:
+        self._world = world
+        self._most_images = depth_images
+        self._depth_images: dict[int, NDArray[np.float32]] = {}
+        self._made_for: tuple[int, int] | None = None
+
+    def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
+        """A keyframe was made; those that were culled for it lose their depth images."""
+        self._depth_images[slot] = depth
+        newest = self._world.keyframes[::-1][: self._most_images]
+        self._depth_images = {at: image for at, image in self._depth_images.items() if at in newest}
+
+    def of(self, submap: int) -> MapView:
+        """What filters see while the camera is in a submap."""
+        world = self._world
+        if self._made_for != (world.next_keyframe, submap):
+            self._made_for = world.next_keyframe, submap
+            newest, points = world.submap(submap)[::-1][:VIEWS].tolist(), points_in(world, submap)
+            self._view = MapView(tuple(map(self._keyframe, newest)), world.id[points], world.position[points])
+        return self._view
+
+    def _keyframe(self, slot: int) -> KeyframeView:
+        world, n = self._world, int(self._world.kf_count[slot])
+        keypoints = Keypoints(
+            world.kf_raw[slot, :n],
+            world.kf_octave[slot, :n].astype(np.int32),
+            world.kf_angle[slot, :n],
+            world.kf_response[slot, :n],
+            world.kf_words[slot, :n].view(np.uint8),
+        )
+        return KeyframeView(
+            se3.inverse(world.kf_pose[slot]),
+            keypoints,
+            world.kf_xy[slot, :n],
+            world.kf_z[slot, :n],
+            self._depth_images.get(slot),
+            float(world.kf_stamp[slot]),
+        )
+
+
 # ---------------------------------------------------------------------- compiled loops over the tables
 
 
 @kernel
-def _link_one(
-    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, keyframe: int, feature: int, point: int
-) -> None:
-    begin, end = obs_at[point], obs_at[point] + n_obs[point]
-    for o in range(begin, end):
-        if obs_kf[o] == keyframe:
+def _link_one(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframe: int, feature: int, point: int) -> None:
+    end = n_obs[point]
+    for o in range(end):
+        if obs_kf[point, o] == keyframe:
             return
-    obs_kf[end] = keyframe
-    obs_ft[end] = feature
+    obs_kf[point, end], obs_ft[point, end] = keyframe, feature
     n_obs[point] += 1
     kf_point[keyframe, feature] = point
 
 
 @kernel
 def _link(
-    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, keyframe: int, features: Slots,
-    points: Slots,
-) -> None:  # fmt: skip
+    obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframe: int, features: Slots, points: Slots
+) -> None:
     """Add observations of the points by the keyframe's features; a second one by the same keyframe is skipped."""
     for i in range(points.shape[0]):
         if kf_point[keyframe, features[i]] < 0:
-            _link_one(obs_kf, obs_ft, obs_at, n_obs, kf_point, keyframe, features[i], points[i])
+            _link_one(obs_kf, obs_ft, n_obs, kf_point, keyframe, features[i], points[i])
 
 
 @kernel
-def _unlink(
-    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, keyframes: Slots, features: Slots
-) -> None:
+def _unlink(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframes: Slots, features: Slots) -> None:
     """Remove observations; the order of the others is kept."""
     for i in range(keyframes.shape[0]):
         p = kf_point[keyframes[i], features[i]]
         if p < 0:
             continue
         kf_point[keyframes[i], features[i]] = -1
-        out = obs_at[p]
-        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
-            if obs_kf[o] != keyframes[i] or obs_ft[o] != features[i]:
-                obs_kf[out] = obs_kf[o]
-                obs_ft[out] = obs_ft[o]
-                out += 1
-        n_obs[p] = out - obs_at[p]
+        left = 0
+        for o in range(n_obs[p]):
+            if obs_kf[p, o] != keyframes[i] or obs_ft[p, o] != features[i]:
+                obs_kf[p, left], obs_ft[p, left] = obs_kf[p, o], obs_ft[p, o]
+                left += 1
+        n_obs[p] = left
 
 
 @kernel
-def _replace(obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints, kf_point: Ints, old: int, new: int) -> None:
+def _replace(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, old: int, new: int) -> None:
     """Move the observations of `old` to `new`; where one keyframe observes both, that of `new` stays."""
-    for o in range(obs_at[old], obs_at[old] + n_obs[old]):
-        kf_point[obs_kf[o], obs_ft[o]] = -1
-        _link_one(obs_kf, obs_ft, obs_at, n_obs, kf_point, obs_kf[o], obs_ft[o], new)
+    for o in range(n_obs[old]):
+        kf_point[obs_kf[old, o], obs_ft[old, o]] = -1
+        _link_one(obs_kf, obs_ft, n_obs, kf_point, obs_kf[old, o], obs_ft[old, o], new)
     n_obs[old] = 0
 
 
 @kernel
 def _refresh(
-    points: Slots, position: Array, normal: Array, far: Array, words: Any, obs_kf: Ints, obs_ft: Ints, obs_at: Slots,
-    n_obs: Ints, kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,
+    points: Slots, position: Array, normal: Array, far: Array, words: Any, obs_kf: Ints, obs_ft: Ints, n_obs: Ints,
+    kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,
 ) -> None:  # fmt: skip
     """Renew descriptor (the medoid of the observed ones), viewing direction and scale range of the points."""
     for i in range(points.shape[0]):
@@ -419,30 +466,29 @@ def _refresh(
         n = n_obs[p]
         if n == 0:
             continue
-        begin, end = obs_at[p], obs_at[p] + n
         m = min(n, 12)  # only the newest observations count
-        best = end - 1
+        best = n - 1
         if m > 2:
             best_score = 1 << 40
-            for a in range(end - m, end):
+            for a in range(n - m, n):
                 score = 0
-                for b in range(end - m, end):
-                    score += distance(kf_words[obs_kf[a], obs_ft[a]], kf_words[obs_kf[b], obs_ft[b]])
+                for b in range(n - m, n):
+                    score += distance(kf_words[obs_kf[p, a], obs_ft[p, a]], kf_words[obs_kf[p, b], obs_ft[p, b]])
                 if score < best_score:
                     best, best_score = a, score
         for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
-            words[p, w] = kf_words[obs_kf[best], obs_ft[best], w]
+            words[p, w] = kf_words[obs_kf[p, best], obs_ft[p, best], w]
         sx, sy, sz = 0.0, 0.0, 0.0
         reference_distance = 0.0
-        for o in range(begin, end):
-            c = kf_centre[obs_kf[o]]
+        for o in range(n):
+            c = kf_centre[obs_kf[p, o]]
             x, y, z = position[p, 0] - c[0], position[p, 1] - c[1], position[p, 2] - c[2]
             d = np.sqrt(x * x + y * y + z * z) + 1e-12
             sx += x / d
             sy += y / d
             sz += z / d
-            if o == begin:
-                reference_distance = d * scales[kf_octave[obs_kf[o], obs_ft[o]]]
+            if o == 0:
+                reference_distance = d * scales[kf_octave[obs_kf[p, o], obs_ft[p, o]]]
         length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
         normal[p, 0], normal[p, 1], normal[p, 2] = sx / length, sy / length, sz / length
         far[p] = reference_distance
@@ -501,9 +547,8 @@ def _project(
 
 @kernel
 def _redundancy(
-    keyframe: int, close: NDArray[np.bool_], kf_point: Ints, kf_octave: Any,
-    obs_kf: Ints, obs_ft: Ints, obs_at: Slots, n_obs: Ints,
-) -> tuple[int, int]:  # fmt: skip
+    keyframe: int, close: NDArray[np.bool_], kf_point: Ints, kf_octave: Any, obs_kf: Ints, obs_ft: Ints, n_obs: Ints
+) -> tuple[int, int]:
     """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser."""
     total, redundant = 0, 0
     for f in range(close.shape[0]):
@@ -514,8 +559,8 @@ def _redundancy(
         if n_obs[p] <= REDUNDANT_VIEWS:
             continue
         fine = 0
-        for o in range(obs_at[p], obs_at[p] + n_obs[p]):
-            if obs_kf[o] != keyframe and kf_octave[obs_kf[o], obs_ft[o]] <= kf_octave[keyframe, f] + 1:
+        for o in range(n_obs[p]):
+            if obs_kf[p, o] != keyframe and kf_octave[obs_kf[p, o], obs_ft[p, o]] <= kf_octave[keyframe, f] + 1:
                 fine += 1
         redundant += fine >= REDUNDANT_VIEWS
     return total, redundant

@@ -62,11 +62,6 @@ MAX_TABLE_BYTES = 1 << 30
 """Of all features of a map as tables; two thousand keyframes of a thousand features fill a fifth."""
 MAX_WORDS = 64
 """Words of 64 bits of a descriptor; ORB's has four."""
-_FINITE = ("kf_pose", "kf_raw", "kf_response", "kf_xy", "kf_z", "kf_angle", "kf_info", "kf_info_right", "position",
-           "normal", "far", "submap_start", "submap_anchor")  # fmt: skip
-_NOT_BELOW = {"kf_count": 0, "kf_z": 0, "kf_info": 0, "kf_info_right": 0, "visible": 1, "found": 0, "n_obs": 1,
-              "kf_octave": 0, "obs_kf": 0, "obs_ft": 0, "kf_id": 0, "kf_map": 0, "id": 0,
-              "born": 0, "submap_bound": 0}  # fmt: skip
 
 
 class MapFeatures(Record):
@@ -128,33 +123,25 @@ class SavedMap:
     header: MapHeader
     arrays: Arrays
 
-    def check(self, camera: Camera, features: MapFeatures, sensors: Sensors, where: str) -> None:
+    def check(self, camera: Camera, features: MapFeatures, sensors: Sensors, file: str) -> None:
         """Refuse a map that a system cannot localise in.
 
         Args:
             camera: The system's.
             features: Those that it extracts.
             sensors: ``rgbd`` or ``rgb``.
-            where: The file, for the message.
+            file: For the message.
 
         Raises:
             SettingsError: Names what differs.
         """
-        if self.header.sensors != sensors:
-            raise SettingsError(
-                f"{where} is a map of sensors '{self.header.sensors}', this system has '{sensors}'",
-                "their units of length differ",
-            )
-        if self.header.features != features:
-            raise SettingsError(
-                f"{where} is made of other features ({self.header.features}) than this system's ({features})",
-                "set features.* as they were when the map was made",
-            )
-        own = described(camera)
-        odd = [name for name in own if self.header.camera.get(name) != own[name]]
-        if odd:
-            differs = ", ".join(f"{name} {self.header.camera.get(name)} instead of {own[name]}" for name in odd)
-            raise SettingsError(f"{where} was made with another camera: {differs}")
+        header = self.header
+        saved: dict[str, Any] = {"sensors": header.sensors, **header.features.model_dump(), **header.camera}
+        own = {"sensors": sensors, **features.model_dump(), **described(camera)}
+        differing = [f"{name} {saved.get(name)} instead of {own[name]}" for name in own if saved.get(name) != own[name]]
+        if differing:
+            cure = "localise with the camera, sensors and features that the map was made with"
+            raise SettingsError(f"{file} is a map of {', '.join(differing)}", cure)
 
 
 def described(camera: Camera) -> dict[str, float]:
@@ -208,8 +195,8 @@ def read_map(path: Path) -> SavedMap:
 def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
     """Faults of the arrays of a file that anyone may have written: compiled loops check no index.
 
-    Arrays that are missing, unknown, or of another type or shape; values out of bounds; references that contradict each
-    other. Later checks rely on earlier ones.
+    Arrays that are missing, unknown, or of another type or shape; indices out of bounds; references that contradict
+    each other. Later checks rely on earlier ones. Damage is found by the check sums of the zip file.
     """
     for name in sorted(_LAYOUT.keys() ^ arrays.keys()):
         yield f"it holds no array '{name}'" if name in _LAYOUT else f"it holds an unknown array '{name[:40]}'"
@@ -221,54 +208,34 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
         if array.dtype != np.dtype(kind) or array.ndim != len(axes) or list(array.shape) != expected:
             shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - array.ndim, 0)
             yield f"'{name}' is {array.dtype} of shape {str(array.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
-    for name in _FINITE:
-        if not np.isfinite(arrays[name]).all():
-            yield f"'{name}' holds values that are not finite"
-    most = {"kf_map": len(arrays["submap_bound"]), "kf_octave": header.features.levels - 1,
-            "kf_id": header.next_keyframe - 1, "born": header.next_keyframe - 1, "id": header.next_point - 1,
-            "obs_kf": len(arrays["kf_id"]) - 1}  # fmt: skip
-    for name, least in _NOT_BELOW.items():
-        if not (arrays[name] >= least).all():
-            yield f"'{name}' holds values below {least}"
-        if not (arrays[name] <= most.get(name, np.inf)).all():
-            yield f"'{name}' holds values above {most[name]}"
-    yield from (fault for holds, fault in _contents(arrays) if not holds)
-    yield from (fault for holds, fault in _references(arrays) if not holds)
+    last = {
+        "kf_id": header.next_keyframe - 1, "born": header.next_keyframe - 1, "id": header.next_point - 1,
+        "kf_map": len(arrays["submap_bound"]), "kf_octave": header.features.levels - 1, "kf_count": np.inf,
+        "n_obs": np.inf, "obs_kf": len(arrays["kf_id"]) - 1, "obs_ft": np.inf,
+    }  # fmt: skip
+    for name, most in last.items():
+        if not ((arrays[name] >= 0) & (arrays[name] <= most)).all():
+            yield f"'{name}' holds values below 0 or above {most}"
+    yield from (fault for holds, fault in _checks(arrays) if not holds)
 
 
-def _contents(arrays: Arrays) -> Iterator[tuple[Any, str]]:
-    """What has to hold of values, and the fault if it does not."""
-    yield len(arrays["kf_id"]), "it holds no keyframe"
-    yield (arrays["far"] > 0).all(), "'far' holds values that are not above 0"
-    for name in ("kf_id", "id"):
-        yield (np.diff(arrays[name]) > 0).all(), f"'{name}' is not in ascending order"
-    rotation = arrays["kf_pose"][:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3))
-        right_handed = np.linalg.det(rotation) > 0
-    rigid = (off < 1e-6).all() and right_handed.all() and (arrays["kf_pose"][:, 3] == [0, 0, 0, 1]).all()
-    yield rigid, "'kf_pose' holds what is no rigid transformation"
-    right, z = arrays["kf_right"], arrays["kf_z"]
-    where_depth = np.array_equal(np.isnan(right), z == 0) and not np.isinf(right).any()
-    yield where_depth, "'kf_right' is not known where depth is, and only there"
-
-
-def _references(arrays: Arrays) -> Iterator[tuple[Any, str]]:
-    """A feature observes one point at most, and a keyframe observes a point with one feature."""
+def _checks(arrays: Arrays) -> Iterator[tuple[Any, str]]:
+    """What has to hold of sizes and references, and the fault if it does not."""
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
     yield words <= MAX_WORDS, f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
-    count = arrays["kf_count"]
-    claimed = len(count) * int(count.max(initial=0)) * (64 + 8 * words)  # as tables, as wide as the longest row
-    yield claimed <= MAX_TABLE_BYTES, f"'kf_count' claims tables of {claimed} bytes, at most {MAX_TABLE_BYTES} are made"
-    for name, total in (("kf_count", len(arrays["kf_xy"])), ("n_obs", len(arrays["obs_kf"]))):
-        counts = arrays[name].astype(np.int64)
-        yield (counts <= total).all() and int(counts.sum()) == total, f"'{name}' does not add up to {total}"
+    count, n_obs = arrays["kf_count"], arrays["n_obs"].astype(np.int64)
+    yield len(count) and n_obs.all(), "it holds no keyframe, or a point that none observes"
+    for name, counts, size, held in (
+        ("kf_count", count, 64 + 8 * words, len(arrays["kf_xy"])), ("n_obs", n_obs, 8, len(arrays["obs_kf"]))
+    ):  # fmt: skip
+        claimed = len(counts) * int(counts.max(initial=0)) * size  # as tables, as wide as the longest row
+        yield claimed <= MAX_TABLE_BYTES, f"'{name}' claims tables of {claimed} bytes, more than {MAX_TABLE_BYTES}"
+        yield int(counts.sum()) == held, f"'{name}' does not add up to {held}"
     keyframe, feature = arrays["obs_kf"], arrays["obs_ft"]
     yield (feature < count[keyframe]).all(), "'obs_ft' names features that the keyframe does not have"
-    row = (np.cumsum(count) - count)[keyframe] + feature
-    point = np.repeat(np.arange(len(arrays["id"])), arrays["n_obs"])
+    row, point = (np.cumsum(count) - count)[keyframe] + feature, np.repeat(np.arange(len(n_obs)), n_obs)
     yield len(np.unique(row)) == len(row), "a feature observes two points"
-    once = len(np.unique(point * len(arrays["kf_id"]) + keyframe)) == len(row)
+    once = len(np.unique(point * len(count) + keyframe)) == len(row)
     yield once, "a keyframe observes a point with two features"
 
 

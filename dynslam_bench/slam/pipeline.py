@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.checks import check_frame
 from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
-from dynslam_bench.contracts.filter import DynamicFilter, FilterState, FrameBundle
+from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
@@ -32,13 +32,10 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.slam.backend import BackendResult, RgbdBackend
+from dynslam_bench.slam.backend import RgbdBackend
 
 if TYPE_CHECKING:
     from dynslam_bench.segmentation.schedule import MaskScheduler
-
-STATS = ("matches", "inliers", "map_points", "keyframes", "keyframe", "maps", "loops", "residual_px")
-"""Fields of the back end's result that are diagnostics of a frame."""
 
 
 class CachedStage(Protocol):
@@ -71,31 +68,9 @@ class StageClock:
         if cached is not None:
             cached.hit, cached.saved_s = False, 0.0
         start = time.perf_counter()
-        try:
-            yield
-        finally:
-            elapsed = time.perf_counter() - start + (0.0 if cached is None else cached.saved_s)
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
-
-
-@dataclass(frozen=True, eq=False)
-class CullingResult:
-    """Which keypoints are static, by all filters.
-
-    Attributes:
-        keep: bool ``[N]``; False rows enter neither tracking nor map.
-        weight: float32 ``[N]`` in [0, 1], confidence that a keypoint is static.
-        mask: bool ``[H, W]``, dynamic pixels; None where no filter gives a mask.
-        stats: Every filter's stats, each name with the filter's before it, and how many of the last filters the guard
-            set aside because too few keypoints would be left.
-        image: This frame's image as the flow prepared it; None if no flow ran.
-    """
-
-    keep: NDArray[np.bool_]
-    weight: NDArray[np.float32]
-    mask: NDArray[np.bool_] | None
-    stats: Mapping[str, float]
-    image: Any
+        yield
+        elapsed = time.perf_counter() - start + (0.0 if cached is None else cached.saved_s)
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +131,6 @@ class SlamPipeline:
         self._segmentation: SegmentationSettings | None = getattr(settings, "segmentation", None)
         self._online = OnlineSettings(settings, self._configurable_parts(settings))
         self._cached = dict(cached or {})
-        self._camera: Camera | None = None
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence with the settings that the system was built with."""
@@ -179,9 +153,9 @@ class SlamPipeline:
             TrackerError: `reset` was not called.
             SequenceError: The frame does not fit the camera (see `check_frame`).
         """
-        camera = self._require_reset("track")
+        backend, camera = self._started(), self._camera
         check_frame(frame, camera)
-        if not self._backend.uses_depth:
+        if not backend.uses_depth:
             frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
         clock = StageClock(self._cached)
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -199,9 +173,12 @@ class SlamPipeline:
         z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
         bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
         state = self._filter_state(bundle, camera)
-        static = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave
-        result = self._backend.track(bundle, static.keep, static.weight)  # with mapping and loop closing
-        self._remember(bundle, static, result)
+        static, image = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave
+        result = backend.track(bundle, static.keep, static.weight)  # with mapping and loop closing
+        # the pose of a frame that is not tracked in the root map's world is unknown
+        pose = result.T_world_cam if result.state == backend.state == "ok" else None
+        self._previous = PreviousFrame(bundle, static.keep, image, pose)
+        self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
         timings = clock.seconds | dict(result.timings)
         stats = self._stats(bundle, state, static, result)
         return TrackResult(result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep)
@@ -230,8 +207,14 @@ class SlamPipeline:
             seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
         )
 
-    def _cull(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> CullingResult:
-        """The filters' verdicts in order, as far as the guard lets them; the first that needs the flow starts it."""
+    def _cull(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> tuple[FilterResult, Any]:
+        """Which keypoints are static, by all filters in order; the first that needs the flow starts it.
+
+        Returns:
+            The filters' common verdict. Its stats are every filter's, each name with the filter's before it, and how
+            many of the last filters the guard set aside because too few keypoints would be left. Beside it this
+            frame's image as the flow prepared it, None if no flow ran.
+        """
         image, verdicts = None, []
         stats: dict[str, float] = {}
         for dynamic_filter in self._filters:
@@ -249,7 +232,7 @@ class SlamPipeline:
             weight *= verdict.weight
         masks = [verdict.mask for verdict in used if verdict.mask is not None]
         mask = np.logical_or.reduce(masks) if masks else None
-        return CullingResult(keep, weight, mask, stats | {"guard_undone": float(undone)}, image)
+        return FilterResult(keep, weight, stats | {"guard_undone": float(undone)}, mask), image
 
     def _run_flow(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> Any:
         """Put the flow to the previous image, and the pose that it predicts, into `state`; the prepared image."""
@@ -263,22 +246,15 @@ class SlamPipeline:
             state.T_world_pred = refine_prediction(frame, state)
         return image
 
-    def _remember(self, frame: FrameBundle, static: CullingResult, result: BackendResult) -> None:
-        tracked = result.state == "ok"
-        pose = result.T_world_cam if tracked and self._backend.state == "ok" else None  # in the root map's world
-        self._previous = PreviousFrame(frame, static.keep, static.image, pose)
-        self._keyframe_due = not tracked or result.keyframe
-
     def _stats(
-        self, frame: FrameBundle, state: FilterState, static: CullingResult, result: BackendResult
+        self, frame: FrameBundle, state: FilterState, static: FilterResult, result: TrackResult
     ) -> dict[str, float]:
         """The frame's diagnostics, the same keys on every frame."""
         stats = {
             "keypoints": float(len(frame.xy)),
             "culled": float(np.count_nonzero(~static.keep)),
-            **{name: float(getattr(result, name)) for name in STATS},
+            **{name: float(value) for name, value in result.stats.items()},
             "mask_fraction": 0.0 if static.mask is None else float(static.mask.mean()),
-            "relocalised": float(result.relocalised),
             **static.stats,
         }
         flow_stats = {} if state.flow is None else state.flow.stats
@@ -297,8 +273,7 @@ class SlamPipeline:
         Raises:
             TrackerError: `reset` was never called.
         """
-        self._require_reset("finalize")
-        return self._backend.finalize()
+        return self._started().finalize()
 
     def map_outputs(self) -> MapOutputs:
         """Keyframes and map points, for ``keyframes.csv``, ``map.ply`` and the sheet.
@@ -306,8 +281,7 @@ class SlamPipeline:
         Raises:
             TrackerError: `reset` was never called.
         """
-        self._require_reset("map_outputs")
-        return self._backend.outputs()
+        return self._started().outputs()
 
     def save_map(self, path: Path, made_by: str = "") -> None:
         """Write the map to a file from which a later run may start (setting ``backend.map.file``).
@@ -320,8 +294,7 @@ class SlamPipeline:
             TrackerError: `reset` was never called, there is no map yet, or it is too large for a file.
             DynslamError: The file cannot be written.
         """
-        self._require_reset("save_map")
-        self._backend.save_map(path, made_by)
+        self._started().save_map(path, made_by)
 
     def configure(self, settings: Settings) -> None:
         """Put other values of online settings into force from the next frame on; `reset` undoes it.
@@ -349,10 +322,10 @@ class SlamPipeline:
         if self._segmentation is not None:
             yield "segmentation", lambda segmentation: setattr(self, "_segmentation", segmentation)
 
-    def _require_reset(self, method: str) -> Camera:
-        if self._camera is None:
-            raise TrackerError(f"{method}() was called before reset()")
-        return self._camera
+    def _started(self) -> RgbdBackend:
+        if not hasattr(self, "_camera"):
+            raise TrackerError("the tracker was used before reset()")
+        return self._backend
 
 
 def restore_starved(

@@ -1,35 +1,92 @@
-"""Relocalisation: the initial pose of a frame from keyframes, within what the camera can have moved.
+"""Relocalisation: which keyframes show the place of a frame, its pose there, and whether the place is verified.
 
-Buildings repeat themselves: the next door looks like the last one, and the local map there agrees. The relocalisation
-gate tells such places apart: a camera covers a limited distance in the time, and the images since the last tracked
-frame tell how far it has rotated.
+1. *Rank*: keyframes are scored by the 16-bit substrings of binary descriptors that they share with the frame. Two
+   descriptors of one point differ in few bits, so that some substrings are equal; those of different points seldom
+   share one (multi-index hashing: Norouzi, Punjani and Fleet, 2012). Nothing is trained or downloaded.
+2. *Pose*: descriptors are matched with a candidate's map points; a pose follows by RANSAC over three-point poses.
+3. *Verify*: all points around the candidate are matched. What was mapped there and should be in view has to be seen,
+   unless a mask hides it; a few dozen matches alone fit between places that share a shelf or a poster.
+4. *Uncertainty*: the matches have to determine the pose well; those on one distant poster do not.
+5. *Perceptual aliasing*: the features must not fit a second place, as in buildings with repeated corridors.
+6. *Relocalisation gate*: the pose has to be within what the camera can have moved. Buildings repeat themselves: the
+   next door looks like the last one, and the local map there agrees. A camera covers a limited distance in the time,
+   and the images since the last tracked frame tell how far it has rotated.
+
+The map is read and never changed (but for the index, which is brought up to date).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.features.matching import match_brute_force
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Array, Map, Slots
-from dynslam_bench.slam.place_recognition import (
-    MAX_DISTANCE,
-    RATIO,
-    is_aliased,
-    pnp_poses,
-    pose_uncertainty,
-    top_candidates,
-    verify_place,
+from dynslam_bench.slam.motion_model import pose_covariance
+from dynslam_bench.slam.settings import BackendSettings, TrackingSettings
+from dynslam_bench.slam.tracking import (
+    MIN_MATCHES,
+    InitialPose,
+    Matches,
+    Observations,
+    TrackedFrame,
+    match_map,
+    solve,
 )
-from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import MIN_MATCHES, InitialPose, Observations, PoseCandidate, TrackedFrame
+
+VALUES = 1 << 16
+"""Values of a substring."""
+STRIDE = 4
+"""Every fourth substring is used: the others change the ranking little and cost as much again."""
+CHANGED = 0.25
+"""A keyframe is indexed again when it has gained or lost this share of its points."""
+
+MAX_DISTANCE = 60
+RATIO = 0.85
+"""Largest Hamming distance of a match by descriptor alone, and over that of the second nearest."""
+RANSAC_ITERATIONS = 150
+"""RANSAC samples at most."""
+RANSAC_BATCH = 25
+"""Samples that are evaluated together."""
+PNP_CANDIDATES = 5
+"""Keyframes with the most descriptor matches that RANSAC is tried on."""
+MIN_PNP_INLIERS = 8
+
+AROUND = 10
+"""Keyframes around a place whose points are matched."""
+WIDEN = 2.0
+"""Factor on the search windows: the RANSAC pose rests on few matches."""
+ROUNDS = 6
+"""Matching and fitting are repeated up to so often: a small patch predicts only its own neighbourhood well."""
+
+INNER_SHARE = 0.85
+"""Share of the matches, those nearest their median in the image, that have to determine the pose by themselves."""
+MAX_DILUTION = 0.1
+"""Largest dilution of precision: uncertainty of the position in median depths, with the information of one match."""
+MIN_SPREAD_MATCHES = 12
+"""Matches at least: a half of fewer determines no pose."""
+SPLITS, MAX_SPLIT_SPREAD = 12, 0.01
+"""Random halves of the matches that the pose is fitted to, and the largest spread of these positions, median depths."""
+
+ALIASING_CANDIDATES = 12
+"""Best-ranked keyframes of each submap that are tested for aliasing."""
+ALIASING_SHARE = 0.33
+"""What a second place has to show, as a share of what the first one does. Without repetition it is 0.15 at most, with
+repeated walls 0.4 to 1 (rendered buildings)."""
+SAME_PLACE_DEPTHS, SAME_PLACE_ANGLE = 0.3, np.radians(15.0)
+"""Poses farther apart, in median depths of what is seen, or rotated by more, are two places."""
+MIN_ALIASING_MATCHES = 30
+"""Matches that make a second place."""
 
 CANDIDATES = 10
 """Best-ranked keyframes that are matched feature by feature; bounds the time of a frame."""
@@ -51,6 +108,341 @@ ROTATION_SLACK = np.radians(20.0)
 ROTATION_SLACK_SHARE = 0.75
 """Largest error of the rotation: an angle, and a share of all rotations between images. A camera that moves sideways
 seems to rotate. On four rendered laps none of 4,000 sections of 3 to 30 steps exceeded the share and half the angle."""
+
+
+# ---------------------------------------------------------------------- rank
+
+
+def top_candidates(world: Map, keyframes: Slots, observations: Observations, count: int) -> list[int]:
+    """The keyframes with the highest place-recognition scores.
+
+    Args:
+        world: The map.
+        keyframes: Slots to choose from, ``[S]``.
+        observations: The frame's features.
+        count: How many to choose at most.
+
+    Returns:
+        Slots, best first; of equal scores the newer keyframe. All, in the order given, if there are at most `count`.
+    """
+    if len(keyframes) <= count or not len(observations):
+        return [int(slot) for slot in keyframes[:count]]
+    order = np.lexsort((-world.kf_id[keyframes], -recognition_scores(world, keyframes, observations)))
+    return [int(slot) for slot in keyframes[order[:count]]]
+
+
+def recognition_scores(world: Map, keyframes: Slots, observations: Observations) -> Array:
+    """Place-recognition scores ``[S]`` of keyframes; comparable within one call alone.
+
+    The sum of the weights of the substrings that a keyframe shares with the frame, over the root of its number of
+    points: many points share more by chance. The weight is the logarithm of how much rarer a substring is than all of
+    the frame's together.
+    """
+    _index_substrings(world)
+    query = np.ascontiguousarray(observations.words).view(np.uint16)[:, ::STRIDE].T
+    counts = np.full((len(query), VALUES), -1, np.int64)
+    for position, values in enumerate(query):
+        counts[position, values] = 0
+    indexed = [world.substrings[slot][1] for slot in keyframes.tolist()]
+    for substrings in indexed:
+        _count_shared(substrings, counts)
+    total = np.maximum(counts, 0).sum()
+    weight = np.where(counts > 0, np.log(max(total, 1) / np.maximum(counts, 1)), 0.0)
+    scores = np.array([_sum_weights(substrings, counts, weight) for substrings in indexed])
+    return np.asarray(scores / np.sqrt([max(substrings.shape[1], 1) for substrings in indexed]))
+
+
+def _index_substrings(world: Map) -> None:
+    """Sort the substrings of new keyframes, and of those that have gained or lost many points."""
+    observed = np.count_nonzero(world.kf_point >= 0, axis=1)
+    for slot in np.flatnonzero(world.kf_alive).tolist():
+        keyframe, substrings = world.substrings.get(slot, (-1, np.zeros((0, 0), np.uint16)))
+        new, count = keyframe != world.kf_id[slot], substrings.shape[1]
+        if new or abs(observed[slot] - count) > CHANGED * count:
+            columns = world.kf_words[slot, world.kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE].T
+            world.substrings[slot] = int(world.kf_id[slot]), np.sort(np.ascontiguousarray(columns))
+
+
+@kernel
+def _count_shared(substrings: NDArray[np.uint16], counts: NDArray[np.int64]) -> None:
+    """Count the substrings ``[P, F]`` of a keyframe that are in the frame; those that are not have -1."""
+    for position in range(substrings.shape[0]):
+        for value in substrings[position]:
+            if counts[position, value] >= 0:
+                counts[position, value] += 1
+
+
+@kernel
+def _sum_weights(substrings: NDArray[np.uint16], counts: NDArray[np.int64], weight: NDArray[np.float64]) -> float:
+    score = 0.0
+    for position in range(substrings.shape[0]):
+        for value in substrings[position]:
+            if counts[position, value] > 0:
+                score += weight[position, value]
+    return score
+
+
+# ---------------------------------------------------------------------- pose
+
+
+def match_keyframe(world: Map, keyframe: int, observations: Observations) -> Matches:
+    """Match a frame's features to those of a keyframe that observe map points, by descriptor alone."""
+    point = world.kf_point[keyframe, : world.kf_count[keyframe]]
+    rows = np.flatnonzero(point >= 0)
+    feature, row = match_brute_force(
+        observations.words, world.kf_words[keyframe, rows], max_distance=MAX_DISTANCE, ratio=RATIO
+    )
+    slots = point[rows[row]].astype(np.int64)
+    return Matches(feature, slots, world.position[slots])
+
+
+def ransac_pose(
+    position: Array, xy: Array, info: Array, camera: Camera, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.bool_]] | None:
+    """A pose by RANSAC over three-point poses.
+
+    Args:
+        position: World points ``[N, 3]``, three or more.
+        xy: Undistorted pixels ``[N, 2]``.
+        info: Inverse variances of the pixels ``[N]``.
+        camera: Intrinsics.
+        rng: Draws the samples.
+
+    Returns:
+        The world-to-camera pose with the most inliers and its inliers; None if no sample gave one with four.
+    """
+    n = len(position)
+    best: tuple[Array, NDArray[np.bool_]] | None = None
+    best_count, needed, drawn = 3, RANSAC_ITERATIONS, 0
+    while drawn < min(needed, RANSAC_ITERATIONS):
+        samples = _triples(n, min(RANSAC_BATCH, RANSAC_ITERATIONS - drawn), rng)
+        drawn += len(samples)
+        poses = _three_point_poses(position[samples], xy[samples], camera)
+        if not len(poses):
+            continue
+        local = np.swapaxes(poses[:, :3, :3] @ position.T + poses[:, :3, 3:], 1, 2)
+        chi2 = info * np.square(camera.project(local) - xy).sum(axis=-1)
+        inliers = (local[..., 2] > 0.05) & (chi2 < 2.0 * 5.991)
+        count = np.count_nonzero(inliers, axis=1)
+        most = int(count.argmax())
+        if count[most] > best_count:
+            best, best_count = (poses[most], inliers[most]), int(count[most])
+            needed = int(np.ceil(np.log(0.001) / np.log1p(-(min(best_count / n, 0.999) ** 3)))) + 1
+    return best
+
+
+def _triples(n: int, count: int, rng: np.random.Generator) -> Slots:
+    """So many samples ``[count, 3]`` of three different indices below `n`, all equally likely."""
+    a, b, c = (rng.integers(n - k, size=count) for k in range(3))
+    b += b >= a
+    for other in (np.minimum(a, b), np.maximum(a, b)):
+        c += c >= other
+    return np.stack([a, b, c], axis=1)
+
+
+def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
+    """All poses ``[H, 4, 4]``, world to camera, that fit any of the samples ``[S, 3, 3]`` and ``[S, 3, 2]``."""
+    solutions = [np.zeros((0, 6))]
+    for points, pixels in zip(position, xy, strict=True):
+        try:
+            _, rotations, translations = cv2.solveP3P(points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_AP3P)
+        except cv2.error:  # a degenerate sample, e.g. collinear points
+            continue
+        solutions.append(np.hstack([np.reshape(rotations, (-1, 3)), np.reshape(translations, (-1, 3))]))
+    flat = np.concatenate(solutions)
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    poses = np.tile(np.eye(4), (len(flat), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(flat[:, :3]).as_matrix()
+    poses[:, :3, 3] = flat[:, 3:]
+    return poses
+
+
+def _ransac_place(
+    world: Map,
+    keyframe: int,
+    observations: Observations,
+    matches: Matches,
+    rng: np.random.Generator,
+    min_inliers: int,
+) -> InitialPose | None:
+    """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it."""
+    f = matches.feature
+    ransac = ransac_pose(matches.position, observations.xy[f], observations.info[f], world.camera, rng)
+    if ransac is None or np.count_nonzero(ransac[1]) < min_inliers:
+        return None
+    return InitialPose(ransac[0], matches.select(ransac[1]), keyframe)
+
+
+def pnp_poses(
+    world: Map, keyframes: list[int], observations: Observations, rng: np.random.Generator, min_inliers: int
+) -> Iterator[InitialPose]:
+    """Poses by descriptor matches: a good one at once, the others after all candidates, the best first.
+
+    Args:
+        world: The map.
+        keyframes: Slots to match against; the ones with the most matches are tried first.
+        observations: The frame's features.
+        rng: Draws RANSAC's samples.
+        min_inliers: Inliers that the optimised pose needs.
+    """
+    if len(observations) < min_inliers:
+        return
+    matched = [(match_keyframe(world, keyframe, observations), keyframe) for keyframe in keyframes]
+    matched.sort(key=lambda pair: (-len(pair[0]), -int(world.kf_id[pair[1]])))
+    others: list[InitialPose] = []
+    for matches, keyframe in matched[:PNP_CANDIDATES]:
+        if len(matches) < max(MIN_PNP_INLIERS, min_inliers // 3):
+            break
+        place = _ransac_place(world, keyframe, observations, matches, rng, MIN_PNP_INLIERS)
+        if place is None:
+            continue
+        estimate = solve(world.camera, observations, place.matches, place.T_cam_world)
+        candidate = InitialPose(estimate.T_cam_world, place.matches.select(estimate.inliers), keyframe)
+        if estimate.count >= 2 * min_inliers:
+            yield candidate
+        else:
+            others.append(candidate)
+    yield from sorted(others, key=lambda candidate: -len(candidate.matches))
+
+
+# ---------------------------------------------------------------------- verify
+
+
+def verify_place(
+    world: Map, candidate: InitialPose, observations: Observations, settings: TrackingSettings
+) -> InitialPose:
+    """Match all points around a keyframe, and fit the pose to them, again while that gives more matches.
+
+    Args:
+        world: The map.
+        candidate: A pose, the matches that agree on it, and the keyframe.
+        observations: The frame's features.
+        settings: Radius and descriptor distances.
+    """
+    keyframe, matches, points = (
+        candidate.keyframe,
+        candidate.matches,
+        world.points_of(around(world, candidate.keyframe)),
+    )
+    estimate = solve(world.camera, observations, matches, candidate.T_cam_world)
+    for _ in range(ROUNDS):
+        before = len(matches)
+        more, _ = match_map(world, observations, estimate.T_cam_world, matches, points, settings, WIDEN)
+        joined = matches.joined(more)
+        estimate = solve(world.camera, observations, joined, estimate.T_cam_world)
+        matches = joined.select(estimate.inliers)
+        if len(matches) <= before:
+            break
+    own = world.kf_point[keyframe]
+    in_view, uv, *_ = world.project(estimate.T_cam_world, own[own >= 0].astype(np.int64))
+    if observations.mask is not None:  # the distortion is less than what masks are dilated by
+        height, width = observations.mask.shape
+        column, row = np.rint(uv).astype(np.int64).T
+        in_view = in_view[~observations.mask[row.clip(0, height - 1), column.clip(0, width - 1)]]
+    share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
+    depth = float(np.median(se3.transform(estimate.T_cam_world, matches.position)[:, 2])) if len(matches) else np.nan
+    return InitialPose(estimate.T_cam_world, matches, keyframe, share, depth)
+
+
+def recognise_place(
+    world: Map,
+    keyframe: int,
+    observations: Observations,
+    settings: TrackingSettings,
+    rng: np.random.Generator,
+    min_matches: int,
+    min_inliers: int,
+) -> InitialPose | None:
+    """The verified pose at a keyframe's place; None with too few matches by descriptor or inliers of RANSAC."""
+    matches = match_keyframe(world, keyframe, observations)
+    if len(matches) < min_matches:
+        return None
+    candidate = _ransac_place(world, keyframe, observations, matches, rng, min_inliers)
+    return None if candidate is None else verify_place(world, candidate, observations, settings)
+
+
+def pose_uncertainty(world: Map, observations: Observations, place: InitialPose, rng: np.random.Generator) -> float:
+    """How badly the matches determine the pose, e.g. those on one distant poster; up to 1 is precise enough.
+
+    The number of matches says nothing of that: errors of the map are common to all of them. So they have to be well
+    spread, and any half has to give the pose, so that a few far off the others do not settle it.
+
+    Args:
+        world: The map.
+        observations: The frame's features.
+        place: The place, with matches and pose.
+        rng: Draws the halves.
+    """
+    matches, T_cam_world = place.matches, place.T_cam_world
+    xy, count = observations.xy[matches.feature], len(matches)
+    if count < MIN_SPREAD_MATCHES:
+        return np.inf
+    off = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
+    inner = solve(world.camera, observations, matches.select(off <= np.quantile(off, INNER_SHARE)), T_cam_world)
+    if inner.count < MIN_SPREAD_MATCHES // 2:
+        return np.inf
+    covariance = pose_covariance(inner.T_cam_world, inner.information, inner.count)
+    dilution = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    halves = [matches.select(rng.permutation(count) < count // 2) for _ in range(SPLITS)]
+    poses = np.array([solve(world.camera, observations, half, T_cam_world).T_cam_world for half in halves])
+    centres = se3.inverse(poses)[:, :3, 3]
+    spread = np.sqrt(np.square(centres - np.median(centres, axis=0)).sum(axis=1).mean())
+    worst = float(max(dilution / MAX_DILUTION, spread / MAX_SPLIT_SPREAD) / place.depth)
+    return worst if np.isfinite(worst) else np.inf
+
+
+def around(world: Map, keyframe: int) -> Slots:
+    """Slots of a keyframe, first, and of those that share most points with it."""
+    near, _ = world.covisible(keyframe)
+    return np.concatenate([[keyframe], near[:AROUND]]).astype(np.int64)
+
+
+# ---------------------------------------------------------------------- perceptual aliasing
+
+
+def contradict(one: InitialPose, other: InitialPose) -> bool:
+    """Whether a frame cannot have been taken at both places."""
+    between = one.T_cam_world @ se3.inverse(other.T_cam_world)
+    far = np.linalg.norm(between[:3, 3]) > SAME_PLACE_DEPTHS * max(one.depth, other.depth)
+    return bool(far or se3.rotation_angle(between) > SAME_PLACE_ANGLE)
+
+
+def is_aliased(
+    world: Map,
+    observations: Observations,
+    hypotheses: Mapping[int, InitialPose],
+    keyframes: Slots,
+    settings: TrackingSettings,
+    seed: int,
+    possible: Callable[[int, Array], bool] = lambda _, __: True,
+) -> bool:
+    """Whether a frame's features fit two places of one submap.
+
+    Args:
+        world: The map.
+        observations: The features.
+        hypotheses: The frame's pose by submap, as far as it is known.
+        keyframes: Slots of the keyframes whose places may be others.
+        settings: Of tracking.
+        seed: Founds RANSAC's draws.
+        possible: Whether the frame can have been taken in a submap at a world-to-camera pose.
+    """
+    min_share = ALIASING_SHARE * max(place.share for place in hypotheses.values())
+    for submap in np.unique(world.kf_map[keyframes]).tolist():
+        places = [hypotheses[submap]] if submap in hypotheses else []
+        slots = keyframes[world.kf_map[keyframes] == submap]
+        for slot in top_candidates(world, slots, observations, ALIASING_CANDIDATES):
+            rng = stream(seed, "lookalikes", int(world.kf_id[slot]))
+            least = MIN_ALIASING_MATCHES // 2, MIN_ALIASING_MATCHES // 3
+            other = recognise_place(world, slot, observations, settings, rng, *least)
+            if other is None or len(other.matches) < MIN_ALIASING_MATCHES or other.share < min_share:
+                continue
+            if not possible(submap, other.T_cam_world):
+                continue
+            if any(contradict(place, other) for place in places):
+                return True
+            places.append(other)
+    return False
 
 
 # ---------------------------------------------------------------------- the relocalisation gate
@@ -224,7 +616,6 @@ class PoseSearch:
     """The search of keyframes for the initial pose of one frame; it reads the map and never changes it.
 
     Attributes:
-        world: The maps.
         observations: The frame's features.
         reference: Slot of the keyframe that shares most points with the last tracked frame.
         keyframes: Slots of the candidate keyframes.
@@ -235,7 +626,6 @@ class PoseSearch:
         frame: Index of the frame.
     """
 
-    world: Map
     observations: Observations
     reference: int
     keyframes: Slots
@@ -245,7 +635,7 @@ class PoseSearch:
     seed: int
     frame: int
 
-    def relocalised(self, weak: PoseCandidate | None) -> InitialPose | None:
+    def relocalised(self, weak: InitialPose | None) -> InitialPose | None:
         """The pose from keyframes.
 
         A pose from the last frame that few matches agree on, as by chance after a gap or a sudden rotation, competes
@@ -259,50 +649,45 @@ class PoseSearch:
             return self._relocalise(MIN_MATCHES)
         if self.lost:
             return self._verified(weak) or self._relocalise(MIN_MATCHES)
-        pose = self._relocalise(weak.estimate.count + 1)
-        if pose is None and self._within_bound(weak):
-            return weak.initial_pose(relocalised=False)
-        return pose
+        pose = self._relocalise(len(weak.matches) + 1)
+        return weak if pose is None and self._within_bound(weak) else pose
 
     def in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
-        pose = replace(self, keyframes=self.world.submap(0), lost=True)._relocalise(MIN_MATCHES)
+        pose = replace(self, keyframes=self.bound.atlas.world.submap(0), lost=True)._relocalise(MIN_MATCHES)
         return pose if pose and len(pose.matches) >= self.settings.relocalisation.min_inliers else None
 
     def _relocalise(self, min_inliers: int) -> InitialPose | None:
         """A pose by descriptors: from the reference keyframe, else from the best-ranked candidates."""
-        world, rng = self.world, stream(self.seed, "relocalisation", self.frame)
+        world, rng = self.bound.atlas.world, stream(self.seed, "relocalisation", self.frame)
         least = self.settings.tracking.min_inliers
         if not self.lost:
             for candidate in pnp_poses(world, [self.reference], self.observations, rng, least):
-                if candidate.estimate.count >= min_inliers and self._within_bound(candidate):
-                    return candidate.initial_pose(relocalised=True)
+                if len(candidate.matches) >= min_inliers and self._within_bound(candidate):
+                    return candidate
         keyframes = top_candidates(world, self.keyframes, self.observations, CANDIDATES)
         candidates = pnp_poses(world, keyframes, self.observations, rng, least)
-        verified = (self._verified(one) for one in candidates if one.estimate.count >= min_inliers)
+        verified = (self._verified(one) for one in candidates if len(one.matches) >= min_inliers)
         return next((pose for pose in verified if pose is not None), None)
 
-    def _verified(self, candidate: PoseCandidate) -> InitialPose | None:
+    def _verified(self, candidate: InitialPose) -> InitialPose | None:
         """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
-        world, observations, s = self.world, self.observations, self.settings
+        world, observations, s = self.bound.atlas.world, self.observations, self.settings
         submap, admits = int(world.kf_map[candidate.keyframe]), self.bound.admits
-        if not admits(submap, candidate.estimate.T_cam_world):
+        if not admits(submap, candidate.T_cam_world):
             return None
-        inliers = candidate.matches.select(candidate.estimate.inliers)
-        place = verify_place(
-            world, candidate.keyframe, observations, inliers, candidate.estimate.T_cam_world, s.tracking
-        )
+        place = verify_place(world, candidate, observations, s.tracking)
         factor = MANY_POINTS_SHARE if len(place.matches) >= MANY_POINTS else 1.0
         if place.share < factor * s.relocalisation.min_share:
             return None
         uncertainty = 0.0
         if self.lost:
             uncertainty = pose_uncertainty(world, observations, place, stream(self.seed, "halves", self.frame))
-            candidates = {submap: place.hypothesis}, self.keyframes
+            candidates = {submap: place}, self.keyframes
             if uncertainty > 1 or is_aliased(world, observations, *candidates, s.tracking, self.seed, admits):
                 return None
-        return InitialPose(place.T_cam_world, place.matches, candidate.keyframe, True, place.share, uncertainty)
+        return replace(place, uncertainty=uncertainty)
 
-    def _within_bound(self, candidate: PoseCandidate) -> bool:
+    def _within_bound(self, candidate: InitialPose) -> bool:
         """Whether the camera can be at a pose in the map where it was tracked last."""
-        return self.bound.admits(self.bound.atlas.active, candidate.estimate.T_cam_world)
+        return self.bound.admits(self.bound.atlas.active, candidate.T_cam_world)

@@ -181,26 +181,6 @@ class Matches:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseCandidate:
-    """A pose, the matches that it was fitted to, and a keyframe nearby.
-
-    Attributes:
-        keyframe: Slot of the keyframe that is matched, or else of the last frame's reference.
-        matches: The matches.
-        estimate: The pose and its inliers among the matches.
-    """
-
-    keyframe: int
-    matches: Matches
-    estimate: PoseEstimate
-
-    def initial_pose(self, *, relocalised: bool) -> InitialPose:
-        """The pose with the matches that are inliers."""
-        pose, inliers = self.estimate.T_cam_world, self.matches.select(self.estimate.inliers)
-        return InitialPose(pose, inliers, self.keyframe, relocalised)
-
-
-@dataclass(frozen=True, eq=False)
 class InitialPose:
     """A pose that enough matches agree on.
 
@@ -208,17 +188,19 @@ class InitialPose:
         T_cam_world: World-to-camera pose.
         matches: The matches that agree.
         keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's reference.
+        share: Which share of the keyframe's own points, in view and behind no mask, is matched; NaN if not verified.
+        depth: Median depth of the matches' points; NaN if not verified.
+        uncertainty: `relocalisation.pose_uncertainty`; NaN if not verified.
         relocalised: Whether it comes from a keyframe, or the camera was lost before.
-        share: Which share of the keyframe's points in view is seen; NaN if not verified.
-        uncertainty: `place_recognition.pose_uncertainty`; NaN if not verified.
     """
 
     T_cam_world: Array
     matches: Matches
     keyframe: int
-    relocalised: bool
     share: float = np.nan
+    depth: float = np.nan
     uncertainty: float = np.nan
+    relocalised: bool = True
 
 
 def pose_from_last_frame(
@@ -228,7 +210,7 @@ def pose_from_last_frame(
     prediction: Array,
     reference: int,
     settings: TrackingSettings,
-) -> tuple[PoseCandidate | None, bool]:
+) -> tuple[InitialPose | None, bool]:
     """The best pose from the last frame, and whether it is trusted; each search is wider than the one before.
 
     Args:
@@ -240,7 +222,7 @@ def pose_from_last_frame(
         settings: Radius and descriptor distance.
     """
     close_m = CLOSE_BASELINES * world.camera.baseline_m
-    best: PoseCandidate | None = None
+    best: InitialPose | None = None
     for widen, depth_m, enough in (
         (1.0, 0.0, ENOUGH_MAPPED),
         (1.0, close_m, ENOUGH_MATCHES),
@@ -248,11 +230,11 @@ def pose_from_last_frame(
     ):
         radius = widen * settings.radius_px
         matches = match_last_frame(world, last, observations, prediction, radius, depth_m, settings.max_distance)
-        if len(matches.feature) < enough:
+        if len(matches) < enough:
             continue
         estimate = solve(world.camera, observations, matches, prediction, rounds=3)
-        if estimate.count >= MIN_MATCHES and (best is None or estimate.count > best.estimate.count):
-            best = PoseCandidate(reference, matches, estimate)
+        if estimate.count >= MIN_MATCHES and (best is None or estimate.count > len(best.matches)):
+            best = InitialPose(estimate.T_cam_world, matches.select(estimate.inliers), reference, relocalised=False)
         if best is not None and estimate.count >= max(TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)):
             return best, True
     return best, False
@@ -286,9 +268,8 @@ def match_last_frame(
     mapped = from_map[rows]
     position = world.position[last.point[rows]]
     unmapped = rows[~mapped]
-    if len(unmapped):
-        local = camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
-        position[~mapped] = se3.transform(se3.inverse(last.T_cam_world), local)
+    local = camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
+    position[~mapped] = se3.transform(se3.inverse(last.T_cam_world), local)
     local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     uv, inside = camera.view(local, MARGIN_PX)
     rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
@@ -436,8 +417,6 @@ class LocalMap:
         self._world = world
         self._connected_only = connected_only
         self._computed_for: tuple[int, int] | None = None
-        self._keyframes: Slots = np.zeros(0, np.int64)
-        self._points: Slots = np.zeros(0, np.int64)
 
     def around(self, reference: int) -> tuple[Slots, Slots]:
         """Slots of the keyframes around one, oldest first, and slots of the points to match there."""

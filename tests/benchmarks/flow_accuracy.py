@@ -117,7 +117,7 @@ def dense_table(budgets: Sequence[int]) -> None:
         result = dense.flow(dense.prepare(gray[0]), dense.prepare(gray[1]))
         star = " (default)" if each == DenseFlowSettings() else ""
         name = f"DAISY Filter Flow, {each.search}, {each.budget}{star}"
-        row(name, result.flow, result.valid, result.stats["evaluations"])
+        row(name, result.flow, result.valid, result.evaluations)
 
 
 def main() -> None:

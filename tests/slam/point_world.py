@@ -1,6 +1,7 @@
 """A simulated world of points with known descriptors, seen by a camera with a depth sensor; back ends that track it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -96,11 +97,12 @@ def make_backend(world, *, monocular=False, seed=0, **overrides):
 
 
 def track_all(backend, frames, keeps=None):
-    """Track frames in order; all features are kept unless told otherwise."""
+    """Track frames in order; all features are kept unless told otherwise. Results have their stats as attributes."""
     results = []
     for i, frame in enumerate(frames):
         keep = np.ones(len(frame), bool) if keeps is None else keeps[i]
-        results.append(backend.track(frame, keep, np.ones(len(frame), np.float32)))
+        result = backend.track(frame, keep, np.ones(len(frame), np.float32))
+        results.append(SimpleNamespace(**vars(result), **result.stats))
     return results
 
 

@@ -8,9 +8,8 @@ import pytest
 from point_world import PointWorld, errors, make_backend, observed, states, track_all, without_depth
 
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam import keyframes
-from dynslam_bench.slam.motion_model import MAX_GAP_S
-from dynslam_bench.slam.rolling_shutter import CameraVelocity, compensate_rolling_shutter
+from dynslam_bench.slam import map as slam_map
+from dynslam_bench.slam.motion_model import MAX_GAP_S, CameraVelocity, compensate_rolling_shutter
 
 COUNTS = ("matches", "inliers", "residual_px", "relocalised", "keyframe", "map_points", "keyframes")
 
@@ -240,7 +239,7 @@ def test_both_ends_of_a_range_give_other_results(room, name, ends, frames, other
 
 
 def test_filters_see_the_newest_keyframes_and_all_points(room, monkeypatch):
-    monkeypatch.setattr(keyframes, "VIEWS", 10)
+    monkeypatch.setattr(slam_map, "VIEWS", 10)
     backend = make_backend(room, keyframes__tracked_share=1.0, keyframes__redundant_share=1.0)
     track_all(backend, [replace(room.see(p, i), depth=np.ones((480, 640), np.float32))
                         for i, p in enumerate(room.path(40))])  # fmt: skip

@@ -13,11 +13,12 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Map
-from dynslam_bench.slam.place_recognition import (
+from dynslam_bench.slam.relocalisation import (
     CHANGED,
     STRIDE,
-    PlaceHypothesis,
-    PlaceMatch,
+    RelocalisationGate,
+    RotationEstimate,
+    contradict,
     is_aliased,
     match_keyframe,
     pose_uncertainty,
@@ -26,9 +27,8 @@ from dynslam_bench.slam.place_recognition import (
     top_candidates,
     verify_place,
 )
-from dynslam_bench.slam.relocalisation import RelocalisationGate, RotationEstimate
 from dynslam_bench.slam.settings import TrackingSettings
-from dynslam_bench.slam.tracking import TrackedFrame, solve
+from dynslam_bench.slam.tracking import InitialPose, TrackedFrame, solve
 
 STEP = 0.15
 QUARTER = round((4.0 + np.pi / 2) / STEP)
@@ -84,12 +84,12 @@ def test_perceptual_aliasing(alike, aliased):
     backend, tracking, _ = run(world, [*range(2 * QUARTER)])
     lap = world.lap(2 * QUARTER, STEP)
     observations = observed(world.see(lap[10], 999), world.camera)
-    here = PlaceHypothesis(se3.inverse(lap[10]) @ lap[0], 1.0, 3.0)
+    here = InitialPose(se3.inverse(lap[10]) @ lap[0], None, 0, share=1.0, depth=3.0)
     everywhere = backend.world.keyframes
     assert (tracking == "ok").all()
     assert is_aliased(backend.world, observations, {0: here}, everywhere, settings, 0) is aliased
     assert not is_aliased(backend.world, observations, {0: here}, everywhere[:4], settings, 0)
-    near = lambda submap, T_cam_world: not here.contradicts(PlaceHypothesis(T_cam_world, 1.0, 3.0))  # noqa: E731
+    near = lambda submap, pose: not contradict(here, InitialPose(pose, None, 0, depth=3.0))  # noqa: E731
     assert not is_aliased(backend.world, observations, {0: here}, everywhere, settings, 0, near)
 
 
@@ -172,7 +172,7 @@ def verified(backend, observations, patch, T_cam_world):
     every = match_keyframe(backend.world, 0, observations)
     few = every.select(patch(observations.xy[every.feature]))
     assert 8 <= len(few) < len(every) / 4
-    return verify_place(backend.world, 0, observations, few, T_cam_world, TrackingSettings())
+    return verify_place(backend.world, InitialPose(T_cam_world, few, 0), observations, TrackingSettings())
 
 
 def test_a_pose_grows_from_a_patch():
@@ -214,7 +214,9 @@ def test_one_patch_does_not_determine_the_pose_nor_do_a_few_matches_beside_it(ha
     patch, beside_it = rng.permutation(np.flatnonzero(off < half)), rng.permutation(np.flatnonzero(off > 150))
     few = every.select(np.sort(np.concatenate([patch[: 80 - beside], beside_it[:beside]])))
     fitted = solve(room.camera, observations, few, se3.inverse(pose))
-    place = PlaceMatch(fitted.T_cam_world, few.select(fitted.inliers), 0.5)
+    few = few.select(fitted.inliers)
+    depth = np.median(se3.transform(fitted.T_cam_world, few.position)[:, 2])
+    place = InitialPose(fitted.T_cam_world, few, 0, depth=float(depth))
     assert len(place.matches) > 60
     assert (pose_uncertainty(backend.world, observations, place, np.random.default_rng(0)) <= 1) == precise
 
@@ -225,9 +227,8 @@ def test_a_few_matches_determine_no_pose(count):
     frame = room.see(FIRST, 1)
     observations = observed(frame, room.camera)
     few = match_keyframe(backend.world, 0, observations).select(np.arange(count))
-    assert (
-        pose_uncertainty(backend.world, observations, PlaceMatch(FIRST, few, 1.0), np.random.default_rng(0)) == np.inf
-    )
+    place = InitialPose(FIRST, few, 0)
+    assert pose_uncertainty(backend.world, observations, place, np.random.default_rng(0)) == np.inf
 
 
 CAMERA = Camera(640, 480, 535.0, 539.0, 320.0, 247.0)
@@ -269,9 +270,8 @@ def test_coarse_features_may_be_farther_off():
 
 
 def test_too_few_or_degenerate_points_give_no_pose():
-    for count in (0, 3):
-        world, xy, _ = true_and_false_matches(0, count, count)
-        assert ransac_pose(world, xy, np.ones(count), CAMERA, np.random.default_rng(0)) is None
+    world, xy, _ = true_and_false_matches(0, 3, 3)
+    assert ransac_pose(world, xy, np.ones(3), CAMERA, np.random.default_rng(0)) is None
     same = np.tile([[0.3, -0.2, 2.0]], (30, 1))
     line = np.linspace([-1.0, 0.0, 3.0], [1.0, 0.0, 3.0], 30)
     for world in (same, line):
