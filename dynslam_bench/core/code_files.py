@@ -14,9 +14,11 @@ from pathlib import Path
 
 CODE = (".py", ".so", ".pyd", ".dylib", ".dll")
 _TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".yml", ".toml", ".json", ".cfg", ".ini",
-         ".xml")  # fmt: skip
+         ".xml", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp")  # fmt: skip
 _LARGEST_TEXT = 1 << 20
 _WORD = re.compile(rb"[\w./~+\-]+")
+_QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
+"""A text in quotes that could be a path, of which the first part is taken."""
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
 _SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
 _STORE = ("index.sqlite", "sequences", "latest")
@@ -58,8 +60,9 @@ def program_files(folder: Path) -> list[Path]:
     """The files below a folder that decide what its code does.
 
     These are all code files, and each other file of which the name, or its end with a dot in it, is written in one of
-    the text files among them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``, ``f"{name}_v2.yaml"``. Hidden folders,
-    virtual environments, results folders and recordings are left out.
+    the text files among them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``, ``f"{name}_v2.yaml"``. So are all
+    files of a folder whose name a Python source quotes: ``glob("weights/*")``. Hidden folders, virtual environments,
+    results folders and recordings are left out.
 
     Args:
         folder: For example that of a plug-in's file.
@@ -69,7 +72,9 @@ def program_files(folder: Path) -> list[Path]:
     """
     everything = list(files_below(folder))
     code = [file for file in everything if is_code(file)]
-    return code + _named(code, [file for file in everything if not is_code(file)])
+    quoted = {name.decode() for file in filter(is_python, code) for name in _QUOTED.findall(file.read_bytes())}
+    sure = [file for file in everything if file in set(code) or file.relative_to(folder).parts[0] in quoted]
+    return sure + _named(sure, [file for file in everything if file not in set(sure)])
 
 
 def imported_modules(files: Iterable[Path]) -> set[str]:

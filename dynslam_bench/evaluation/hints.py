@@ -265,9 +265,9 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
 
 
 def _jitter(positions: Array, order: int) -> float:
-    """Standard deviation of white noise, per axis, that differences of some order show; metres, 0 if there are few."""
+    """Standard deviation of white noise, per axis, that differences of some order show; metres, nan of few."""
     if len(positions) < 30:
-        return 0.0
+        return float("nan")
     return float(np.median(np.abs(np.diff(positions, order, axis=0))) / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 

@@ -173,12 +173,12 @@ class RunIndex:
 
 
 def file_stamp(file: str | Path) -> str:
-    """Time (nanoseconds) and size (bytes) of a file; ``-`` where there is none."""
+    """Times of content and inode (nanoseconds) and size (bytes) of a file; ``-`` where there is none."""
     try:
         status = os.stat(file)  # noqa: PTH116 - a hundred thousand of them: pathlib takes twice as long
     except OSError:
         return "-"
-    return f"{status.st_mtime_ns},{status.st_size}"
+    return f"{status.st_mtime_ns},{status.st_ctime_ns},{status.st_size}"
 
 
 def check_plain(folder: Path, root: Path) -> None:

@@ -838,7 +838,8 @@ def _axes(X: Array, alike: float, stated: Match) -> Finding:
 def _turn(R_body_cam: Array) -> str:
     """The rotation that gives a truth the camera's axes; one within 20 degrees of swapped axes is written as such."""
     swapped = np.round(R_body_cam)
-    near = not np.array_equal(swapped, np.eye(3)) and np.trace(swapped.T @ R_body_cam) > 1 + 2 * np.cos(np.radians(20))
+    is_rotation = np.array_equal(swapped @ swapped.T, np.eye(3)) and not np.array_equal(swapped, np.eye(3))
+    near = is_rotation and np.trace(swapped.T @ R_body_cam) > 1 + 2 * np.cos(np.radians(20))
     rows = [", ".join(f"{value:g}" for value in row) for row in (swapped if near else R_body_cam.round(3)) + 0.0]
     return "; ".join(rows)
 

@@ -19,6 +19,7 @@ PLUGIN = """
 from pathlib import Path
 from dynslam_bench.contracts.tracker import TrackerSpec
 PARAMETERS = Path(__file__).parent / "params" / "slam.yaml"
+LAYERS = sorted(Path(__file__).parent.glob("weights/*"))
 SPEC = TrackerSpec("mine", f"{__file__}:build", "mine")
 def build(settings):
     import helper
@@ -91,6 +92,7 @@ def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
         "helper.py": "def make(text):\n    return 1  # a note\n",
         "params/slam.yaml": "threshold: 1\nweights: net.bin\n",
         "params/net.bin": "1111",
+        "weights/layer0": "3333",
         "notes.md": "nothing reads this",
         "results/runs/x/slam.yaml": "an output",
         "results/index.sqlite": "an output",
@@ -107,6 +109,7 @@ def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
         ("helper.py", "return 1", "return 2"),
         ("params/slam.yaml", ": 1", ": 2"),
         ("params/net.bin", "1111", "2222"),
+        ("weights/layer0", "3333", "4444"),
     ],
 )
 def test_a_changed_plug_in_is_another_run(file: str, old: str, new: str, tmp_path: Path) -> None:

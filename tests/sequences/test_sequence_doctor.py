@@ -18,7 +18,7 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences import PreprocessingSettings, open_sequence
 from dynslam_bench.sequences.calibration import Window, adjust, calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
-from dynslam_bench.sequences.doctor import Diagnosis, Finding, diagnose, examine, stretches, truth_findings
+from dynslam_bench.sequences.doctor import Diagnosis, Finding, _turn, diagnose, examine, stretches, truth_findings
 from dynslam_bench.sequences.preprocessing import Preprocessed
 from dynslam_bench.sequences.rgbd_motion import READINGS, read_as, rgbd_pairs
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
@@ -178,6 +178,14 @@ def test_the_cure_of_turned_axes_is_their_inverse(diagnosed):
     rows = re.search(r"\[(.*)\]", finding.cure).group(1).split(";")
     cure = np.array([[float(value) for value in row.split(",")] for row in rows])
     np.testing.assert_allclose(BODY[:3, :3] @ cure, np.eye(3), atol=0.02)
+
+
+@pytest.mark.parametrize("angle", [30, 40, 50, 85])
+def test_the_cure_of_turned_axes_is_a_rotation(angle):
+    R, _ = cv2.Rodrigues(np.array([np.radians(angle), 0, 0]))
+    rows = re.search(r"\[(.*)\]", _turn(R)).group(1).split(";")
+    cure = np.array([[float(value) for value in row.split(",")] for row in rows])
+    np.testing.assert_allclose(cure @ cure.T, np.eye(3), atol=0.005)
 
 
 def test_stretches_cover_a_short_recording_and_sample_a_long_one():
