@@ -301,7 +301,10 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
             f"{name}, has {numbers}"
         )
     if ratio.ratio >= 1:
-        return Verdict.WORSE, f"the settings matter, but the best, {name}, is not better than the baseline: {numbers}"
+        text = f"the best, {name}, is not better than the baseline: {numbers}"
+        if p_value is None:
+            return Verdict.NOT_JUDGED, f"{text}; one trial or one scene cannot tell whether settings matter"
+        return Verdict.WORSE, f"the settings matter, but {text}"
     more = f"about {ratio.missing} more scene{'s' * (ratio.missing != 1)} would settle it"
     return Verdict.PROMISING, f"{name} has perhaps {gain}: {numbers}; {unsettled}, {more}"
 
@@ -403,20 +406,25 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
         raise StudyError(f"study '{spec.name}' has no finished trial", "run it first, or see why its trials failed")
     is_rival = tuner.baseline.tracker != spec.tracker  # then trial 0, the default settings, is a candidate too
     best = [trial for trial in finished if trial.number > 0 or is_rival][: spec.top]
-    candidates, shipped = [_candidate(trial) for trial in best], dict[str, Ratio]()
+    margin, shipped = spec.ate_margin if spec.at_equal_accuracy else None, dict[str, Ratio]()
+    candidates = [
+        Candidate(trial=trial.number, params=trial.params, values=list(trial.values or ()), ate_margin=margin)
+        for trial in best
+    ]
     if best and design.confirm:
         numbers = " and ".join(str(trial.number) for trial in best)
         note(
             f"the baseline and trial{'s' * (len(best) > 1)} {numbers} on {len(design.confirm)} instances that no trial "
             "has seen"
         )
-        candidates, shipped = _confirm(tuner, best, jobs)
+    candidates = _judge(tuner, "confirm", candidates, jobs, shipped)
     candidates.sort(key=lambda candidate: (candidate.bound, bool(candidate.failed), not candidate.feasible))
     picks = _picks(spec, candidates)
     for place, candidate in enumerate(candidates):
         if design.confirm and not candidate.failed and (place == 0 or candidate.trial in picks.values()):
             note(f"trial {candidate.trial} on the held-out instances")
-            candidates[place] = _judge(tuner, candidate, jobs, shipped)
+            for split in ("held_out", "recorded"):
+                (candidates[place],) = _judge(tuner, split, [candidates[place]], jobs, shipped)
     ratios = scene_ratios(tuner.study)
     p_value, notes = spread_test(list(ratios.values())), list(design.notes)
     reasons = [trial.user_attrs.get("reason", "") for trial in tuner.study.get_trials(states=(TrialState.FAIL,))]
@@ -447,69 +455,38 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
     return summary
 
 
-def _candidate(trial: FrozenTrial, **more: Any) -> Candidate:
-    return Candidate(trial=trial.number, params=trial.params, values=list(trial.values or ()), **more)
-
-
-def _beside(
-    tuner: Study, settings: Sequence[Mapping[str, Any]], instances: Sequence[ProblemInstance], jobs: int
-) -> tuple[Outcomes, list[Outcomes | InstanceFailedError], Outcomes | None]:
-    """Outcomes of the baseline, of settings of the study's tracker, and of the shipped default if that is another.
+def _judge(
+    tuner: Study, split: str, candidates: Sequence[Candidate], jobs: int, shipped: dict[str, Ratio]
+) -> list[Candidate]:
+    """Candidates beside the baseline on the instances of a split; `shipped` gains the shipped default's ratio there.
 
     Raises:
         StudyError: The baseline fails.
     """
-    configurations = [tuner.baseline, *(Configuration(tuner.spec.tracker, {**tuner.held, **one}) for one in settings)]
-    configurations += [] if tuner.shipped is None else [tuner.shipped]
-    baseline, *others = tuner.evaluate_beside(configurations, instances, jobs=jobs)
+    instances: tuple[ProblemInstance, ...] = getattr(tuner.design, split)
+    if not instances or not candidates:
+        return list(candidates)
+    objective = ACCURACY if split == "recorded" else together(tuner.objectives)
+    tuned = [Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params}) for candidate in candidates]
+    default = [] if tuner.shipped is None else [tuner.shipped]
+    baseline, *runs = tuner.evaluate_beside([tuner.baseline, *tuned, *default], instances, jobs=jobs)
     if isinstance(baseline, InstanceFailedError):
         raise StudyError(f"the baseline fails: {baseline.args[0]}", "a study needs one that runs")
-    shipped = None if tuner.shipped is None else others.pop()
-    return baseline, list(others), None if isinstance(shipped, InstanceFailedError) else shipped
-
-
-def _confirm(tuner: Study, trials: Sequence[FrozenTrial], jobs: int) -> tuple[list[Candidate], dict[str, Ratio]]:
-    """Trials' settings on the instances for the choice, and the shipped default there if it is not the baseline."""
-    baseline, repeated, shipped = _beside(tuner, [trial.params for trial in trials], tuner.design.confirm, jobs)
-    objective, candidates = together(tuner.objectives), []
-    for trial, outcomes in zip(trials, repeated, strict=True):
-        if isinstance(outcomes, InstanceFailedError):
-            candidates.append(_candidate(trial, failed=str(outcomes), feasible=False))
-            continue
-        candidates.append(
-            _candidate(
-                trial,
-                confirm=compared(outcomes, baseline, objective=objective, candidates=len(trials)),
-                on_confirm=_accuracy_and_speed(outcomes, baseline),
-                ate_margin=tuner.spec.ate_margin if tuner.spec.at_equal_accuracy else None,
-                frame_ms=_frame_ms(outcomes),
-                baseline_frame_ms=_frame_ms(baseline),
-                feasible=all(value <= 0 for value in violations(tuner.spec, outcomes).values()),
-            )
-        )
-    return candidates, {} if shipped is None else {"confirm": compared(shipped, baseline, objective=objective)}
-
-
-def _judge(tuner: Study, candidate: Candidate, jobs: int, shipped: dict[str, Ratio]) -> Candidate:
-    """The candidate on the held-out instances and on recordings; `shipped` gains the shipped default's ratio there."""
-    update: dict[str, Any] = {}
-    for split, instances in (("held_out", tuner.design.held_out), ("recorded", tuner.design.recorded)):
-        if not instances:
-            continue
-        baseline, (tuned,), default = _beside(tuner, [candidate.params], instances, jobs)
-        if isinstance(tuned, InstanceFailedError):
-            return candidate.model_copy(update={"failed": str(tuned), "feasible": False})
-        objective = ACCURACY if split == "recorded" else together(tuner.objectives)
-        update[split] = compared(tuned, baseline, objective=objective)
-        if split == "held_out":
-            update["on_held_out"] = _accuracy_and_speed(tuned, baseline)
-        if default is not None:
-            shipped[split] = compared(default, baseline, objective=objective)
-    return candidate.model_copy(update=update)
-
-
-def _accuracy_and_speed(outcomes: Outcomes, baseline: Outcomes) -> dict[str, Ratio]:
-    return {objective.name: compared(outcomes, baseline, objective=objective) for objective in (ACCURACY, SPEED)}
+    if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
+        shipped[split] = compared(outcomes, baseline, objective=objective)
+    judged = []
+    for candidate, outcomes in zip(candidates, runs, strict=True):
+        update: dict[str, Any] = {"failed": str(outcomes), "feasible": False}
+        if not isinstance(outcomes, InstanceFailedError):
+            update = {split: compared(outcomes, baseline, objective=objective, candidates=len(candidates))}
+            if split != "recorded":
+                both = (ACCURACY, SPEED)
+                update[f"on_{split}"] = {one.name: compared(outcomes, baseline, objective=one) for one in both}
+            if split == "confirm":
+                update |= {"frame_ms": _frame_ms(outcomes), "baseline_frame_ms": _frame_ms(baseline)}
+                update["feasible"] = all(value <= 0 for value in violations(tuner.spec, outcomes).values())
+        judged.append(candidate.model_copy(update=update))
+    return judged
 
 
 def _picks(spec: StudySpec, candidates: Sequence[Candidate]) -> dict[str, int | None]:

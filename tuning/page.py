@@ -14,6 +14,7 @@ import optuna
 import plotly.graph_objects as go
 from optuna.trial import TrialState
 
+from dynslam_bench.core.reading import read_text
 from dynslam_bench.core.records import write_atomic
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.core.toml import setting_text
@@ -27,7 +28,7 @@ from dynslam_bench.reports.model.names import name_columns
 from dynslam_bench.reports.model.row import SEEN, command_line, grouped
 from dynslam_bench.reports.tables.leaderboard import run_link
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
-from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict, preset_text, worth
+from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict, worth
 from dynslam_bench.tuning.objectives import held_protocol
 from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
@@ -179,7 +180,7 @@ def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]
     shown, best = Block("table", table=settings), summary.best
     if best is None:
         return [shown]
-    text = preset_text(tuner, best.params, summary.conclusion, status=summary.verdict.value)
+    text = read_text(tuner.folder / "best.toml")
     if summary.verdict != Verdict.PROVEN:
         return [shown, Block("code", title=f"best.toml, not recommended: {summary.verdict.value}", text=text)]
     command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"

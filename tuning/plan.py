@@ -168,22 +168,31 @@ class Preview(Record):
     include: list[str]
 
     @property
-    def lines(self) -> list[str]:
-        """The same for people."""
+    def figures(self) -> list[str]:
+        """What the scenes could show and how long it takes, for people."""
         source = f"{self.runs} stored runs of the baseline" if self.runs else "other trackers' runs, none is stored yet"
         needed = f"A gain of {100 * GAIN:.0f} % takes {self.needed} scenes to show"
         shown = f"the {self.scenes} that judge this study show {100 * self.detectable:.0f} %"
         if self.scenes < FEWEST_SCENES:
             shown = f"{self.scenes} can judge this study, and below {FEWEST_SCENES} it claims nothing"
-        lines = [
+        return [
             f"{needed}; {shown} (spread {self.spread:.2f} over scenes, from {source}).",
             f"The study takes about {max(1, math.ceil(self.minutes))} min if no trial is pruned.",
         ]
-        lines += [f"{name} is not used here: {why}." for name, why in self.unused.items()]
+
+    @property
+    def proposal(self) -> list[str]:
+        """The settings that are not used here, and the space without them; it takes runs of the baseline to know."""
+        lines = [f"{name} is not used here: {why}." for name, why in self.unused.items()]
         if self.unused:
-            left = f"The space without them: include = {self.include}"
-            lines.append(left.replace("'", '"') if self.include else "Nothing would be left of the space without them.")
+            left = f"The space without them: include = {self.include}".replace("'", '"')
+            lines.append(left if self.include else "Nothing would be left of the space without them.")
         return lines
+
+    @property
+    def lines(self) -> list[str]:
+        """Both."""
+        return [*self.figures, *self.proposal]
 
 
 class Plan:
@@ -233,10 +242,6 @@ class Plan:
         starting_point({}, self.space, self.base)
         self.design = design_of(spec, accept=accept)
 
-    def run_options(self) -> dict[str, object]:
-        """Fields of `RunSpec` that all runs of the study share."""
-        return {"threads": self.spec.threads, "cache": self.spec.cache, "data_root": self.spec.data_root}
-
     def preview(self, jobs: int = 1) -> Preview:
         """What the study could show, from the baseline's stored runs where there are some."""
         design, spec = self.design, self.spec
@@ -258,9 +263,9 @@ class Plan:
 
     def _stored(self, instance: ProblemInstance) -> RunRecord | None:
         """The baseline's run on an instance, if it is stored and came to its end."""
-        tracker, settings = self.baseline
-        run = resolve(instance.run_spec(tracker, settings=dict(settings), **self.run_options()))
-        record = self.store.get(run.run_id)
+        (tracker, settings), spec = self.baseline, self.spec
+        how = {"threads": spec.threads, "cache": spec.cache, "data_root": spec.data_root}
+        record = self.store.get(resolve(instance.run_spec(tracker, settings=dict(settings), **how)).run_id)
         return None if record is None or record.failed or record.status == "stopped" else record
 
     def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:

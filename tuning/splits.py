@@ -30,7 +30,7 @@ from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, further_
 
 FEWEST_STARTS = 3
 """The baseline runs from so many starts at every place: all trials would share the luck of a single one."""
-CONFIRM_SCENES = 12
+CONFIRM_SCENES = 18
 """Scenes at least that are made for the choice; half as many as to tune on where that is more."""
 RECORDED_FRAMES, RECORDED_STARTS = 120, 4
 

@@ -239,7 +239,7 @@ class Study(Plan):
             StudyError: The baseline fails; says where and why.
         """
         missing = [instance for instance in self.design.reference if instance not in self._reference]
-        if on_event is not None:
+        if on_event is not None and missing:
             on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
         with self._ending_all():
             try:
@@ -602,7 +602,10 @@ def run_study(
         tuner.extend(scenes=scenes, trials=trials)
     tuner.on_run = on_run
     if on_event is not None and not tuner.study.get_trials(deepcopy=False)[1:]:
-        for line in tuner.preview(jobs).lines:
+        for line in tuner.preview(jobs).figures:
+            on_event(StudyEvent("preview", 0, tuner.trials, line))
+        tuner.reference(on_event, jobs)
+        for line in tuner.preview(jobs).proposal:
             on_event(StudyEvent("preview", 0, tuner.trials, line))
     tuner.run(jobs=jobs, on_event=on_event)
     return tuner

@@ -111,7 +111,7 @@ def parse_instances(
     """Read one text of a study file.
 
     ``[A:B]`` takes a part of any sequence, ``?frames=N`` its first N frames (a rendered one is made that long).
-    ``?scene=0-19`` names scenes of a rendered one (``@0-19`` is read as well), ``noise=SEED`` a draw of its noise.
+    ``?scene=0-19`` names scenes of a rendered one, ``noise=SEED`` a draw of its noise.
     ``scene``, ``offsets`` and ``seeds`` are numbers and ranges (``0-4,7``), ``degrade`` strengths
     (``blur:0.5,glare:0.2``), ``stride`` a step between frames.
 
@@ -133,9 +133,6 @@ def parse_instances(
         raise StudyError(f"'{text}' names no instances", _FORM)
     name, query = match["name"], match["query"] or ""
     rendered = name.startswith("synthetic/")
-    if rendered and "@" in name:
-        name, _, numbers = name.partition("@")
-        query = f"scene={numbers}&{query}".rstrip("&")
     options = _options(query, text)
     try:
         frames = None if match["frames"] in (None, ":") else parse_frames(match["frames"])

@@ -69,7 +69,7 @@ class SimulatedTuner(Study):
     def __init__(
         self, spec: StudySpec, results: Path, *, effect: Effect = nothing, seed: int = 0, in_memory: bool = True
     ) -> None:
-        self.effect, self.noise_seed, self.runs = effect, seed, 0
+        self.effect, self.noise_seed, self._made = effect, seed, set[tuple[str, ProblemInstance]]()
         with (
             _PATCHING,
             patch.multiple(
@@ -80,6 +80,11 @@ class SimulatedTuner(Study):
             patch("dynslam_bench.tuning.plan.design_of", simulated_design),
         ):
             super().__init__(spec, results)
+
+    @property
+    def runs(self) -> int:
+        """How many runs were made; the store makes none twice."""
+        return len(self._made)
 
     def extend(self, **more: int) -> None:
         with _PATCHING, patch("dynslam_bench.tuning.study.design_of", simulated_design):
@@ -97,14 +102,14 @@ class SimulatedTuner(Study):
         jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
-        self.runs += len(instances)
+        who = digest({**self.base, **settings})
+        self._made |= {(who, instance) for instance in instances}
         return {
-            instance: Outcome(instance, "", self._error(settings, instance), 1.0, 0.03, 0.03, 1.0)
+            instance: Outcome(instance, "", self._error(who, settings, instance), 1.0, 0.03, 0.03, 1.0)
             for instance in instances
         }
 
-    def _error(self, settings: Mapping[str, Any], instance: ProblemInstance) -> float:
-        who = digest(dict(settings))
+    def _error(self, who: str, settings: Mapping[str, Any], instance: ProblemInstance) -> float:
         scene = stream(self.noise_seed, "scene", instance.scene).normal(0, 0.5)
         own = stream(self.noise_seed, "own", who, instance.scene).normal(0, SCENES_SD / math.sqrt(2))
         start = stream(self.noise_seed, "start", who, str(instance)).normal(0, STARTS_SD / math.sqrt(2))

@@ -31,7 +31,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dynslam_bench.tuning.plan.design_of", lambda spec, accept: design)
     for name in ("outcomes", "_identify", "_error"):
         monkeypatch.setattr(Study, name, getattr(SimulatedTuner, name), raising=False)
-    for name, value in {"effect": staticmethod(valley), "noise_seed": 0, "runs": 0}.items():
+    for name, value in {"effect": staticmethod(valley), "noise_seed": 0, "_made": set()}.items():
         monkeypatch.setattr(Study, name, value, raising=False)
 
 

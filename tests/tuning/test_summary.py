@@ -110,6 +110,7 @@ def accuracy(bound: float) -> dict[str, Ratio]:
         ({"confirm": LUCKY, "held_out": WIDE}, None, [], Verdict.PROMISING, "perhaps"),
         ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.001, [], Verdict.WORSE, "is not better"),
         ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.24, [], Verdict.NO_MATTER, "p = 0.24"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, None, [], Verdict.NOT_JUDGED, "cannot tell"),
         ({"held_out": Ratio(ratio=1.5, low=1.1, high=2, n=8, sequences=4)}, 0.5, [], Verdict.WORSE, "50.0 % more ATE"),
         ({"recorded": Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)}, 0.5, [], Verdict.WORSE, "recordings"),
         ({"feasible": False}, 0.5, [], Verdict.WORSE, "constraint"),
