@@ -152,7 +152,9 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
             spec = study_on(8, pruner=pruner, trials=24, sampler="tpe", sampler_seed=seed)
             tuner = simulated.SimulatedTuner(spec, folder / f"{pruner}-{seed}", effect=simulated.valley, seed=seed)
             trials = tuner.run().study.get_trials(deepcopy=False)
-            runs.append(sum(len(trial.user_attrs["instances"]) for trial in trials))  # the baseline's too, as in `plain`
+            runs.append(
+                sum(len(trial.user_attrs["instances"]) for trial in trials)
+            )  # the baseline's too, as in `plain`
             ours.append(simulated.valley(finish(tuner).best.params))
             others.append(simulated.valley(plain(tuner, seed, runs[-1])))
         yield line(pruner, mean(ours), mean(others), round(np.mean(runs)))
