@@ -124,7 +124,7 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
 
 
 def best_power(design: Any, gain: float) -> float:
-    """How often a z-test with the variances known tells a gain from nothing, with a false claim in 800 (5 % x 2.5 %)."""
+    """How often a z-test of known variances tells a gain from nothing, with a false claim in 800 (5 % x 2.5 %)."""
     import simulated
 
     from dynslam_bench.tuning.study_file import scenes
