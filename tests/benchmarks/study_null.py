@@ -67,7 +67,7 @@ def null(studies: int, folder: Path) -> Iterable[str]:
                 chosen += summary.best is not None and summary.best.chosen
                 said[summary.verdict.value] += 1
             shares = [count / studies for count in (lucky, chosen, *(said[name] for name in verdicts))]
-            yield line(scenes, simulated.STARTS_SD, *shares)
+            yield line(scenes, str(simulated.STARTS_SD), *shares)
 
 
 def planted(settings: Mapping[str, Any]) -> float:
