@@ -103,6 +103,7 @@ def accuracy(bound: float) -> dict[str, Ratio]:
         ({}, 0.5, [], Verdict.PROVEN, "25.0 % less ATE: ATE x 0.750 [0.600, 0.900] on 6 scenes"),
         ({}, 0.5, ["same"], Verdict.PROMISING, "not apart"),
         ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "upper bound 1.200"),
+        ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "about 62 more scenes would settle it"),
         ({"held_out": WIDE}, 0.5, [], Verdict.PROMISING, "about 60 more scenes would settle it"),
         ({"held_out": None}, 0.5, [], Verdict.PROMISING, "fewer than 3 held-out scenes"),
         ({"confirm": LUCKY, "held_out": WIDE}, 0.5, [], Verdict.NO_MATTER, "p = 0.50"),
