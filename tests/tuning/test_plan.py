@@ -15,7 +15,7 @@ from simulated import SimulatedTuner, make_spec, valley
 
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.core.toml import read_settings
-from dynslam_bench.tuning import Plan, StudyEvent, StudySpec, Verdict, finish, read_preset_text, run_study, write_page
+from dynslam_bench.tuning import Plan, StudySpec, Verdict, finish, read_preset_text, run_study, write_page
 from dynslam_bench.tuning.storage import EARLIER, best_trials, importances
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
@@ -61,22 +61,6 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     preview = plan.preview()
     assert {name.split(".")[0] for name in preview.unused} == {"epipolar"}
     assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.lines[-1]
-
-
-def test_a_study_says_before_its_trials_that_nothing_of_its_space_is_used(tmp_path: Path) -> None:
-    spec = StudySpec(
-        name="s", tracker="emfoa-oft?masks=none", recorded=(), offsets=(0,), trials=2, min_coverage=None,
-        tune=("synthetic/sitting_static?scene=0&frames=8",), confirm=("synthetic/sitting_static?scene=1-3&frames=8",),
-        space={"include": ["epipolar.threshold_px"]},
-    )  # fmt: skip
-    events: list[StudyEvent] = []
-    tuner = run_study(spec, results=tmp_path, on_event=events.append)
-    kinds, texts = [event.kind for event in events], [event.text for event in events]
-    last = max(index for index, text in enumerate(texts) if text.startswith("Nothing would be left of the space"))
-    assert kinds.index("reference") < last < kinds.index("started"), "it takes the baseline's runs to know"
-    summary = finish(tuner)
-    assert summary.best is not None and summary.best.confirm is not None and summary.best.confirm.ratio == 1
-    assert summary.verdict in (Verdict.NO_MATTER, Verdict.NOT_JUDGED)
 
 
 def test_ratios_are_to_the_baseline_and_the_default_stands_beside(folders: list[str], tmp_path: Path) -> None:
@@ -204,29 +188,6 @@ def test_a_pruned_trial_is_a_preset_too(folders: list[str], tmp_path: Path) -> N
     assert trial.state == TrialState.PRUNED and trial.params == {"gain": 3.0}
     text = read_preset_text(spec, tmp_path, trial=1)
     assert "gain = 3.0" in text and 'status = "not judged"' in text
-
-
-def test_one_scene_claims_nothing(folders: list[str], tmp_path: Path) -> None:
-    """The best setting has an error of none on the one scene that is there, against 50 %."""
-    spec = make(folders, trials=2, start=[{"gain": 1.0}], confirm=[], held_out=[], tune=[f"{folders[0]}[0:6]"])
-    tuner = run_study(spec, results=tmp_path)
-    summary = finish(tuner)
-    assert summary.verdict == Verdict.NOT_JUDGED and "1 scene only" in summary.conclusion
-    whole = run_study(spec.model_copy(update={"name": "whole", "tune": tuple(folders[:1])}), results=tmp_path)
-    assert "no frames are left to confirm" in finish(whole).conclusion
-    assert "0 can judge this study" in whole.preview().lines[0] and "claims nothing" in tuner.preview().lines[0]
-    assert write_page(whole, finish(whole)).is_file()
-
-
-def test_scenes_with_more_starts_weigh_no_more(folders: list[str], tmp_path: Path) -> None:
-    """A trial fails on no scene, whatever its length; each counts once."""
-    tune = [f"{folders[0]}?offsets=0-4", f"{folders[1]}[2:8]", f"{folders[2]}?stride=2&offsets=0,1"]
-    tuner = run_study(make(folders, tune=tune, confirm=folders[3:6], held_out=folders[6:]), results=tmp_path)
-    for trial in tuner.study.get_trials():
-        ratios = trial.user_attrs["scenes"].values()
-        assert len(ratios) == 3 and trial.value == pytest.approx(sum(ratios) / 3)
-    summary = finish(tuner)
-    assert summary.candidates[0].confirm is not None and summary.candidates[0].confirm.sequences == 3
 
 
 def test_a_baseline_that_crashes_is_one_clear_line(folders: list[str], tmp_path: Path) -> None:
