@@ -1,4 +1,7 @@
-"""Reference pages that are made of the code: its docstrings, settings, command line, trackers and protocols."""
+"""Reference pages that are made of the code: its docstrings, settings, command line, trackers and protocols.
+
+python .ci/site/generated.py      # write those of docs/reference/ again
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import inspect
 import itertools
 import re
 import textwrap
+from pathlib import Path
 
 from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.settings import Settings, flatten, settings_table
@@ -41,17 +45,26 @@ PACKAGES = {
 HEADER = ("sequence", "m", "system", "input", "alignment", "protocol", "hardware", "source", "read")
 """Columns of a table of published errors."""
 
+MADE = "<!-- Made by python .ci/site/generated.py -->\n\n"
+"""First line of a page that the repository holds; it is not edited by hand."""
+
 MANY = 6
 """More trackers than this that share a group of settings are counted, not named."""
 
 
 def reference_pages() -> dict[str, str]:
-    """Markdown of every page below ``reference/``, by its path on the site."""
+    """Markdown of the pages that the repository holds, by their path below ``docs/``."""
     pages = {"settings": settings(), "commands": commands(), "systems": systems(), "protocols": protocols()}
     pages |= {"columns": columns(), "published": published()}
-    for name, (title, modules) in PACKAGES.items():
-        pages[f"python/{name}"] = f"# {title}\n\n" + "".join(f"## {m}\n\n::: dynslam_bench.{m}\n\n" for m in modules)
-    return {f"reference/{name}.md": text for name, text in pages.items()}
+    return {f"reference/{name}.md": MADE + text.strip() + "\n" for name, text in pages.items()}
+
+
+def docstring_pages() -> dict[str, str]:
+    """Markdown of the pages of docstrings, which only the site shows, by their path on it."""
+    return {
+        f"reference/python/{name}.md": f"# {title}\n\n" + "".join(f"## {m}\n\n::: dynslam_bench.{m}\n\n" for m in modules)
+        for name, (title, modules) in PACKAGES.items()
+    }
 
 
 def settings() -> str:
@@ -203,3 +216,8 @@ def _held_by(trackers: list[str]) -> str:
     if len(trackers) > MANY:
         return f"{len(trackers)} [systems](systems.md) have it."
     return "Systems that have it: " + ", ".join(f"[`{name}`](systems.md#{slug(name)})" for name in trackers) + "."
+
+
+if __name__ == "__main__":
+    for page, text in reference_pages().items():
+        (Path(__file__).resolve().parents[2] / "docs" / page).write_text(text, encoding="utf-8")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
-from generated import reference_pages  # noqa: E402
+from generated import docstring_pages  # noqa: E402
 from mkdocs.plugins import event_priority  # noqa: E402
 from mkdocs.structure.files import File  # noqa: E402
 
@@ -56,10 +56,10 @@ def _stage(source: Path, target: Path) -> None:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages of the top level, those that the code gives, and what pages link to outside of `docs/`."""
+    """Add the pages of the top level, those of docstrings, and what pages link to outside of `docs/`."""
     for page, source in ELSEWHERE.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
-    for page, text in reference_pages().items():
+    for page, text in docstring_pages().items():
         files.append(File.generated(config, page, content=text))
     for source in sorted({path for file in files.documentation_pages() for path in _outside(file)}):
         files.append(File.generated(config, f"files/{source.as_posix()}", abs_src_path=str(ROOT / source)))

@@ -15,9 +15,10 @@ CELLS = re.compile(r"(?<!\\)\|")
 
 
 def user_pages() -> list[Path]:
-    """The pages that are written for users, top level and `docs/`."""
+    """The pages that are written for users, top level and `docs/`; not those made of the code."""
     pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-    return sorted(page for page in pages if not set(page.relative_to(ROOT).parts[1:-1]) & set(NOTES))
+    written = [page for page in pages if not page.read_text(encoding="utf-8").startswith("<!-- Made by ")]
+    return sorted(page for page in written if not set(page.relative_to(ROOT).parts[1:-1]) & set(NOTES))
 
 
 def paragraphs(text: str) -> list[str]:
