@@ -1,0 +1,54 @@
+// The board: categories, selection, search, sort and columns, all in the address.
+function startBoard() {
+  const tables = new Map();
+  const view = address.read();
+  const selected = new Set((view.get("select") ?? "").split(".").filter(Boolean)), panel = () => select("[data-panel]").find((each) => !each.hidden);
+
+  /** The table of a category, made when it is first shown. */
+  function tableOf(place) {
+    if (tables.has(place)) return tables.get(place);
+    const element = place.querySelector("table"), paging = element.rows.length > 60;
+    const made = sortable(element, {
+      paging, pageLength: 50, orderFixed: [0, "asc"],
+      layout: { ...TABLE.layout, topStart: { buttons: [{ extend: "colvis", text: "Columns", columns: ":gt(1)" }] }, topEnd: "search", bottomEnd: paging ? "paging" : null },
+      columnDefs: [{ targets: 0, visible: false }, { targets: [".n", 2], type: "number" }],
+      search: { search: view.get("q") ?? "" },
+    });
+    made.columns((view.get("hide") ?? "").split(".").filter(Boolean).map(Number)).visible(false);
+    const [at, way] = (view.get("sort") ?? "").split(".");
+    if (way) made.order([+at, way]).draw();
+    made.on("search", () => address.write({ q: made.search() }));
+    made.on("order", () => address.write({ sort: made.order().filter(([column, to]) => column && to).map(([column, to]) => `${column}.${to}`)[0] ?? "" }));
+    made.on("column-visibility", () => address.write({ hide: made.columns().indexes().toArray().filter((column) => column && !made.column(column).visible()).join(".") }));
+    tables.set(place, made.on("draw", ticks));
+    return made;
+  }
+
+  function showTab(name) {
+    const tab = select("[data-tab]").find((each) => each.dataset.tab === name) ?? select("[data-tab]")[0];
+    select("[data-tab]").forEach((each) => each.setAttribute("aria-selected", each === tab));
+    select("[data-panel]").forEach((each) => { each.hidden = each.dataset.panel !== tab.dataset.tab; });
+    document.querySelector(".headline").textContent = panel().querySelector("table").dataset.sentence;
+    tableOf(panel());
+    ticks();
+  }
+
+  function ticks() {
+    select("td input").forEach((box) => { box.checked = selected.has(box.value); });
+    const button = byId("compare");
+    button.disabled = selected.size !== 2;
+    button.textContent = selected.size === 2 ? "Compare selected" : `Select two to compare (${selected.size})`;
+  }
+
+  select("[data-tab]").forEach((tab) => { tab.onclick = () => { showTab(tab.dataset.tab); address.write({ tab: tab === select("[data-tab]")[0] ? "" : tab.dataset.tab }); }; });
+  document.addEventListener("change", ({ target }) => {
+    if (!target.matches("table.board input")) return;
+    target.checked ? selected.add(target.value) : selected.delete(target.value);
+    address.write({ select: [...selected].join(".") });
+    ticks();
+  });
+  byId("compare").onclick = () => { const [a, b] = selected; location.href = `compare.html#a=${a}&b=${b}`; };
+  byId("copy-link").onclick = ({ target }) => navigator.clipboard.writeText(location.href).then(() => { target.textContent = "Link copied"; });
+  showTab(view.get("tab"));
+}
+startBoard();

@@ -1,0 +1,91 @@
+// What all pages share: the theme, figures, sortable tables, data beside the page, the view in the address.
+"use strict";
+const byId = (id) => document.getElementById(id);
+const select = (selector, from = document) => [...from.querySelectorAll(selector)];
+
+function make(tag, properties = {}, ...children) {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.append(...children);
+  return element;
+}
+
+// -- the view in the address: #anchor&name=value
+const address = {
+  read() { return new URLSearchParams(location.hash.slice(1)); },
+  write(changes) {
+    const view = address.read();
+    for (const [name, value] of Object.entries(changes)) value === "" || value === null ? view.delete(name) : view.set(name, value);
+    history.replaceState(null, "", `#${view.toString().replace(/=(?=&|$)/g, "")}`);
+  },
+};
+
+// -- data that lie beside the page: a page in a folder may load scripts, but no JSON
+const loading = {}, loaded = {};
+function keep(name, value) { loaded[name](value); }
+function side(name) {
+  loading[name] ??= new Promise((done, fail) => {
+    loaded[name] = done;
+    document.head.append(make("script", { src: `data/${name}.js`, onerror: () => fail(new Error(`data/${name}.js is missing beside this page.`)) }));
+  });
+  return loading[name];
+}
+
+// -- figures in the page's theme
+const drawn = new Map();
+const scheme = () => document.documentElement.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+
+async function draw(element, figure) {
+  drawn.set(element, figure);
+  const layout = { ...figure.layout, template: THEMES[scheme()], autosize: true };
+  if (element.clientWidth < 500) layout.font = { size: 10 };
+  if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: -0.3, yanchor: "top", ...layout.legend };
+  const options = { format: "png", scale: 2, filename: element.id };
+  await Plotly.react(element, figure.data, layout, { responsive: true, displaylogo: false, toImageButtonOptions: options });
+}
+
+/** The figures of the page, each when it comes into sight. */
+function drawFigures() {
+  const sight = new IntersectionObserver((entries) => entries.filter((entry) => entry.isIntersecting).forEach(({ target }) => {
+    sight.unobserve(target);
+    draw(target, FIGURES[target.id]);
+  }), { rootMargin: "300px" });
+  select(".figure").filter((element) => FIGURES[element.id]).forEach((element) => sight.observe(element));
+  for (const place of select(".save")) {
+    for (const format of ["png", "svg"]) {
+      const save = () => Plotly.downloadImage(byId(place.dataset.figure), { format, scale: 2, filename: place.dataset.figure });
+      place.append(make("button", { type: "button", textContent: format.toUpperCase(), onclick: save }));
+    }
+  }
+}
+
+function startTheme() {
+  const button = byId("theme"), themes = ["", "light", "dark"], names = { "": "◐ Auto", light: "☀ Light", dark: "☾ Dark" };
+  const show = (theme) => {
+    document.documentElement.dataset.theme = theme;
+    document.documentElement.classList.toggle("dark", scheme() === "dark"); // DataTables' own switch
+    button.textContent = names[theme];
+    drawn.forEach((figure, element) => element.isConnected && draw(element, figure));
+  };
+  let theme = localStorage.getItem("theme") ?? "";
+  button.onclick = () => {
+    theme = themes[(themes.indexOf(theme) + 1) % 3];
+    localStorage.setItem("theme", theme);
+    show(theme);
+  };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => show(theme));
+  show(theme);
+}
+
+// -- tables: what is missing stays last, a third click restores the order
+const last = (way) => (a, b) => (a === "" || b === "" ? (a === "") - (b === "") : way * (a - b));
+Object.assign(DataTable.ext.type.order, { "number-asc": last(1), "number-desc": last(-1) });
+const TABLE = { paging: false, info: false, autoWidth: false, order: [], layout: { topStart: null, topEnd: null, bottomStart: null, bottomEnd: null } };
+
+function sortable(table, options = {}) {
+  return new DataTable(table, { ...TABLE, columnDefs: [{ targets: ".n", type: "number", className: "n" }], ...options });
+}
+
+startTheme();
+select("table.sorts").forEach((table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {}));
+addEventListener("DOMContentLoaded", drawFigures);
+addEventListener("beforeprint", () => select("details").forEach((fold) => { fold.open = true; }));

@@ -1,1 +1,0 @@
-keep("looks-0b5ba5b9179550e4",{"looks":[{"index":169,"image":"frames/5c6b2da4d248adf9/172.webp","error_mm":3.3631},{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":0.77929},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":1.1493}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-1d4cd6db892a34c0",{"looks":[{"index":156,"image":"frames/5c6b2da4d248adf9/159.webp","error_mm":8.8325},{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":1.3196},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":4.4614}],"stored":false});

@@ -1,1 +1,0 @@
-keep("looks-686fa662d0e8635a",{"looks":[{"index":130,"image":"frames/5c6b2da4d248adf9/133.webp","error_mm":5.3851},{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":1.3043},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":2.4705}],"stored":false});

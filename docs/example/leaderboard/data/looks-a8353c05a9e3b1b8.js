@@ -1,1 +1,0 @@
-keep("looks-a8353c05a9e3b1b8",{"looks":[{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":1.0261},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":1.4183}],"stored":false});

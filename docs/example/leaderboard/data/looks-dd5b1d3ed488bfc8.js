@@ -1,1 +1,0 @@
-keep("looks-dd5b1d3ed488bfc8",{"looks":[{"index":183,"image":"frames/5c6b2da4d248adf9/186.webp","error_mm":0.91277},{"index":196,"image":"frames/5c6b2da4d248adf9/199.webp","error_mm":1.1391}],"stored":false});
