@@ -61,10 +61,11 @@ def reference_pages() -> dict[str, str]:
 
 def docstring_pages() -> dict[str, str]:
     """Markdown of the pages of docstrings, which only the site shows, by their path on it."""
-    return {
-        f"reference/python/{name}.md": f"# {title}\n\n" + "".join(f"## {m}\n\n::: dynslam_bench.{m}\n\n" for m in modules)
-        for name, (title, modules) in PACKAGES.items()
-    }
+    pages = {}
+    for name, (title, modules) in PACKAGES.items():
+        sections = [f"## {module}\n\n::: dynslam_bench.{module}\n\n" for module in modules]
+        pages[f"reference/python/{name}.md"] = f"# {title}\n\n" + "".join(sections)
+    return pages
 
 
 def settings() -> str:
