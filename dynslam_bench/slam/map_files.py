@@ -221,6 +221,8 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
 
 def _checks(arrays: Arrays) -> Iterator[tuple[Any, str]]:
     """What has to hold of sizes and references, and the fault if it does not."""
+    for name in ("kf_pose", "kf_xy", "kf_z", "position", "normal", "far"):
+        yield np.isfinite(arrays[name]).all(), f"'{name}' holds values that are not finite"
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
     yield words <= MAX_WORDS, f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
     count, n_obs = arrays["kf_count"], arrays["n_obs"].astype(np.int64)

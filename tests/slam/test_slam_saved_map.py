@@ -139,6 +139,7 @@ def with_two_features(arrays):
 
 
 FAULTS = [
+    (put("position", 0, np.nan), "'position' holds values that are not finite"),
     (twice, "two points"),
     (with_two_features, "with two features"),
     (put("obs_ft", 0, 30000), "features that the keyframe does not have"),
