@@ -9,7 +9,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("dynslam_bench", "envs", "tuning", "reports")
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    page
+    for page in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+    if not page.read_text(encoding="utf-8").startswith("<!-- Made by ")
+]
+"""All pages but those that are made of the code."""
 SUFFIXES = r"(?:py|toml|md|jsonl|json|csv|txt|html|png|mp4|ply|yml|yaml|xz|tex)"
 
 

@@ -29,9 +29,11 @@ def pattern(tmp_path_factory):
 
 @pytest.fixture
 def store(pattern, tmp_path):
-    """A copy of it with the times of its files."""
+    """A copy of it, and the rows of a first report on the copy."""
     shutil.copytree(pattern.root, tmp_path / "results", symlinks=True)
-    return RunStore(tmp_path / "results")
+    copy = RunStore(tmp_path / "results")
+    rows_of(copy)
+    return copy
 
 
 @pytest.fixture
