@@ -371,10 +371,11 @@ def test_ordinary_paths_do_not(name: str, sigma_m: float) -> None:
         assert found.metrics["ape_rot_rmse_deg"] < 10
 
 
-def test_the_uncertainty_is_that_of_repetition() -> None:
-    """Where errors are small, it is the spread of the rotations that independent errors give."""
-    truth = straight(0.1)
-    fits = [align(disturbed(truth, 0.005, seed, frames=1.0), truth, "se3") for seed in range(40)]
+@pytest.mark.parametrize("frames", [300, 20])
+def test_the_uncertainty_is_that_of_repetition(frames: int) -> None:
+    """Where errors are small, it is the spread of the rotations that independent errors give; of short paths, too."""
+    truth = straight(0.1, frames)
+    fits = [align(disturbed(truth, 0.005, seed, frames=0.5), truth, "se3") for seed in range(40)]
     turned = se3.with_rotation(np.tile(np.eye(4), (len(fits), 1, 1)), np.array([fit.rotation for fit in fits]))
     spread = np.sqrt((np.rad2deg(se3.rotation_angle(turned)) ** 2).mean())
     assert 0.6 * spread < np.median([fit.uncertainty_deg for fit in fits]) < 1.8 * spread
