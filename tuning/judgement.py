@@ -44,6 +44,8 @@ from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec
 
 _LARGEST_LOG = 700.0
 """Larger logarithms overflow."""
+NEGLIGIBLE = 0.05
+"""A gain that is surely smaller than this share does not matter."""
 FALSE_CHOICES = 0.05
 """At most this share of the studies in which nothing is better may choose something."""
 
@@ -256,7 +258,8 @@ def judge(
 
     *Proven*: it was chosen, the whole interval on held-out scenes lies below 1, nothing is lost of accuracy where that
     is asked, recordings are not worse and the splits are apart. *Worse*: an interval lies above 1, a constraint fails,
-    or the settings matter and the estimate is not below 1. *Does not matter here*: see `objectives.spread_test`.
+    or the settings matter and the estimate is not below 1. *Does not matter here*: the trials differ by no more than
+    chance (`objectives.spread_test`), or the whole interval lies above 1 - `NEGLIGIBLE`.
     *Promising* is what is left.
 
     Args:
@@ -300,6 +303,8 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
             f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}); the best, "
             f"{name}, has {numbers}"
         )
+    if ratio.low is not None and 1 - NEGLIGIBLE < ratio.low and ratio.ratio < 1:
+        return Verdict.NO_MATTER, f"the best, {name}, gains at most {100 * (1 - ratio.low):.1f} %: {numbers}"
     if ratio.ratio >= 1:
         text = f"the best, {name}, is not better than the baseline: {numbers}"
         if p_value is None:

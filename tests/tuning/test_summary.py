@@ -114,6 +114,8 @@ def accuracy(bound: float) -> dict[str, Ratio]:
         ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, None, [], Verdict.NOT_JUDGED, "cannot tell"),
         ({"held_out": Ratio(ratio=1.5, low=1.1, high=2, n=8, sequences=4)}, 0.5, [], Verdict.WORSE, "50.0 % more ATE"),
         ({"recorded": Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)}, 0.5, [], Verdict.WORSE, "recordings"),
+        ({"held_out": Ratio(ratio=0.98, low=0.96, high=1.001, n=8, sequences=4)}, 0.001, [], Verdict.NO_MATTER,
+         "gains at most 4.0 %"),
         ({"feasible": False}, 0.5, [], Verdict.WORSE, "constraint"),
         ({**SPEED, "on_confirm": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
         ({**SPEED, "on_confirm": accuracy(1), "on_held_out": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
