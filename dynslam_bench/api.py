@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
-from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean
+from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean, raising
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.runs import DEFAULT_PROTOCOL, Limits, RunRecord, RunSpec, RunStore, load_frames, run_many
@@ -255,15 +255,13 @@ def dask_executor(address: str) -> Executor:
     Raises:
         RunError: ``distributed`` is not installed, or the scheduler does not answer.
     """
-    try:
+    with raising(RunError, "a scheduler needs the package distributed", install_hint("cluster"), of=ImportError):
         from distributed import Client
-    except ImportError as error:
-        raise RunError("a scheduler needs the package distributed", install_hint("cluster")) from error
-    try:
+    with raising(
+        RunError, f"no Dask scheduler answers at {address}", "for example tcp://host:8786", of=(OSError, ValueError)
+    ):
         logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # it logs a lost scheduler with a traceback
         return Client(address, timeout="10s").get_executor()  # type: ignore[no-any-return]
-    except (OSError, ValueError) as error:
-        raise RunError(f"no Dask scheduler answers at {address}: {error}", "for example tcp://host:8786") from error
 
 
 def tune(

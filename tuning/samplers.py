@@ -24,7 +24,7 @@ from optuna.search_space import IntersectionSearchSpace
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core.errors import StudyError, raising
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.flow.moth_flame import EMFOA, flames_left, flight, moth_positions, opposites
 from dynslam_bench.tuning.study_file import PrunerName, StudySpec
@@ -132,13 +132,13 @@ def restore_cma(data: bytes) -> Any:
     Raises:
         StudyError: It is something else.
     """
-    try:
+    with raising(
+        StudyError,
+        "the study's storage holds no state of CMA-ES but something else",
+        "it was tampered with or is damaged; use another sampler, or a storage of your own",
+        of=Exception,
+    ):  # a forged pickle raises anything
         return _CmaUnpickler(io.BytesIO(data)).load()
-    except Exception as error:  # a forged pickle raises anything
-        raise StudyError(
-            f"the study's storage holds no state of CMA-ES but something else: {str(error)[:200]}",
-            "it was tampered with or is damaged; use another sampler, or a storage of your own",
-        ) from error
 
 
 class RestrictedCmaEsSampler(optuna.samplers.CmaEsSampler):

@@ -29,11 +29,11 @@ from sqlalchemy.exc import DBAPIError
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.reading import read_json
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.sanitise import HIDDEN, without_passwords
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.samplers import is_feasible
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, make_spec, parse_instances
+from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, parse_instances
 
 EARLIER = "earlier"
 """User attribute of trials that an earlier study made: which, and whether by other code. They are no candidates."""
@@ -227,7 +227,9 @@ def read_stored(folder: Path) -> tuple[StudySpec, Path]:
     stored = folder / SPEC_FILE
     if not stored.is_file():
         raise StudyError(f"{folder} holds no study: it has no {SPEC_FILE}", "name results/studies/NAME")
-    return make_spec(read_json(stored, kind=StudyError), str(stored)), folder.absolute().parents[1]
+    return validated(StudySpec, read_json(stored, kind=StudyError), str(stored), StudyError), folder.absolute().parents[
+        1
+    ]
 
 
 def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:

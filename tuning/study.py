@@ -20,7 +20,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.records import digest, write_atomic
+from dynslam_bench.core.records import digest, validated, write_atomic
 from dynslam_bench.core.sanitise import storable, words_without_passwords
 from dynslam_bench.core.settings import Scalar
 from dynslam_bench.core.toml import read_settings
@@ -59,7 +59,7 @@ from dynslam_bench.tuning.storage import (
     worker_is_dead,
     worker_name,
 )
-from dynslam_bench.tuning.study_file import ProblemInstance, PrunerName, StudySpec, make_spec, read_study
+from dynslam_bench.tuning.study_file import ProblemInstance, PrunerName, StudySpec, read_study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -154,7 +154,7 @@ class Study(Plan):
             changes["objectives"] = tuple(objective.name for objective in objectives)
         if base is None or changes:
             values = {} if base is None else base.model_dump()
-            base = make_spec({"name": "study", **values, **changes}, "the study")
+            base = validated(StudySpec, {"name": "study", **values, **changes}, "the study", StudyError)
         super().__init__(base, results, objectives=objectives, accept=reading)
         spec, self._callbacks = base, tuple(callbacks)
         self.reading = reading

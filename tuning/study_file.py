@@ -11,11 +11,11 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.sanitise import without_passwords
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.runs.spec import RunSpec
@@ -401,26 +401,4 @@ def read_study(path: str | Path) -> StudySpec:
         StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
     """
     path = Path(path)
-    return make_spec({"name": path.stem, **read_toml(path, kind=StudyError)}, str(path))
-
-
-def make_spec(values: Any, where: str) -> StudySpec:
-    """A study from its values.
-
-    Args:
-        values: Fields of `StudySpec`.
-        where: Where they come from, for messages.
-
-    Raises:
-        StudyError: An unknown key (with a did-you-mean) or an unfit value, in one line.
-    """
-    try:
-        return StudySpec.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(map(str, first["loc"]))
-        if first["type"] == "extra_forbidden":
-            key_names = [*StudySpec.model_fields, *(f"space.{name}" for name in SpaceSpec.model_fields)]
-            raise StudyError(f"{where}: unknown key '{field}'", did_you_mean(field, key_names)) from None
-        text = first["msg"].removeprefix("Value error, ")
-        raise StudyError(f"{where}: {field + ': ' if field else ''}{text}") from None
+    return validated(StudySpec, {"name": path.stem, **read_toml(path, kind=StudyError)}, str(path), StudyError)

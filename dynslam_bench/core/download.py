@@ -17,7 +17,7 @@ from urllib.error import HTTPError
 from urllib.parse import SplitResult, urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
-from dynslam_bench.core.errors import DownloadError, DynslamError
+from dynslam_bench.core.errors import DownloadError, DynslamError, raising
 from dynslam_bench.core.files import claimed
 from dynslam_bench.core.reading import file_sha256, read_json
 from dynslam_bench.core.sanitise import without_passwords
@@ -91,7 +91,7 @@ def download(
     """
     check_address(url, checked=sha256 is not None)
     part = target.with_name(target.name + ".part")
-    try:
+    with raising(DownloadError, f"cannot write {target}", "name another folder"):
         target.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
             if not stack.enter_context(claimed(part.with_name(part.name + ".lock"))):
@@ -117,8 +117,6 @@ def download(
             file.replace(target)
             partial.forget()  # also what a process left that was killed between these two lines
             return checksum
-    except OSError as error:
-        raise DownloadError(f"cannot write {target}: {error.strerror or error}", "name another folder") from error
 
 
 @dataclass(frozen=True)
@@ -250,11 +248,9 @@ def check_address(url: str, *, checked: bool) -> SplitResult:
         DownloadError: Another scheme, no host, characters that no address has, or a password.
     """
     shown = f"cannot download {url[:200]!r}"
-    try:
+    with raising(DownloadError, f"{shown}", of=ValueError):
         parts = urlsplit(url)
         host, port = (parts.hostname or "").encode("idna").decode(), parts.port
-    except ValueError as error:
-        raise DownloadError(f"{shown}: {error}") from error
     if parts.scheme not in ("http", "https"):
         raise DownloadError(shown, "the address has to begin with http:// or https://")
     if not host or port == 0 or not url.isascii() or not url.isprintable() or " " in url:

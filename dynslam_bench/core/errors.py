@@ -6,7 +6,8 @@ Each message is one line: what was found (with the measured numbers), what was e
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from dynslam_bench.core.sanitise import without_passwords
@@ -99,6 +100,38 @@ class StudyError(DynslamError):
 
 class ReportError(DynslamError):
     """A report cannot be made of what was given."""
+
+
+@contextmanager
+def raising(
+    kind: type[DynslamError],
+    message: str,
+    hint: str = "",
+    *,
+    of: type[Exception] | tuple[type[Exception], ...] = OSError,
+) -> Iterator[None]:
+    """Turn what a library raises in the block into one line: the message, a colon, the reason.
+
+    Args:
+        kind: What is raised; errors of this package pass as they are.
+        message: What cannot be done, or what is damaged.
+        hint: One line that says how to cure it.
+        of: What is caught.
+
+    Raises:
+        DynslamError: Of the given kind.
+    """
+    try:
+        yield
+    except DynslamError:
+        raise
+    except of as error:
+        raise kind(f"{message}: {reason_of(error)}", hint) from error
+
+
+def reason_of(error: BaseException) -> str:
+    """What went wrong in the words of the library or of the system, one short line."""
+    return getattr(error, "strerror", None) or " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -18,10 +18,10 @@ import tempfile
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.errors import DynslamError, raising
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.(tmp|new)")
 _NEW_S = 60.0
@@ -70,14 +70,9 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
         file.writelines(f"{line}\n".encode(errors="backslashreplace") for line in lines)
 
 
-@contextmanager
-def _clear_errors(path: Path) -> Iterator[None]:
+def _clear_errors(path: Path) -> AbstractContextManager[None]:
     """Turn what goes wrong in writing a file into one line."""
-    try:
-        yield
-    except OSError as error:
-        reason = f"cannot write {path}: {error.strerror}"
-        raise DynslamError(reason, "check the permissions and the free space") from error
+    return raising(DynslamError, f"cannot write {path}", "check the permissions and the free space")
 
 
 def replace_folder(work: Path, target: Path) -> None:
@@ -159,11 +154,9 @@ def temporary_folder(target: Path) -> Iterator[Path]:
     Raises:
         DynslamError: The parent folder cannot be written.
     """
-    try:
+    with raising(DynslamError, f"cannot write into {target.parent}", "name another folder"):
         target.parent.mkdir(parents=True, exist_ok=True)
         work, lock = _reserve(target, Path.mkdir)
-    except OSError as error:
-        raise DynslamError(f"cannot write into {target.parent}: {error.strerror}", "name another folder") from error
     try:
         yield work
     finally:
@@ -184,10 +177,8 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     sweep_temporary(target.parent)
     with temporary_folder(target) as work:
         yield work
-        try:
+        with raising(DynslamError, f"cannot write {target}", "check the permissions"):
             replace_folder(work, target)
-        except OSError as error:
-            raise DynslamError(f"cannot write {target}: {error.strerror}", "check the permissions") from error
 
 
 # -- locks, which the system releases when their holder dies -----------------------------------------------------------
@@ -206,10 +197,8 @@ def claimed(path: Path) -> Iterator[bool]:
     Raises:
         DynslamError: The file cannot be made.
     """
-    try:
+    with raising(DynslamError, f"cannot write {path}", "check the permissions and the disk"):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-    except OSError as error:
-        raise DynslamError(f"cannot write {path}: {error.strerror}", "check the permissions and the disk") from error
     try:
         mine = _lock(handle) is not False and _is_at(handle, path)  # else its last holder has just removed it
         try:

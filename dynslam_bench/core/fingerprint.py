@@ -33,7 +33,7 @@ from dynslam_bench.core.code_files import (
     is_installed,
     program_files,
 )
-from dynslam_bench.core.errors import DynslamError, PluginError
+from dynslam_bench.core.errors import DynslamError, PluginError, raising
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 from dynslam_bench.core.reading import file_sha256
@@ -73,11 +73,9 @@ def named_digests(settings: Settings) -> dict[str, str]:
     digests = {}
     for name, text in texts.items():
         path = Path(text).expanduser()
-        try:
+        with raising(PluginError, f"cannot read {path}, which the setting '{name}' names"):
             if path.exists():
                 digests[name] = path_digest(path)[:16]
-        except OSError as error:
-            raise PluginError(f"cannot read {path}, which the setting '{name}' names: {error.strerror}") from error
     return digests
 
 
@@ -125,7 +123,7 @@ def plugin_digest(entry_point: str) -> str:
     top = module.partition(".")[0]
     if top == _OWN and not module.endswith(".py"):
         return ""
-    try:
+    with raising(PluginError, f"cannot read the code of plug-in '{entry_point}'"):
         if module.endswith(".py"):
             file = Path(module).expanduser().resolve()
             files = program_files(file.parent)
@@ -133,8 +131,6 @@ def plugin_digest(entry_point: str) -> str:
         places = _folders_of(top)
         names = imported_modules(file for place in places for file in _files_of(place)) - {top}
         return digest([[_whole(place) for place in places], _dependencies(names)])
-    except OSError as error:
-        raise PluginError(f"cannot read the code of plug-in '{entry_point}': {error}") from error
 
 
 def _dependencies(modules: set[str]) -> dict[str, str]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.errors import DynslamError, raising
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,12 +41,10 @@ def read_bytes(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError
     Raises:
         DynslamError: Of the given kind: it cannot be read, or is larger.
     """
-    try:
+    with raising(kind, f"cannot read {path}", of=(OSError, ValueError)):  # ValueError: a name with a null byte
         with path.open("rb") as file:  # in two steps: taking memory for `limit` bytes costs as much as reading them
             data = file.read(min(_MOST_FILES, limit + 1))
             data += file.read(limit + 1 - len(data)) if len(data) == _MOST_FILES else b""
-    except (OSError, ValueError) as error:  # ValueError: a name with a null byte
-        raise kind(f"cannot read {path}: {_reason(error)}") from error
     if len(data) > limit:
         raise kind(_too_large(path, limit))
     return data
@@ -58,10 +56,8 @@ def read_text(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError]
     Raises:
         DynslamError: Of the given kind: it cannot be read, is larger, or is no UTF-8.
     """
-    try:
+    with raising(kind, f"{path} is not a text file", of=UnicodeDecodeError):
         return read_bytes(path, limit=limit, kind=kind).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise kind(_no_text(path, error)) from error
 
 
 def read_lines(path: Path, *, limit: int = TABLE_BYTES, kind: type[DynslamError] = DynslamError) -> Iterator[str]:
@@ -71,17 +67,16 @@ def read_lines(path: Path, *, limit: int = TABLE_BYTES, kind: type[DynslamError]
         DynslamError: Of the given kind: it cannot be read, has more than `limit` bytes, or is no UTF-8.
     """
     done = 0
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            while line := file.readline(limit + 1):
-                done += len(line)
-                if done > limit:
-                    raise kind(_too_large(path, limit))
-                yield line
-    except UnicodeDecodeError as error:
-        raise kind(_no_text(path, error)) from error
-    except (OSError, ValueError) as error:
-        raise kind(f"cannot read {path}: {_reason(error)}") from error
+    with (
+        raising(kind, f"cannot read {path}", of=(OSError, ValueError)),
+        raising(kind, f"{path} is not a text file", of=UnicodeDecodeError),
+        path.open(encoding="utf-8-sig") as file,
+    ):
+        while line := file.readline(limit + 1):
+            done += len(line)
+            if done > limit:
+                raise kind(_too_large(path, limit))
+            yield line
 
 
 def read_json(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError) -> Any:
@@ -104,12 +99,8 @@ def parse_json(text: str, where: str, *, kind: type[DynslamError] = DynslamError
     Raises:
         DynslamError: Of the given kind: it is no JSON, nested too deeply, or holds a number of thousands of digits.
     """
-    try:
+    with raising(kind, f"{where} is no valid JSON", of=(ValueError, RecursionError)):
         return json.loads(text)
-    except ValueError as error:
-        raise kind(f"{where} is no valid JSON: {error}") from error
-    except RecursionError as error:
-        raise kind(f"{where} is no valid JSON: it is nested too deeply") from error
 
 
 def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str, NDArray[Any]]:
@@ -125,15 +116,13 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
     import numpy as np
 
     data = read_bytes(path, limit=MOST_BYTES, kind=kind)
-    try:
+    # zipfile and numpy raise almost anything over damaged files
+    with raising(kind, f"{path} holds no arrays", of=Exception):
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             claimed = sum(entry.file_size for entry in archive.zip.infolist())
             if claimed > MOST_BYTES:
                 raise ValueError(f"it claims {claimed / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read")
             arrays = dict(archive)
-    except Exception as error:  # zipfile and numpy raise almost anything over damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise kind(f"{path} holds no arrays: {reason}") from error
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise kind(f"{path} holds something else than arrays")
     return arrays
@@ -154,13 +143,5 @@ def file_sha256(path: Path, progress: Callable[[int, int], object] = lambda done
     return digest.hexdigest()
 
 
-def _reason(error: OSError | ValueError) -> str:
-    return str(getattr(error, "strerror", None) or error)
-
-
 def _too_large(path: Path, limit: int) -> str:
     return f"{path} has more than the {limit / MEGABYTE:g} MB that are read of such a file"
-
-
-def _no_text(path: Path, error: UnicodeDecodeError) -> str:
-    return f"{path} is not a text file: byte {error.start} ({error.object[error.start]:#04x}) is no UTF-8"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.errors import DynslamError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.reading import RECORD_BYTES, read_text
 from dynslam_bench.core.sanitise import json_without_passwords, storable
@@ -17,6 +18,7 @@ from dynslam_bench.core.sanitise import json_without_passwords, storable
 __all__ = ["Digest", "Record", "atomic_folder", "digest", "schema", "write_atomic"]
 
 R = TypeVar("R", bound="Record")
+M = TypeVar("M", bound=BaseModel)
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 """Sixteen hexadecimal digits, as `digest` makes them; nothing else names a file or folder."""
 
@@ -73,6 +75,37 @@ class Record(BaseModel):
             newer = place.endswith("schema_version") and first["type"] == "less_than_equal"
             hint = "a newer dynslam-bench wrote it: upgrade" if newer else ""
             raise DynslamError(f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}", hint) from error
+
+
+def validated(cls: type[M], values: Any, where: str, kind: type[DynslamError]) -> M:
+    """A model of what a user wrote.
+
+    Args:
+        cls: The model.
+        values: Its fields.
+        where: Where they stand, for messages.
+        kind: What is raised.
+
+    Raises:
+        DynslamError: Of the given kind: an unknown key (with a did-you-mean) or an unfit value, in one line.
+    """
+    try:
+        return cls.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            raise kind(f"{where}: unknown key '{name}'", did_you_mean(name, _keys(cls))) from None
+        text = first["msg"].removeprefix("Value error, ")
+        raise kind(f"{where}: {name + ': ' if name else ''}{text}") from None
+
+
+def _keys(cls: type[BaseModel]) -> Iterator[str]:
+    """The names of a model's fields, and of those of models in it."""
+    for name, field in cls.model_fields.items():
+        yield name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from (f"{name}.{key}" for key in _keys(field.annotation))
 
 
 def digest(value: Any, length: int = 12) -> str:

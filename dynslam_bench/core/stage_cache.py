@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.errors import DynslamError, raising
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.folders import STAGES_VARIABLE, stage_cache_folder
 from dynslam_bench.core.reading import read_npz
@@ -79,14 +79,13 @@ class StageCache:
             DynslamError: The folder cannot be written, e.g. a full disk; nothing is left behind.
         """
         path = self._path(stage, key)
-        try:
+        with raising(
+            DynslamError,
+            f"cannot write the stage cache {self.folder}",
+            f"free some space, or name another folder by {STAGES_VARIABLE}",
+        ):
             with replacing(path) as temporary, temporary.open("wb") as file:
                 np.savez(file, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
-        except OSError as error:
-            raise DynslamError(
-                f"cannot write the stage cache {self.folder}: {error.strerror}",
-                f"free some space, or name another folder by {STAGES_VARIABLE}",
-            ) from error
         self._writes += 1
         if self._writes % _PRUNE_EVERY == 1:
             self.prune()

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, raising
 from dynslam_bench.core.reading import read_text
 
 if sys.version_info >= (3, 11):
@@ -46,12 +46,8 @@ def parse_toml(text: str, where: str, *, kind: type[DynslamError] = SequenceErro
     Raises:
         DynslamError: Of the given kind: it is no TOML, nested too deeply, or holds a number of thousands of digits.
     """
-    try:
+    with raising(kind, f"{where} is not valid TOML", of=(ValueError, OverflowError, RecursionError)):
         return tomllib.loads(text)
-    except (ValueError, OverflowError) as error:  # a TOMLDecodeError is a ValueError
-        raise kind(f"{where} is not valid TOML: {error}") from error
-    except RecursionError as error:
-        raise kind(f"{where} is not valid TOML: it is nested too deeply") from error
 
 
 def read_settings(path: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import MapOutputs, TrackResult
-from dynslam_bench.core.errors import RunError, TrackerError
+from dynslam_bench.core.errors import RunError, TrackerError, raising
 from dynslam_bench.core.reading import read_npz
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
 from dynslam_bench.envs.slam_env import SlamEnv
@@ -161,7 +161,7 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     if not path.is_file():
         return (0, 0), []
     arrays = read_npz(path, kind=RunError)
-    try:
+    with raising(RunError, f"{path} holds no snapshots", of=(LookupError, ValueError, TypeError, ArithmeticError)):
         height, width = map(int, arrays["size"])
         index, count, points, kept = arrays["index"], arrays["count"], arrays["points"], arrays["kept"]
         masks, masked = arrays["masks"], arrays["masked"]
@@ -182,8 +182,6 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
             Snapshot(int(index[at]), place, keep, masks[at] if masked[at] else None, width)
             for at, (place, keep) in enumerate(parts)
         ]
-    except (LookupError, ValueError, TypeError, ArithmeticError) as error:
-        raise RunError(f"{path} holds no snapshots: {' '.join(str(error).split())[:200]}") from error
     return (height, width), shots
 
 

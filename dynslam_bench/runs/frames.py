@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, field_validator
 from pydantic.dataclasses import dataclass as validated
 
 from dynslam_bench.contracts import stage_seconds
-from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core.errors import DynslamError, RunError, reason_of
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.sanitise import storable
 from dynslam_bench.geometry import Trajectory, format_ns, ns_of, se3, write_tum
@@ -155,8 +155,7 @@ def read_csv(path: Path) -> list[FrameRow]:
     try:
         rows.extend(map(_parse, csv.DictReader(read_lines(path, kind=RunError))))
     except (TypeError, ValueError, csv.Error) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({reason})") from error
+        raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({reason_of(error)})") from error
     return rows
 
 
@@ -198,8 +197,7 @@ class FrameLog:
                         raise ValueError(f"stamp {row.timestamp!r} after {rows[-1].timestamp!r}")
                     rows.append(row)
         except (DynslamError, ValueError) as error:
-            reason = " ".join(str(error).split())[:200]
-            return cls(rows, f"row {len(rows) + 1} of {path.name} is damaged ({type(error).__name__}: {reason})")
+            return cls(rows, f"row {len(rows) + 1} of {path.name} is damaged ({reason_of(error)})")
         return cls(rows)
 
     def lost_streak(self) -> int:

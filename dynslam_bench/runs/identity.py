@@ -8,7 +8,7 @@ from typing import Any
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.contracts.checks import check_sensors
-from dynslam_bench.core.errors import PluginError, RunError, SettingsError, did_you_mean
+from dynslam_bench.core.errors import PluginError, RunError, SettingsError, did_you_mean, raising
 from dynslam_bench.core.fingerprint import (
     code_digest,
     contents_digest,
@@ -105,10 +105,8 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     start_map = start_map_of(settings, sequence.camera, tracker.sensors, weights)
     by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
     part = part_of(sequence, spec.offset)
-    try:
+    with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
         files = contents_digest(load_object(tracker.files)(settings)) if tracker.files else ""
-    except OSError as error:
-        raise PluginError(f"cannot read a file of tracker '{tracker.id}': {error}") from error
     installed = versions()  # another version of what computes with the run's data may give other bits
     datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
     dataset = datasets.get(spec.sequence.partition("/")[0])

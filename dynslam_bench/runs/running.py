@@ -20,7 +20,15 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from dynslam_bench.contracts import exact_stamps, timestamps_ns
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, SequenceError, TrajectoryError
+from dynslam_bench.core.errors import (
+    DynslamError,
+    InfrastructureError,
+    RunError,
+    SequenceError,
+    TrajectoryError,
+    raising,
+    reason_of,
+)
 from dynslam_bench.core.files import TemporaryFolder, write_atomic
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
@@ -119,14 +127,12 @@ def run_one(
             raise RunError(
                 f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
             )
-        try:
+        with raising(InfrastructureError, f"cannot write {work}", "the run is not stored"):
             bound_log(log, LONGEST_LOG)
             frames = FrameLog.read(work / FRAMES_FILE)
             title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
             frames.write(work, title, exact_stamps(resolved.sequence))
             (work / FRAMES_FILE).unlink(missing_ok=True)
-        except OSError as error:
-            raise InfrastructureError(f"cannot write {work}: {error.strerror}", "the run is not stored") from error
         check_unchanged(resolved.start_map, resolved.settings)
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
@@ -492,9 +498,8 @@ def _asked(ask: Callable[..., T], *arguments: object) -> T:
     except DynslamError:
         raise
     except Exception as error:  # each library of executors has errors of its own
-        words = " ".join(str(error).split())[:200]
         raise InfrastructureError(
-            f"the executor gave up: {type(error).__name__} {words}".rstrip(),
+            f"the executor gave up: {type(error).__name__} {reason_of(error)}",
             "what is finished is stored; the same command goes on from there",
         ) from error
 
@@ -556,12 +561,12 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     """
     with contextlib.closing(TemporaryFolder()) as folder:
         sent = RunStore(folder.path)
-        try:
+        with raising(
+            RunError, f"{len(data)} bytes from a worker are no packed run", of=Exception
+        ):  # zipfile raises almost anything over damaged archives
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 odd = [name for name in archive.namelist() if not _ENTRY.fullmatch(name)]
                 archive.extractall(folder.path, set(archive.namelist()).difference(odd))
-        except Exception as error:  # zipfile raises almost anything over damaged archives
-            raise RunError(f"{len(data)} bytes from a worker are no packed run: {error}") from error
         runs = sent.ids()
         if odd or len(runs) != 1:
             raise RunError(f"a packed run holds {len(runs)} runs, and {len(odd)} odd names")

@@ -18,7 +18,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError, EvaluationError, InfrastructureError, RunError, did_you_mean
+from dynslam_bench.core.errors import (
+    DynslamError,
+    EvaluationError,
+    InfrastructureError,
+    RunError,
+    did_you_mean,
+    raising,
+)
 from dynslam_bench.core.files import claimed, replace_folder, sweep_temporary, temporary_folder
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.reading import read_lines
@@ -287,11 +294,9 @@ class RunStore:
         """
         target = self.folder(record.run_id)
         record = self._with_alarm(record, work)
-        try:
+        with raising(InfrastructureError, f"cannot write {target}", "check the free space"):
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
             replace_folder(work, target)
-        except OSError as error:
-            raise InfrastructureError(f"cannot write {target}: {error.strerror}", "check the free space") from error
         link = self.root / "latest"
         with contextlib.suppress(OSError), temporary_folder(link) as folder:  # a file system may have no links
             fresh = folder / link.name
@@ -339,11 +344,9 @@ class RunStore:
             RunError: There is no such run, or it cannot be deleted.
         """
         run_id = self.find(run_id)
-        try:
+        with raising(RunError, f"cannot remove run {run_id}"):
             with self.work_folder(run_id) as removed:
                 self.folder(run_id).rename(removed / run_id)
-        except OSError as error:
-            raise RunError(f"cannot remove run {run_id}: {error.strerror}") from error
         self.index.forget(run_id)
         self._unlink_dangling()
 
@@ -574,10 +577,8 @@ def _read_truth(path: Path, _stamp: str) -> Trajectory:
 @lru_cache(maxsize=64)
 def _read_stamps(path: Path, _stamp: str) -> NDArray[np.float64]:
     """The stamps of a part, likewise shared."""
-    try:
+    with raising(RunError, f"cannot read {path}", "the results folder is incomplete", of=ValueError):
         stamps = np.array([float(line) for line in read_lines(path, kind=RunError) if line.strip()], dtype=np.float64)
-    except ValueError as error:
-        raise RunError(f"cannot read {path}: {error}", "the results folder is incomplete") from error
     stamps.flags.writeable = False
     return stamps
 

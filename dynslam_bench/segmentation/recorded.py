@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, Instances, MaskSource, SegmenterContext, Sequence
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.errors import SegmentationError, raising
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.reading import read_json
@@ -64,15 +64,15 @@ class RecordedSegmenter:
             )
         self.by_stamp = stamped > 0
         self._tolerance = MAX_DIFFERENCE_S if self.by_stamp else 0.5
-        try:
+        with raising(
+            SegmentationError,
+            f"{self.folder}: a mask file is named neither by stamp nor by index",
+            "for example 1311868164.363181.png or 000012.png",
+            of=(ValueError, OverflowError),
+        ):
             numbers = np.array([float(file.stem if self.by_stamp else int(file.stem)) for file in files])
             if not np.isfinite(numbers).all():
                 raise ValueError("a stamp is not finite")
-        except (ValueError, OverflowError) as error:
-            raise SegmentationError(
-                f"{self.folder}: a mask file is named neither by stamp nor by index: {error}",
-                "for example 1311868164.363181.png or 000012.png",
-            ) from error
         order = np.argsort(numbers, kind="stable")
         self._keys: NDArray[np.float64] = numbers[order]
         self._files = [files[i] for i in order]
@@ -148,10 +148,10 @@ def read_classes(path: Path) -> dict[int, str]:
     """
     if not path.is_file():
         return {}
-    try:
+    with raising(
+        SegmentationError, f"cannot read {path}", 'expected {"1": "person", ...}', of=(ValueError, AttributeError)
+    ):
         names = {int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()}
-    except (ValueError, AttributeError) as error:
-        raise SegmentationError(f"cannot read {path}: {error}", 'expected {"1": "person", ...}') from error
     unknown = sorted(set(names.values()) - set(COCO_NAMES))
     if unknown:
         raise SegmentationError(f"{path}: '{unknown[0]}' is no COCO class")

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError, SequenceError
+from dynslam_bench.core.errors import SequenceError, raising
 from dynslam_bench.core.files import atomic_folder
 from dynslam_bench.geometry import Camera, parse_ns
 from dynslam_bench.sequences.cameras import CAMERA_FILE, write_camera
@@ -113,13 +113,10 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
         SequenceError: `rosbags` is not installed, the bag is damaged, or the topic is missing or one of several.
     """
     source = Path(bag).expanduser()
-    try:
-        with _opened(source) as reader:
-            topics = _Topics(reader, source)
-            chosen = topics.pose(topic, "--topic")
-            lines = [pose_line(message) for message in _read(reader, topics.connections[chosen])] if chosen else []
-    except OSError as error:  # e.g. a file that its metadata name is missing
-        raise SequenceError(f"bag {source} cannot be read: {error.strerror or error}") from error
+    with _opened(source) as reader:
+        topics = _Topics(reader, source)
+        chosen = topics.pose(topic, "--topic")
+        lines = [pose_line(message) for message in _read(reader, topics.connections[chosen])] if chosen else []
     table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
     if not np.isfinite(table).all():
         raise SequenceError(f"{source} holds poses that are not finite")
@@ -197,19 +194,17 @@ def _opened(source: Path) -> Iterator[Any]:
     """The bag's reader; whatever it raises over a damaged bag becomes one line."""
     if not source.exists():
         raise SequenceError(f"there is no bag {source}")
-    try:
+    with raising(
+        SequenceError, "bags are read with rosbags, which is not installed", "pip install rosbags", of=ImportError
+    ):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise SequenceError("bags are read with rosbags, which is not installed", "pip install rosbags") from error
-    try:
-        with AnyReader([source], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            yield reader
-    except (DynslamError, OSError):
-        raise
-    except Exception as error:  # a damaged bag makes its readers raise whatever they like
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise SequenceError(f"bag {source} cannot be read: {reason}") from error
+    # a damaged bag makes its readers raise whatever they like
+    with (
+        raising(SequenceError, f"bag {source} cannot be read", of=Exception),
+        AnyReader([source], default_typestore=get_typestore(Stores.LATEST)) as reader,
+    ):
+        yield reader
 
 
 # Messages of ROS as images, stamps, poses and cameras; ROS 1 and 2 name a few fields otherwise.

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from dynslam_bench.contracts import Sequence
-from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.errors import SequenceError, raising
 from dynslam_bench.geometry import Array, Camera
 from dynslam_bench.geometry.se3 import hat
 from dynslam_bench.sequences.rgbd_motion import follow_corners
@@ -138,10 +138,10 @@ def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] | None
             f"{len(windows)} of {len(starts)} windows of {sequence.id} can be used, expected {LEAST_WINDOWS}: {common}",
             "record a well-lit, textured, static scene within the depth camera's reach",
         )
-    try:
+    with raising(
+        SequenceError, f"the windows of {sequence.id} cannot be adjusted", "try another part", of=np.linalg.LinAlgError
+    ):
         readout, delay = adjust(windows)
-    except np.linalg.LinAlgError as error:
-        raise SequenceError(f"the windows of {sequence.id} cannot be adjusted: {error}", "try another part") from None
     camera = sequence.camera
     quantities = _readout(readout, windows, camera), _delay(delay, camera), _factor(windows, sequence)
     values: dict[str, Any] = {

@@ -6,11 +6,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from dynslam_bench.core.errors import RunError, did_you_mean
 from dynslam_bench.core.reading import read_text
-from dynslam_bench.core.records import Record
+from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.core.toml import parse_toml
 from dynslam_bench.runs.spec import Limits, RunSpec
@@ -190,14 +190,7 @@ def load_suite(name: str | Path) -> Suite:
         raise RunError(f"unknown suite '{name}'", f"{hint} Or name a .toml file")
     document = parse_toml(text, where, kind=RunError)
     document.setdefault("name", Path(where).stem)
-    try:
-        suite = Suite.model_validate(document)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        if first["type"] == "extra_forbidden":
-            raise RunError(f"{where}: unknown key '{key}'", did_you_mean(key, Suite.model_fields)) from error
-        raise RunError(f"{where}: {key}: {first['msg'][0].lower()}{first['msg'][1:]}") from error
+    suite = validated(Suite, document, where, RunError)
     for tracker in (*suite.trackers, *suite.optional):
         TRACKERS.get(tracker)
     return suite

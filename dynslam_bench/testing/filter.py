@@ -57,13 +57,15 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     report = ConformanceReport.of("filter", construct)
     declared = report.run("declaration", lambda: _declaration(construct()))
     if declared and report.run("results", lambda: _run(construct(), steps)):
-        report.run("declared stats", lambda: _declared_stats(construct(), steps))
-        report.run("frames are left alone", lambda: _left_alone(construct(), steps))
-        report.run("determinism", lambda: _repeated((construct(), construct()), steps, *_TWO_RUNS))
-        report.run("two resets", lambda: _repeated((construct(),) * 2, steps, *_TWO_RESETS))
-        for name, change in _DEGENERATE.items():
-            changed = [change(frame, state) for frame, state in steps]
-            report.run(name, lambda changed=changed: _run(construct(), changed))  # type: ignore[misc]
+        report.run_all(
+            {
+                "declared stats": lambda: _declared_stats(construct(), steps),
+                "frames are left alone": lambda: _left_alone(construct(), steps),
+                "determinism": lambda: _repeated((construct(), construct()), steps, *_TWO_RUNS),
+                "two resets": lambda: _repeated((construct(),) * 2, steps, *_TWO_RESETS),
+                **{name: partial(_run_changed, construct, steps, change) for name, change in _DEGENERATE.items()},
+            }
+        )
     return report
 
 
@@ -155,6 +157,10 @@ def _declaration(candidate: DynamicFilter) -> None:
 def _run(candidate: DynamicFilter, steps: Steps) -> list[FilterResult]:
     candidate.reset(steps[0][1].camera)
     return [check_result(candidate.apply(frame, state), frame) for frame, state in steps]
+
+
+def _run_changed(construct: Callable[[], DynamicFilter], steps: Steps, change: Change) -> None:
+    _run(construct(), [change(frame, state) for frame, state in steps])
 
 
 def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:

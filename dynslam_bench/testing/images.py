@@ -70,23 +70,20 @@ def features_report(
     report = ConformanceReport.of("extractor", construct)
     report.run("construction", lambda: require_methods(construct(), "extract"))
     if report.ok and report.run("results", lambda: results(scene[0], least=20)):
-        report.run("beside a mask", lambda: _masked_extraction(construct(), image))
-        _run_common(report, scene[0], left_alone, lambda: _extractor_determinism(construct, image, other), results)
+        report.run_all(
+            {
+                "beside a mask": lambda: _masked_extraction(construct(), image),
+                "images are left alone": left_alone,
+                "determinism": lambda: _extractor_determinism(construct, image, other),
+                **_on_hard_images(scene[0], results),
+            }
+        )
     return report
 
 
-def _run_common(
-    report: ConformanceReport,
-    frame: Frame,
-    left_alone: Callable[[], None],
-    determinism: Callable[[], None],
-    results: Callable[[Frame], object],
-) -> None:
-    """The checks that all kinds of plug-ins on images share."""
-    report.run("images are left alone", left_alone)
-    report.run("determinism", determinism)
-    for name, hard in hard_frames(frame).items():
-        report.run(f"{name} image", lambda hard=hard: results(hard))  # type: ignore[misc]
+def _on_hard_images(frame: Frame, results: Callable[[Frame], object]) -> dict[str, Callable[[], object]]:
+    """The checks of results on images that have nothing to find."""
+    return {f"{name} image": partial(results, hard) for name, hard in hard_frames(frame).items()}
 
 
 def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_bytes: int | None = None) -> None:
@@ -187,12 +184,17 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
     report = ConformanceReport.of("flow", construct)
     report.run("construction", lambda: require_methods(construct(), "prepare", "track"))
     if report.ok and report.run("results", lambda: results(second, grid)):
-        report.run("no points", lambda: results(second, grid[:0]))
-        report.run("points outside", outside)
-        report.run("guesses", lambda: results(second, grid, guess))
-        report.run("a small shift is found", lambda: _flow_finds_shift(results, first, grid))
-        determinism = partial(_flow_determinism, construct, first, second, grid)
-        _run_common(report, scene[0], left_alone, determinism, lambda frame: results(grey(frame), grid))
+        report.run_all(
+            {
+                "no points": lambda: results(second, grid[:0]),
+                "points outside": outside,
+                "guesses": lambda: results(second, grid, guess),
+                "a small shift is found": lambda: _flow_finds_shift(results, first, grid),
+                "images are left alone": left_alone,
+                "determinism": lambda: _flow_determinism(construct, first, second, grid),
+                **_on_hard_images(scene[0], lambda frame: results(grey(frame), grid)),
+            }
+        )
     return report
 
 
@@ -283,7 +285,13 @@ def segmenter_report(
     report = ConformanceReport.of("segmenter", construct)
     report.run("construction", lambda: require_methods(construct(), "segment"))
     if report.ok and report.run("results", lambda: results(*inputs)):
-        _run_common(report, inputs[0], left_alone, lambda: _segmenter_determinism(construct, inputs), results)
+        report.run_all(
+            {
+                "images are left alone": left_alone,
+                "determinism": lambda: _segmenter_determinism(construct, inputs),
+                **_on_hard_images(inputs[0], results),
+            }
+        )
     return report
 
 

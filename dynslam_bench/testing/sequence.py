@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,18 +40,18 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
     if not report.run("protocol", lambda: _protocol(sequence)):
         return report
     chosen = sorted(set(np.linspace(0, len(sequence) - 1, max(frames, 2)).astype(int).tolist()))
-    checks: dict[str, Callable[..., None]] = {
-        "timestamps": _timestamps,
-        "frames": partial(_frames, chosen=chosen),
-        "end of the sequence": _end,
-        "reading twice": partial(_twice, index=chosen[-1]),
-        "ground truth": _ground_truth,
-        "masks": partial(_masks, chosen=chosen),
-        "digest": _digest,
-        "pickling": _pickling,
-    }
-    for name, check in checks.items():
-        report.run(name, partial(check, sequence))
+    report.run_all(
+        {
+            "timestamps": lambda: _timestamps(sequence),
+            "frames": lambda: _frames(sequence, chosen),
+            "end of the sequence": lambda: _end(sequence),
+            "reading twice": lambda: _twice(sequence, chosen[-1]),
+            "ground truth": lambda: _ground_truth(sequence),
+            "masks": lambda: _masks(sequence, chosen),
+            "digest": lambda: _digest(sequence),
+            "pickling": lambda: _pickling(sequence),
+        }
+    )
     return report
 
 

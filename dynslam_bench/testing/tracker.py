@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -93,17 +94,20 @@ def run_tracker_checks(
         return
     deterministic = spec is None or spec.deterministic
     turning_run = _Runner(report, spec or subject, settings, turning, len(turning), seed)
-    report.run("camera to world", lambda: _conventions(turning_run, spec is not None and spec.sensors == "rgb"))
-    report.run("same stats on every frame", lambda: _same_keys(run))
-    report.run("frames are left alone", lambda: _frames_left_alone(run))
-    report.run("determinism", lambda: _determinism(run, deterministic))
-    report.run("two resets", lambda: _two_resets(run, deterministic))
-    for name in hard_frames(scene[0]):
-        report.run(f"{name} frame", lambda name=name: _hard_frame(run, name))  # type: ignore[misc]
-    report.run("one frame", lambda: _final(run, 1))
-    report.run("online settings", lambda: _online_settings(run, spec, settings))
-    report.run("final trajectory", lambda: _final(run))
-    report.run("closing", lambda: _closing(run))
+    report.run_all(
+        {
+            "camera to world": lambda: _conventions(turning_run, spec is not None and spec.sensors == "rgb"),
+            "same stats on every frame": lambda: _same_keys(run),
+            "frames are left alone": lambda: _frames_left_alone(run),
+            "determinism": lambda: _determinism(run, deterministic),
+            "two resets": lambda: _two_resets(run, deterministic),
+            **{f"{name} frame": partial(_hard_frame, run, name) for name in hard_frames(scene[0])},
+            "one frame": lambda: _final(run, 1),
+            "online settings": lambda: _online_settings(run, spec, settings),
+            "final trajectory": lambda: _final(run),
+            "closing": lambda: _closing(run),
+        }
+    )
 
 
 class _Runner:

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 import dynslam_bench
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError, raising
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
@@ -94,10 +94,8 @@ def run_jobs(pool: Executor | None, function: Callable[..., T], jobs: Sequence[t
         return
     with _without_main():
         answers = pool.map(function, *zip(*jobs, strict=True))
-    try:
+    with raising(InfrastructureError, "a worker process of the report ended early", of=BrokenProcessPool):
         yield from answers
-    except BrokenProcessPool as error:
-        raise InfrastructureError(f"a worker process of the report ended early: {error}") from error
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dynslam_bench.core.errors import RunError, TrajectoryError
+from dynslam_bench.core.errors import RunError, TrajectoryError, raising
 from dynslam_bench.core.files import temporary_folder, write_atomic
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.version import install_hint
@@ -219,22 +219,20 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
     Raises:
         DynslamError: `rosbags` is not installed, or the file cannot be written.
     """
-    try:
+    with raising(
+        RunError, "MCAP is written with rosbags, which is not installed", install_hint("bags"), of=ImportError
+    ):
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise RunError("MCAP is written with rosbags, which is not installed", install_hint("bags")) from error
     store = get_typestore(Stores.LATEST)
     with temporary_folder(folder / "trajectory") as work:
         bag = work / "trajectory"
-        try:
+        with raising(RunError, f"cannot write {folder}", "check the free space"):
             with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 for name, trajectory in trajectories.items():
                     _write_messages(writer, store, name, trajectory)
             for file in bag.iterdir():
                 file.replace(folder / file.name)
-        except OSError as error:
-            raise RunError(f"cannot write {folder}: {error.strerror}", "check the free space") from error
 
 
 def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Sequence
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import RunError, raising
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.rendering import CULLED, ESTIMATE, KEPT, MASK, TRUTH
 from dynslam_bench.geometry import Camera, Trajectory, se3
@@ -104,11 +104,11 @@ def write_recording(
     import rerun as rr
 
     stream = rr.RecordingStream("dynslam-bench")
-    try:
+    with raising(
+        RunError, f"cannot write {path}", "check the permissions and the free space", of=(OSError, RuntimeError)
+    ):
         path.touch()
         stream.save(str(path), default_blueprint=_blueprint())
-    except (OSError, RuntimeError) as error:
-        raise RunError(f"cannot write {path}: {error}", "check the permissions and the free space") from error
     stream.send_recording_name(name)
     _log_frames(rr, stream, camera, frames)
     for track_name, track, colour in zip(("estimate", "truth"), tracks, (ESTIMATE, TRUTH), strict=True):

@@ -5,7 +5,6 @@ Loading is strict and never unpickles.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -18,7 +17,7 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.errors import SegmentationError, raising
 from dynslam_bench.core.files import replacing
 from dynslam_bench.segmentation.networks.backbone import COCO_CLASSES, NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
@@ -65,24 +64,21 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
         SegmentationError: The file is missing, truncated, or holds anything but tensors and plain values.
     """
     path = path.expanduser()
-    try:
+    with raising(SegmentationError, f"cannot read the checkpoint {path}"):
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
-    except OSError as error:
-        raise SegmentationError(f"cannot read the checkpoint {path}: {error.strerror or error}") from error
-    try:
+    with raising(
+        SegmentationError,
+        f"{path} ({size} bytes) is no torch checkpoint of plain weights",
+        "it is truncated or of another format",
+        of=Exception,
+    ):  # torch raises many types for a damaged file
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 unpacked = sum(entry.file_size for entry in archive.infolist())
             if unpacked > MAX_EXPANSION * size:
                 raise ValueError(f"it claims to unpack to {unpacked} bytes")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many types for a damaged file
-        reason = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
-        raise SegmentationError(
-            f"{path} ({size} bytes) is no torch checkpoint of plain weights: {reason}",
-            "it is truncated or of another format",
-        ) from error
     if not isinstance(content, Mapping):
         raise SegmentationError(f"{path} holds a {type(content).__name__}, not a table of weights")
     return content
@@ -98,7 +94,8 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], NetworkConfig | None]:
     if "config" in content and "format" in content:
         if content["format"] != FORMAT:
             raise SegmentationError(f"{path} has the format {content['format']!r}, this version reads {FORMAT!r}")
-        config = _config(str(content["config"]), path)
+        with raising(SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError):
+            config = NetworkConfig.model_validate_json(str(content["config"]))
     content = next((content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)), content)
     state = {str(key): value for key, value in content.items() if isinstance(value, Tensor)}
     if not state:
@@ -114,15 +111,6 @@ def _is_plain(value: Tensor) -> bool:
     if value.layout != torch.strided or value.is_quantized or value.is_meta or value.is_complex():
         return False
     return value.numel() * value.element_size() <= value.untyped_storage().nbytes()
-
-
-def _config(text: str, path: Path) -> NetworkConfig:
-    try:
-        return NetworkConfig.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        reason = f"{path}: the network's shape is not understood: {first['loc']}: {first['msg']}"
-        raise SegmentationError(reason) from error
 
 
 def _renamed(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -180,7 +168,8 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         "mask_layers": len({key.split(".")[2] for key in state if key.startswith("roi_heads.mask_head.")}),
         "cfpn": True,
     }
-    return _config(json.dumps(shape), path)
+    with raising(SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError):
+        return NetworkConfig(**shape)
 
 
 def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:

@@ -9,13 +9,12 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.errors import SegmentationError, raising
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
@@ -127,13 +126,21 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
         SegmentationError: `onnx` or `onnxscript` is missing, or torch cannot export it.
         OSError: The file cannot be written.
     """
-    onnx = _library()
+    missing = "networks are exported with onnx and onnxscript, which are not both installed"
+    with raising(SegmentationError, missing, install_hint("onnx"), of=ImportError):
+        import onnx
+        import onnxscript  # noqa: F401 - torch's exporter asks for it
     static = StaticMaskRCNN(network, *size, score=FLOOR, iou=NMS_IOU).eval()
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0))
     classes = {number: name for number, name in enumerate(network.config.classes, start=1) if name}
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with replacing(path) as temporary:
-        try:
+        with raising(
+            SegmentationError,
+            f"torch {torch.__version__} cannot export the network",
+            "torch >= 2.6",
+            of=(torch.onnx.errors.OnnxExporterError, TypeError),
+        ):  # TypeError: options of a newer torch
             with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(StringIO()):
                 warnings.simplefilter("ignore")
                 torch.onnx.export(
@@ -147,29 +154,12 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
                     output_names=["boxes", "labels", "scores", "masks"],
                     verbose=False,
                 )
-        except (torch.onnx.errors.OnnxExporterError, TypeError) as error:  # TypeError: options of a newer torch
-            reason = " ".join(str(error).split())[:200]
-            raise SegmentationError(
-                f"torch {torch.__version__} cannot export the network: {reason}", "torch >= 2.6"
-            ) from error
         model = onnx.load(str(temporary))
         onnx.helper.set_model_props(model, {"names": repr(classes), "producer": "dynslam-bench"})
         onnx.checker.check_model(model)
         onnx.save(model, str(temporary))
         megabytes = temporary.stat().st_size / 1e6
     return ExportedNetwork(path, size, classes, megabytes)
-
-
-def _library() -> Any:
-    try:
-        import onnx
-        import onnxscript  # noqa: F401 - torch's exporter asks for it
-    except ImportError as error:
-        raise SegmentationError(
-            f"networks are exported with onnx and onnxscript: {error.name} is not installed",
-            install_hint("onnx"),
-        ) from error
-    return onnx
 
 
 class StaticMaskRCNN(nn.Module):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Instances, SegmenterContext
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.errors import SegmentationError, raising
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, NMS_IOU, VOC_NAMES, SegmentationSettings
@@ -69,13 +69,13 @@ class OnnxSegmenter:
         self.path, self.settings, self.threads, self.floor = path.expanduser(), settings, threads, floor
         header = read_header(self.path)
         self._size = _input_size(header, self.path)
-        try:
+        with raising(
+            SegmentationError,
+            f"OpenCV {cv2.__version__} cannot load {self.path}",
+            "export it with static shapes and plain operators",
+            of=(cv2.error, RuntimeError),
+        ):
             self._net = cv2.dnn.readNetFromONNX(str(self.path))
-        except (cv2.error, RuntimeError) as error:
-            raise SegmentationError(
-                f"OpenCV {cv2.__version__} cannot load {self.path}: {_first_line(error)}",
-                "export it with static shapes and plain operators",
-            ) from error
         self._input = header.inputs[0].name
         self.layout = self._find_layout(header)
 
@@ -115,14 +115,14 @@ class OnnxSegmenter:
         scaled = (image.astype(np.float32) - np.array(mean, np.float32)) / np.array(divisor, np.float32)
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
         with pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads):
-            try:
+            with raising(
+                SegmentationError,
+                f"{self.path} cannot run on a {image.shape[1]}x{image.shape[0]} image",
+                f"OpenCV {cv2.__version__}",
+                of=(cv2.error, RuntimeError),
+            ):
                 self._net.setInput(blob, self._input)
                 outputs = self._net.forward(names)
-            except (cv2.error, RuntimeError) as error:
-                raise SegmentationError(
-                    f"{self.path} cannot run on a {image.shape[1]}x{image.shape[0]} image: {_first_line(error)}",
-                    f"OpenCV {cv2.__version__}",
-                ) from error
         return [np.asarray(output, np.float32) for output in outputs]
 
 
@@ -261,14 +261,14 @@ def _aligned(cells: Sequence[int | None], size: tuple[int, int]) -> bool:
 def _metadata_names(metadata: Mapping[str, str], where: str) -> dict[int, str] | None:
     if "names" not in metadata:
         return None
-    try:
+    with raising(
+        SegmentationError,
+        f"{where}: the metadata entry 'names' is not a table of class names",
+        of=(ValueError, SyntaxError, TypeError),
+    ):
         value = ast.literal_eval(metadata["names"])
         pairs = value.items() if isinstance(value, dict) else enumerate(value)
         return {int(number): str(name) for number, name in pairs}
-    except (ValueError, SyntaxError, TypeError) as error:
-        raise SegmentationError(
-            f"{where}: the metadata entry 'names' is not a table of class names: {error}"
-        ) from error
 
 
 def _unknown(outputs: Sequence[TensorInfo], where: str, reason: str) -> SegmentationError:
@@ -501,13 +501,14 @@ def read_header(path: Path) -> OnnxHeader:
     Raises:
         SegmentationError: The file is missing, truncated or no ONNX model.
     """
-    try:
+    with raising(SegmentationError, f"cannot read the network {path}", "give the path of an .onnx file"):
         data = path.expanduser().read_bytes()
-    except OSError as error:
-        raise SegmentationError(
-            f"cannot read the network {path}: {error.strerror}", "give the path of an .onnx file"
-        ) from error
-    try:
+    with raising(
+        SegmentationError,
+        f"{path} is not an ONNX model ({len(data)} bytes)",
+        "the file is truncated or of another format",
+        of=(ValueError, IndexError, TypeError, AttributeError),
+    ):  # also a field of another type
         model = _fields(memoryview(data))
         graph = _message(model, 7)
         initialised = {_text(_fields(tensor), 8) for tensor in graph.get(5, ())}
@@ -516,10 +517,6 @@ def read_header(path: Path) -> OnnxHeader:
         metadata = {_text(entry, 1): _text(entry, 2) for entry in map(_fields, model.get(14, ()))}
         if not inputs or not outputs:
             raise ValueError(f"it declares {len(inputs)} inputs and {len(outputs)} outputs")
-    except (ValueError, IndexError, TypeError, AttributeError) as error:  # also a field of another type
-        raise SegmentationError(
-            f"{path} is not an ONNX model ({len(data)} bytes): {error}", "the file is truncated or of another format"
-        ) from error
     return OnnxHeader(inputs, outputs, metadata)
 
 

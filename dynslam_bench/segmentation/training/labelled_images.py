@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Sequence as RgbdSequence
-from dynslam_bench.core.errors import SegmentationError, did_you_mean
+from dynslam_bench.core.errors import SegmentationError, did_you_mean, raising
 from dynslam_bench.core.files import atomic_folder
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.reading import TABLE_BYTES, read_json, read_lines
@@ -147,14 +147,15 @@ def _read_yolo(path: Path, label: Path) -> LabelledImage:
     lines = read_lines(label, kind=SegmentationError) if label.is_file() else []
     for number, line in enumerate(lines, 1):
         if line.strip():
-            try:
+            with raising(
+                SegmentationError,
+                f"{label} line {number} is no polygon label",
+                "expected class x1 y1 x2 y2 ...",
+                of=(ValueError, LookupError, OverflowError),
+            ):
                 kind, *points = line.split()
                 names.append(dict(enumerate(COCO_NAMES))[int(kind)])
                 polygon = _polygon(points) * [rgb.shape[1], rgb.shape[0]]
-            except (ValueError, LookupError, OverflowError) as error:
-                raise SegmentationError(
-                    f"{label} line {number} is no polygon label: {error}", "expected class x1 y1 x2 y2 ..."
-                ) from error
             masks.append(_fill([polygon], rgb.shape[:2]))
     return _labelled(rgb, masks, names)
 
@@ -199,7 +200,12 @@ def _polygon(points: Any) -> NDArray[np.float64]:
 
 def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:
     """A mask from polygons, or from run lengths column by column, which must fill the image exactly."""
-    try:
+    with raising(
+        SegmentationError,
+        f"{where}: a segmentation is damaged",
+        "COCO's are polygons or run lengths",
+        of=(ValueError, TypeError, LookupError, OverflowError),
+    ):
         if isinstance(segmentation, list):
             return _fill([_polygon(points) for points in segmentation], shape)
         counts = segmentation["counts"]
@@ -210,10 +216,6 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
             raise ValueError(f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}")
         flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
         return np.ascontiguousarray(flat.reshape(width, height).T)
-    except (ValueError, TypeError, LookupError, OverflowError) as error:
-        raise SegmentationError(
-            f"{where}: a segmentation is damaged: {str(error)[:200]}", "COCO's are polygons or run lengths"
-        ) from error
 
 
 def decode_runs(text: str) -> list[int]:
@@ -284,13 +286,11 @@ def rendered_frames(text: str = "") -> LabelledImages:
         if key not in values or not separator:
             raise SegmentationError(f"synthetic: unknown option '{part}'", "known: " + ", ".join(values))
         values[key] = value
-    try:
+    with raising(SegmentationError, f"synthetic: '{text}' is not understood", of=ValueError):
         first, _, last = values["scenes"].partition("-")
         scenes = range(int(first), int(last or first) + 1)
         frames, length, seed = (int(values[key]) for key in ("frames", "length", "seed"))
         options = float(values["options"])
-    except ValueError as error:
-        raise SegmentationError(f"synthetic: '{text}' is not understood: {error}") from error
     if not scenes or scenes[0] < 0 or scenes[-1] > 199 or not 1 <= frames <= length:
         raise SegmentationError(
             f"synthetic: '{text}' asks for scenes or frames that do not exist", "scenes 0-199, at least one frame"
@@ -389,12 +389,12 @@ class PreparedImages:
     """
 
     def __init__(self, folder: Path, classes: Sequence[str]) -> None:
-        try:
+        with raising(
+            SegmentationError, f"the prepared images in {folder} are damaged", _AGAIN, of=Exception
+        ):  # numpy raises many types for a damaged header
             self.images, self.labels = (
                 np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("images", "labels")
             )
-        except Exception as error:  # numpy raises many types for a damaged header
-            raise SegmentationError(f"the prepared images in {folder} are damaged: {error}", _AGAIN) from error
         self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
         if not len(self.images) == len(self.labels) == len(self.names):
             raise SegmentationError(f"the prepared images in {folder} are damaged: their numbers differ", _AGAIN)

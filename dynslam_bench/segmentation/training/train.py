@@ -14,7 +14,7 @@ import pandas as pd
 import torch
 from torch import nn
 
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core.errors import SegmentationError, raising
 from dynslam_bench.core.files import replacing, write_atomic
 from dynslam_bench.core.reading import read_json
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
@@ -240,14 +240,15 @@ class TrainingRun:
             SegmentationError: The file does not fit.
         """
         content = read_checkpoint(self.output / "last.pt")
-        try:
+        with raising(
+            SegmentationError,
+            f"{self.output / 'last.pt'} does not fit these settings",
+            of=(LookupError, RuntimeError, ValueError, TypeError, AttributeError),
+        ):
             for name in self._MODULES:
                 getattr(self, name).load_state_dict(content[name])
             for name, kind in self._PLAIN.items():
                 setattr(self, name, kind(content[name]))
-        except (LookupError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-            reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise SegmentationError(f"{self.output / 'last.pt'} does not fit these settings: {reason}") from error
 
 
 def draw_curve(table: pd.DataFrame, path: Path, title: str) -> None:

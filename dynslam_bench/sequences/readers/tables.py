@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import SequenceError, TrajectoryError
+from dynslam_bench.core.errors import SequenceError, TrajectoryError, raising
 from dynslam_bench.core.reading import read_lines, read_text
 from dynslam_bench.geometry import Array, Trajectory, is_number, parse_ns, refuse_close, se3, to_seconds
 from dynslam_bench.sequences.readers.lists import MOST_LINES
@@ -34,11 +34,10 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
     opened = text.count("[") + text.count("{")
     if opened > MOST_BRACKETS:
         raise SequenceError(f"{path} opens {opened} lists and mappings, more than a calibration's {MOST_BRACKETS}")
-    try:
+    with raising(
+        SequenceError, f"{path} is no valid YAML", of=Exception
+    ):  # values such as dates make yaml's constructors raise whatever they like
         document = yaml.safe_load(re.sub(r"^%YAML.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
-    except Exception as error:  # values such as dates make yaml's constructors raise whatever they like
-        reason = " ".join(str(error).split())[:200]
-        raise SequenceError(f"{path} is no valid YAML: {reason or type(error).__name__}") from error
     if not isinstance(document, Mapping):
         raise SequenceError(f"{path} holds no YAML mapping")
     return document

@@ -16,7 +16,7 @@ import numpy as np
 
 import dynslam_bench
 from dynslam_bench.contracts import TrackerContext
-from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core.errors import TrackerError, raising
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import vocabularies_folder
 from dynslam_bench.core.reading import MEGABYTE, read_bytes
@@ -61,11 +61,9 @@ def find_vocabulary(setting: str) -> Path:
     path = Path(named).expanduser().absolute()
     if not path.is_file():
         raise TrackerError(f"orbslam3: no vocabulary file {path}", HINT)
-    try:
+    with raising(TrackerError, f"orbslam3: cannot read the vocabulary {path}", HINT):
         stamp = path.stat()
         return _prepared(path, stamp.st_size, stamp.st_mtime_ns)
-    except OSError as error:
-        raise TrackerError(f"orbslam3: cannot read the vocabulary {path}: {error.strerror}", HINT) from error
 
 
 @lru_cache(maxsize=8)
@@ -78,12 +76,13 @@ def _prepared(path: Path, size: int, modified_ns: int) -> Path:
     target = vocabularies_folder() / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
     if target.is_file():
         return _prepared(target, target.stat().st_size, target.stat().st_mtime_ns)
-    try:
+    with raising(
+        TrackerError,
+        f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file",
+        HINT,
+        of=(lzma.LZMAError, EOFError, ValueError),
+    ):
         text = _unpack(packed)
-    except (lzma.LZMAError, EOFError, ValueError) as error:
-        raise TrackerError(
-            f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file: {error}", HINT
-        ) from None
     _check(text, path)
     write_atomic(target, text)
     return target

@@ -15,7 +15,7 @@ from typing import Literal
 from pydantic import Field
 
 from dynslam_bench.contracts import TrackerSpec
-from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core.errors import SettingsError, raising
 from dynslam_bench.core.settings import Settings, names, tunable
 from dynslam_bench.core.version import install_hint
 
@@ -78,10 +78,8 @@ class SubprocessSettings(ProgramSettings):
         Raises:
             SettingsError: There are none, or its quotes do not match.
         """
-        try:
+        with raising(SettingsError, f"subprocess: cannot split the command '{self.command}'", of=ValueError):
             command = shlex.split(self.command)
-        except ValueError as error:
-            raise SettingsError(f"subprocess: cannot split the command '{self.command}': {error}") from None
         if not command:
             hint = "write 'subprocess:PROGRAM ARGUMENTS' or --set command=..."
             raise SettingsError("subprocess needs a command", hint)

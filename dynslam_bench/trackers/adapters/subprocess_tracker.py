@@ -27,7 +27,7 @@ import numpy as np
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError, raising
 from dynslam_bench.core.files import SHARED_MEMORY, TemporaryFolder
 from dynslam_bench.core.reading import parse_json
 from dynslam_bench.core.seeding import derive_seed
@@ -73,7 +73,7 @@ class Program:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
-        try:
+        with raising(TrackerError, f"{name}: cannot start '{command[0]}'", "check its path", of=(OSError, ValueError)):
             self._process = subprocess.Popen(
                 list(command),
                 stdin=subprocess.PIPE,
@@ -84,9 +84,6 @@ class Program:
                 start_new_session=True,
                 preexec_fn=end_with_parent(),
             )
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise TrackerError(f"{name}: cannot start '{command[0]}': {reason}", "check its path") from error
         self._kill = weakref.finalize(self, _kill_group, self._process)
         self._answers: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # None: standard output has ended
         self._old_lines, self._new_lines = dict[str, str](), dict[str, str]()  # new: since the last request
