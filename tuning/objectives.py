@@ -21,9 +21,10 @@ from scipy import stats
 
 from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs import RunEvent, RunRecord, RunStore, run_many, score
 from dynslam_bench.trackers.registry import TRACKERS
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec
+from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
 
 
 @dataclass(frozen=True)
@@ -358,19 +359,15 @@ def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
     Returns:
         Natural logarithm by scene, below 0 is better than the baseline.
     """
-    reference = _log_errors(baseline)
-    ratios: dict[str, list[float]] = {}
-    for place, values in _log_errors(errors).items():
-        ratios.setdefault(place.scene, []).append(float(np.median(values) - np.median(reference[place])))
-    return {scene: float(np.mean(values)) for scene, values in ratios.items()}
+    reference = log_errors(baseline)
+    ratios = {place: np.median(logs) - np.median(reference[place]) for place, logs in log_errors(errors).items()}
+    return {scene: float(np.mean([ratios[place] for place in places])) for scene, places in scenes(ratios).items()}
 
 
-def _log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
+def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
     """Natural logarithms of the errors in metres, by place."""
-    logs: dict[ProblemInstance, list[float]] = {}
-    for instance, error in errors.items():
-        logs.setdefault(place_of(instance), []).append(math.log(max(error, FLOOR_M)))
-    return logs
+    groups = grouped(errors, place_of).items()
+    return {place: [math.log(max(errors[instance], FLOOR_M)) for instance in group] for place, group in groups}
 
 
 def centre(values: Iterable[float]) -> float:

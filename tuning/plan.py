@@ -31,14 +31,13 @@ from dynslam_bench.runs.identity import resolve
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.objectives import (
     FEWEST_SCENES,
-    FLOOR_M,
     Configuration,
     Objective,
     detectable,
     find_objective,
     held_protocol,
+    log_errors,
     outcome,
-    place_of,
     scenes_needed,
 )
 from dynslam_bench.tuning.splits import design_of, source_of_masks
@@ -270,10 +269,9 @@ class Plan:
 
     def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:
         """Standard deviation between starts of the log ratio of two runs; 0 where no scene has two stored runs."""
-        protocol, logs = held_protocol(get_protocol(self.spec.protocol)), dict[ProblemInstance, list[float]]()
-        for instance, record in records.items():
-            ate = outcome(self.store, record, instance, protocol, self.spec.data_root).ate_m
-            logs.setdefault(place_of(instance), []).append(math.log(max(ate, FLOOR_M)))
+        protocol, root = held_protocol(get_protocol(self.spec.protocol)), self.spec.data_root
+        runs = {at: outcome(self.store, record, at, protocol, root) for at, record in records.items()}
+        logs = log_errors({at: run.ate_m for at, run in runs.items()})
         free = sum(len(values) - 1 for values in logs.values())
         squares = sum(float(np.var(values)) * len(values) for values in logs.values())
         return math.sqrt(2 * squares / free) if free else 0.0

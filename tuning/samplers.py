@@ -27,7 +27,7 @@ from optuna.trial import FrozenTrial, TrialState
 from dynslam_bench.core.errors import StudyError, raising
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.flow.moth_flame import EMFOA, flames_left, flight, moth_positions, opposites
-from dynslam_bench.tuning.study_file import PrunerName, StudySpec
+from dynslam_bench.tuning.study_file import PrunerName, SamplerName, StudySpec
 
 _STARTUP_TRIALS = 8
 
@@ -78,28 +78,30 @@ class StreamedSampler(optuna.samplers.BaseSampler):
         return self._sampler.sample_independent(study, trial, param_name, param_distribution)
 
 
+_SAMPLERS: dict[SamplerName, Callable[[StudySpec, int], optuna.samplers.BaseSampler]] = {
+    "random": lambda spec, seed: optuna.samplers.RandomSampler(seed=seed),
+    "tpe": lambda spec, seed: optuna.samplers.TPESampler(
+        n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2), constant_liar=True, seed=seed
+    ),
+    "nsga2": lambda spec, seed: optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed),
+    "gp": lambda spec, seed: optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed),
+    "cmaes": lambda spec, seed: RestrictedCmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS),
+    "emfoa": lambda spec, seed: EmfoaSampler(seed=seed, n_trials=spec.trials),
+}
+_OF_ONE_OBJECTIVE = ("cmaes", "emfoa")
+
+
 def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
-    if spec.sampler == "random":
-        return optuna.samplers.RandomSampler(seed=seed)
-    if spec.sampler == "tpe":
-        with warnings.catch_warnings():  # `constant_liar` counts as experimental
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            startup = min(_STARTUP_TRIALS, spec.trials // 2)
-            return optuna.samplers.TPESampler(n_startup_trials=startup, constant_liar=True, seed=seed)
-    if spec.sampler == "nsga2":
-        return optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed)
-    if spec.sampler == "gp":
-        return optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed)
-    if len(spec.objectives) > 1:
+    if spec.sampler in _OF_ONE_OBJECTIVE and len(spec.objectives) > 1:
         raise StudyError(
             f"sampler '{spec.sampler}' takes one objective, the study has {len(spec.objectives)}",
             "use tpe, nsga2, gp or random",
         )
-    if spec.sampler == "cmaes":
-        if find_spec("cmaes") is None:
-            raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
-        return RestrictedCmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS)
-    return EmfoaSampler(seed=seed, n_trials=spec.trials)
+    if spec.sampler == "cmaes" and find_spec("cmaes") is None:
+        raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
+    with warnings.catch_warnings():  # TPE's `constant_liar` counts as experimental
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return _SAMPLERS[spec.sampler](spec, seed)
 
 
 def is_feasible(trial: FrozenTrial) -> bool:
@@ -203,9 +205,8 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
             raise ValueError("EmfoaSampler takes one objective")
         if not search_space:
             return {}
-        cube, sign = _SearchSpaceTransform(search_space, transform_0_1=True), 1.0
-        if study.direction == StudyDirection.MAXIMIZE:
-            sign = -1.0
+        cube = _SearchSpaceTransform(search_space, transform_0_1=True)
+        sign = -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
         trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
         finished = [one for one in trials if one.value is not None and search_space.keys() <= one.params.keys()]
         units = [cube.transform({name: one.params[name] for name in search_space}) for one in finished]
@@ -244,15 +245,18 @@ DOMINATED_SHARE = 0.1
 WILCOXON_LEVEL = 0.1
 
 
+_PRUNERS: dict[PrunerName, Callable[[], optuna.pruners.BasePruner]] = {
+    "halving": lambda: optuna.pruners.SuccessiveHalvingPruner(min_resource=FIRST_STEP, reduction_factor=2),
+    "wilcoxon": lambda: optuna.pruners.WilcoxonPruner(p_threshold=WILCOXON_LEVEL, n_startup_steps=FIRST_STEP),
+    "none": optuna.pruners.NopPruner,
+}
+
+
 def build_pruner(name: PrunerName) -> optuna.pruners.BasePruner:
     """Optuna's pruner of that name."""
-    if name == "halving":
-        return optuna.pruners.SuccessiveHalvingPruner(min_resource=FIRST_STEP, reduction_factor=2)
-    if name == "wilcoxon":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            return optuna.pruners.WilcoxonPruner(p_threshold=WILCOXON_LEVEL, n_startup_steps=FIRST_STEP)
-    return optuna.pruners.NopPruner()
+    with warnings.catch_warnings():  # the Wilcoxon pruner counts as experimental
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return _PRUNERS[name]()
 
 
 def steps(name: PrunerName, count: int) -> list[int]:

@@ -20,7 +20,7 @@ from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.reports.model.row import SEEN
+from dynslam_bench.reports.model.row import SEEN, grouped
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
 from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
@@ -100,11 +100,8 @@ def running_order(instances: PySequence[ProblemInstance], seed: int) -> list[Pro
 
 def with_more_starts(instances: PySequence[ProblemInstance]) -> list[ProblemInstance]:
     """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
-    places: dict[ProblemInstance, list[ProblemInstance]] = {}
-    for instance in instances:
-        places.setdefault(place_of(instance), []).append(instance)
     more = []
-    for repeats in places.values():
+    for repeats in grouped(instances, place_of).values():
         used = {instance.offset for instance in repeats}
         unused = (offset for offset in itertools.count() if offset not in used)
         more += [replace(repeats[0], offset=offset) for offset in islice(unused, max(FEWEST_STARTS - len(used), 0))]

@@ -18,6 +18,7 @@ from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.sanitise import without_passwords
 from dynslam_bench.core.toml import read_toml
+from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.sequences.catalogue import entry_of, open_sequence, parse_frames
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -174,10 +175,7 @@ def scene_of(name: str) -> str:
 
 def scenes(instances: Iterable[ProblemInstance]) -> dict[str, list[ProblemInstance]]:
     """Instances by their scene, both in order of appearance."""
-    groups: dict[str, list[ProblemInstance]] = {}
-    for instance in instances:
-        groups.setdefault(instance.scene, []).append(instance)
-    return groups
+    return grouped(instances, lambda instance: instance.scene)
 
 
 def further_scenes(

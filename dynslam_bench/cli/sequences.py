@@ -143,11 +143,9 @@ def doctor(
 
     with progress(name) as advance:
         diagnosis = diagnose(name, data_root=data_root, camera=camera, progress=advance)
-    faults = sum(finding.severity == "fault" for finding in diagnosis.findings)
-    verdict = "no fault found" if diagnosis.ok else f"{faults} fault{'s' * (faults != 1)}"
     present(
         {**asdict(diagnosis), "ok": diagnosis.ok},
-        f"{diagnosis.id}: {verdict}, {diagnosis.frames} frames compared",
+        f"{diagnosis.id}: {diagnosis.verdict}, {diagnosis.frames} frames compared",
         *(f"  {f.severity} {f.id}: {f.text}\n    cure: {f.cure}" for f in diagnosis.findings),
     )
     if not diagnosis.ok:

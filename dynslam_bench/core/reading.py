@@ -41,10 +41,11 @@ def read_bytes(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError
     Raises:
         DynslamError: Of the given kind: it cannot be read, or is larger.
     """
-    with raising(kind, f"cannot read {path}", of=(OSError, ValueError)):  # ValueError: a name with a null byte
-        with path.open("rb") as file:  # in two steps: taking memory for `limit` bytes costs as much as reading them
-            data = file.read(min(_MOST_FILES, limit + 1))
-            data += file.read(limit + 1 - len(data)) if len(data) == _MOST_FILES else b""
+    # ValueError: a name with a null byte
+    with raising(kind, f"cannot read {path}", of=(OSError, ValueError)), path.open("rb") as file:
+        # in two steps: taking memory for `limit` bytes costs as much as reading them
+        data = file.read(min(_MOST_FILES, limit + 1))
+        data += file.read(limit + 1 - len(data)) if len(data) == _MOST_FILES else b""
     if len(data) > limit:
         raise kind(_too_large(path, limit))
     return data
@@ -117,12 +118,14 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
 
     data = read_bytes(path, limit=MOST_BYTES, kind=kind)
     # zipfile and numpy raise almost anything over damaged files
-    with raising(kind, f"{path} holds no arrays", of=Exception):
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            claimed = sum(entry.file_size for entry in archive.zip.infolist())
-            if claimed > MOST_BYTES:
-                raise ValueError(f"it claims {claimed / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read")
-            arrays = dict(archive)
+    with (
+        raising(kind, f"{path} holds no arrays", of=Exception),
+        np.load(io.BytesIO(data), allow_pickle=False) as archive,
+    ):
+        claimed = sum(entry.file_size for entry in archive.zip.infolist())
+        if claimed > MOST_BYTES:
+            raise ValueError(f"it claims {claimed / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read")
+        arrays = dict(archive)
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise kind(f"{path} holds something else than arrays")
     return arrays

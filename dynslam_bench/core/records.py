@@ -97,7 +97,7 @@ def validated(cls: type[M], values: Any, where: str, kind: type[DynslamError]) -
         if first["type"] == "extra_forbidden":
             raise kind(f"{where}: unknown key '{name}'", did_you_mean(name, _keys(cls))) from None
         text = first["msg"].removeprefix("Value error, ")
-        raise kind(f"{where}: {name + ': ' if name else ''}{text}") from None
+        raise kind(f"{where}: {name + ': ' if name else ''}{text[0].lower()}{text[1:]}") from None
 
 
 def _keys(cls: type[BaseModel]) -> Iterator[str]:

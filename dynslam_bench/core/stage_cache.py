@@ -79,13 +79,16 @@ class StageCache:
             DynslamError: The folder cannot be written, e.g. a full disk; nothing is left behind.
         """
         path = self._path(stage, key)
-        with raising(
-            DynslamError,
-            f"cannot write the stage cache {self.folder}",
-            f"free some space, or name another folder by {STAGES_VARIABLE}",
+        with (
+            raising(
+                DynslamError,
+                f"cannot write the stage cache {self.folder}",
+                f"free some space, or name another folder by {STAGES_VARIABLE}",
+            ),
+            replacing(path) as temporary,
+            temporary.open("wb") as file,
         ):
-            with replacing(path) as temporary, temporary.open("wb") as file:
-                np.savez(file, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
         self._writes += 1
         if self._writes % _PRUNE_EVERY == 1:
             self.prune()

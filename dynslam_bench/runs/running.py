@@ -561,12 +561,12 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     """
     with contextlib.closing(TemporaryFolder()) as folder:
         sent = RunStore(folder.path)
-        with raising(
-            RunError, f"{len(data)} bytes from a worker are no packed run", of=Exception
-        ):  # zipfile raises almost anything over damaged archives
-            with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                odd = [name for name in archive.namelist() if not _ENTRY.fullmatch(name)]
-                archive.extractall(folder.path, set(archive.namelist()).difference(odd))
+        with (  # zipfile raises almost anything over damaged archives
+            raising(RunError, f"{len(data)} bytes from a worker are no packed run", of=Exception),
+            zipfile.ZipFile(io.BytesIO(data)) as archive,
+        ):
+            odd = [name for name in archive.namelist() if not _ENTRY.fullmatch(name)]
+            archive.extractall(folder.path, set(archive.namelist()).difference(odd))
         runs = sent.ids()
         if odd or len(runs) != 1:
             raise RunError(f"a packed run holds {len(runs)} runs, and {len(odd)} odd names")

@@ -344,9 +344,8 @@ class RunStore:
             RunError: There is no such run, or it cannot be deleted.
         """
         run_id = self.find(run_id)
-        with raising(RunError, f"cannot remove run {run_id}"):
-            with self.work_folder(run_id) as removed:
-                self.folder(run_id).rename(removed / run_id)
+        with raising(RunError, f"cannot remove run {run_id}"), self.work_folder(run_id) as removed:
+            self.folder(run_id).rename(removed / run_id)
         self.index.forget(run_id)
         self._unlink_dangling()
 

@@ -21,8 +21,8 @@ from dynslam_bench.core.toml import parse_toml
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"\xff\xfe", "is not a text file: byte 0 .0xff. is no UTF-8"),
-        (b"[" * 100_000, "is no valid JSON: it is nested too deeply"),
+        (b"\xff\xfe", "is not a text file: .utf-8. codec can.t decode byte 0xff"),
+        (b"[" * 100_000, "is no valid JSON: maximum recursion depth"),
         (b"9" * 5000, "is no valid JSON: Exceeds the limit"),
         (b"{", "is no valid JSON: Expecting property name"),
         (b" " * 2000, "has more than the 0.00095.* MB that are read"),

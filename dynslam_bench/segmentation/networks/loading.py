@@ -6,7 +6,6 @@ Loading is strict and never unpickles.
 from __future__ import annotations
 
 import math
-import os
 import re
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -65,8 +64,7 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     """
     path = path.expanduser()
     with raising(SegmentationError, f"cannot read the checkpoint {path}"):
-        with path.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
+        size = path.stat().st_size
     with raising(
         SegmentationError,
         f"{path} ({size} bytes) is no torch checkpoint of plain weights",

@@ -114,15 +114,17 @@ class OnnxSegmenter:
         mean, divisor = _SCALINGS[scaling]
         scaled = (image.astype(np.float32) - np.array(mean, np.float32)) / np.array(divisor, np.float32)
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
-        with pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads):
-            with raising(
+        with (
+            pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads),
+            raising(
                 SegmentationError,
                 f"{self.path} cannot run on a {image.shape[1]}x{image.shape[0]} image",
                 f"OpenCV {cv2.__version__}",
                 of=(cv2.error, RuntimeError),
-            ):
-                self._net.setInput(blob, self._input)
-                outputs = self._net.forward(names)
+            ),
+        ):
+            self._net.setInput(blob, self._input)
+            outputs = self._net.forward(names)
         return [np.asarray(output, np.float32) for output in outputs]
 
 
