@@ -185,10 +185,6 @@ def _input_size(header: OnnxHeader, path: Path) -> tuple[int, int] | None:
     return None if height is None or width is None else (height, width)
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
 @dataclass(frozen=True)
 class Layout:
     """How to read a network's outputs.
