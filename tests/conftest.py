@@ -6,6 +6,8 @@ import pytest
 
 # The tests start many interpreters, and each would compile the sources that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# They import the installed package, also from the checkout's folder; else the kernels compile twice.
+os.environ["PYTHONSAFEPATH"] = "1"
 COMPILING = pytest.StashKey[subprocess.Popen]()
 
 
