@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -178,9 +179,8 @@ def build_report(
     paged_ids = {row.run_id for row in paged}
     write_side(output, "board", side_content(board, boards, protocol, paged_ids, pictured, pageless))
     write_side(output, "ratios", ratios_content(board))
-    return _write(
-        sections, board, boards, protocol, output, title, _notes(board, protocol, loaded, pageless), loaded.trials
-    )
+    notes = _notes(board, protocol, loaded, pageless)
+    return _write(sections, board, boards, protocol, output, title, notes, loaded.trials, paged_ids)
 
 
 def pages_for(runs: int, typical: int) -> int:
@@ -194,13 +194,17 @@ def pages_for(runs: int, typical: int) -> int:
 
 
 def _paged(board: Board, typical: set[str], most: int | None) -> list[RunRow]:
-    """The runs that have a page: the typical one of every cell, then its first, its second, ... repeat."""
+    """The runs that have a page: the typical one of every cell, trackers in turn, failures first; then repeats."""
     most = pages_for(len(board.rows), len(typical)) if most is None else most
     if len(board.rows) <= most:
         return board.rows
     cells = [cell.rows for cells in board.cells.values() for cell in cells.values()]
     turn = {row.run_id: at for rows in cells for at, row in enumerate(rows)} | dict.fromkeys(typical, -1)
-    return sorted(board.rows, key=lambda row: turn[row.run_id])[:most]
+    rows = sorted(board.rows, key=lambda row: (turn[row.run_id], not row.failed))
+    place = {
+        row.run_id: at for some in grouped(rows, lambda row: row.variant_key).values() for at, row in enumerate(some)
+    }
+    return sorted(rows, key=lambda row: (turn[row.run_id], place[row.run_id]))[:most]
 
 
 def _pageless(pages: int, runs: int) -> str:
@@ -208,9 +212,8 @@ def _pageless(pages: int, runs: int) -> str:
     if pages == runs:
         return ""
     return (
-        f"{runs - pages} of {runs} runs have no page of their own, and their frames stand in no figure: pages are made "
-        f"of {pages}, those with the median error of their cell first (`report --most-pages {runs}` makes all). "
-        "Every number of the tables counts all runs."
+        f"{runs - pages} of {runs} runs have no pictures and no course over time here: {pages} have, those with the "
+        f"median error of their cell first. report --most-pages {runs} shows all. The tables count all runs."
     )
 
 
@@ -234,6 +237,7 @@ def _write(
     title: str,
     notes: list[str],
     trials: int,
+    paged: Collection[str],
 ) -> ReportPaths:
     """Write the pages, and the tables in all formats."""
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
@@ -275,7 +279,7 @@ def _write(
         rows=board.rows,
     ).write(paths.data)
     write_assets(output)
-    write_atomic(paths.html, _first_page(board, boards, protocol, facts, notes, title, footer))
+    write_atomic(paths.html, _first_page(board, boards, protocol, facts, notes, title, footer, paged))
     for page, sections in pages.items():
         name = dict(LINKS)[page]
         text = sections_page(
@@ -301,6 +305,7 @@ def _first_page(
     notes: Sequence[str],
     title: str,
     footer: str,
+    paged: Collection[str],
 ) -> str:
     """The board: the sentence first, then the data, the ranking by category, and accuracy against speed."""
     caption = (
@@ -319,7 +324,7 @@ def _first_page(
         sentence=headline(board),
         sentences={name: headline(some) for name, some in boards.items()},
         facts=facts,
-        categories={name: entries_of(some, board, boards, protocol) for name, some in boards.items()},
+        categories={name: entries_of(some, board, boards, protocol, paged) for name, some in boards.items()},
         meanings=MEANINGS,
         reference=board.reference_name,
         explanation=how_to_read(board),
@@ -359,6 +364,7 @@ def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
     failed = [row for row in board.rows if row.failed]
     endings = [f"{board.labels[row.variant_key]} on {board.sequence(row)}: {row.ending}" for row in failed]
     doubts = reservations(board.rows)
+    quoting = [f"Name the protocol, {protocol.id}{', and say:' if doubts else '.'}", *doubts]
     several = f"{repeats[0]}–{repeats[-1]}" if len(repeats) > 1 else str(repeats[0])
     return [
         (str(len(names)), "sequence" + "s" * (len(names) != 1), sequences),
@@ -366,7 +372,11 @@ def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
         (several, "run a cell" if several == "1" else "runs a cell", []),
         (str(len(board.rows)), "run" + "s" * (len(board.rows) != 1), []),
         (str(len(failed)), "failed", first_of(endings, _MOST_NOTES, "and {} more, see Diagnostics")),
-        (str(len(doubts)), "reservation" + "s" * (len(doubts) != 1) + " when quoting", [*doubts, "Name the protocol."]),
+        (
+            str(len(doubts)),
+            "reservation" + "s" * (len(doubts) != 1) + " when quoting",
+            quoting,
+        ),
         (protocol.id, "protocol", [protocol.describe()]),
     ]
 
@@ -469,9 +479,10 @@ def masks_section(board: Board) -> Section:
 def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
     """Frame-to-frame error against the share of people."""
     bins = {key: error_by_share(some) for key, some in grouped(pages, lambda page: page.variant_key).items()}
+    which = "all successful runs" if len(pages) == len(board.rows) else f"the {len(pages)} runs with pictures here"
     caption = (
-        "Frame-to-frame error (translation, RMSE) over the frames of all successful runs, by the share of the image "
-        "that shows people (exact masks)."
+        f"Frame-to-frame error (translation, RMSE) over the frames of {which}, by the share of the image that shows "
+        "people (exact masks)."
     )
     blocks = figure_blocks(figures.share_figure(board, bins, SHARE_EDGES), caption)
     return Section("share", "Error against the share of people", blocks=blocks)
@@ -618,6 +629,9 @@ def _publish_study(study: Path, output: Path) -> tuple[str, str, str]:
     for page in folder.glob("*.html"):
         shared = f'="../../leaderboard/{ASSETS}/'
         page.write_text(page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', shared), encoding="utf-8")
+    for path in folder.glob("data/run-*.js"):  # pictures and files of runs are not published
+        lists = r'"(pictures|files)":\[(?:[^\[\]]|\[[^\[\]]*\])*\]'
+        path.write_text(re.sub(lists, r'"\1":[]', path.read_text(encoding="utf-8")), encoding="utf-8")
     summary = study / "summary.json"
     words = read_json(summary)["conclusion"] if summary.is_file() else ""
     return f"study/{study.name}/{STUDY_PAGE}", f"Study {study.name}", words

@@ -183,7 +183,7 @@ def mask_figure(board: Board) -> go.Figure | None:
             )
     if not traces:
         return None
-    overlap = {"title": "overlap (IoU) of the undilated mask with the exact one", "range": [-0.02, 1.02]}
+    overlap = {"title": "overlap (IoU) of the mask, dilated, with the exact one", "range": [-0.02, 1.02]}
     return figure_of(traces, max(420, 110 + 21 * len(traces)), xaxis=overlap, yaxis=log_axis("ATE (mm)"))
 
 
@@ -253,5 +253,5 @@ def bar_figure(board: Board, statistic: str) -> go.Figure | None:
         max(380, 100 + 19 * len(traces)),
         barmode="group",
         xaxis={"title": "sequence", "type": "category"},
-        yaxis={"title": f"absolute pose error, {STATISTICS[statistic]} (mm)", "rangemode": "tozero"},
+        yaxis={"title": f"{STATISTICS[statistic]} (mm)", "rangemode": "tozero"},
     )

@@ -243,6 +243,11 @@ class StudySummary(Record):
     seen: list[str] = Field(default_factory=list)
 
     @property
+    def keeps_default(self) -> bool:
+        """Whether the default settings, which are not the baseline, are as good as the best trial."""
+        return beside_default(self.baseline, self.shipped, self.best).endswith("keep them.")
+
+    @property
     def best(self) -> Candidate | None:
         """The best candidate; None if no trial with other settings came to its end."""
         return self.candidates[0] if self.candidates else None
@@ -313,6 +318,22 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
     missing = max(part.missing for part in ([ratio] if best.chosen else [ratio, best.confirm]) if part.ratio < 1)
     more = f"about {missing} more scene{'s' * (missing != 1)} would settle it"
     return Verdict.PROMISING, f"{name} has perhaps {gain}: {numbers}; {unsettled}, {more}"
+
+
+def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate | None) -> str:
+    """What the default settings reach where the baseline is something else; empty if it is not.
+
+    Args:
+        baseline: What ratios are to, in words.
+        shipped: The default settings beside it, by split.
+        best: The best candidate.
+    """
+    split = next((split for split in ("held_out", "confirm") if split in shipped), None)
+    mine = None if best is None or split is None else getattr(best, split)
+    if split is None or mine is None:
+        return ""
+    keep = ", so keep them" if shipped[split].ratio <= mine.ratio else ""
+    return f" Ratios are to {baseline}; the default settings have {shipped[split]} there{keep}."
 
 
 def _unsettled(best: Candidate, split_notes: Sequence[str]) -> str:
@@ -435,6 +456,7 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
     p_value, notes = spread_test(list(ratios.values())), list(design.notes)
     reasons = [trial.user_attrs.get("reason", "") for trial in tuner.study.get_trials(states=(TrialState.FAIL,))]
     verdict, conclusion = judge(candidates, p_value, notes, reasons)
+    conclusion += beside_default(spec.baseline, shipped, candidates[0] if candidates else None)
     summary = StudySummary(
         name=spec.name,
         tracker=spec.tracker,

@@ -170,7 +170,12 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
             )
     blocks = []
     for title, figure in figures.items():
-        figure.update_layout(title=None, template={}, height=figure.layout.height or 450)
+        rows = 1 + max((int(axis._plotly_name[5:] or 1) - 1 for axis in figure.select_yaxes()), default=0)
+        height = 60 + 170 * round(math.sqrt(rows)) if title == "Contours" else 450
+        figure.update_layout(title=None, template={}, height=figure.layout.height or height)
+        if title in ("Contours", "Slices"):  # whole names of settings overlap
+            for axis in (*figure.select_xaxes(), *figure.select_yaxes()):
+                axis.update(title={"text": (axis.title.text or "").rpartition(".")[2], "font": {"size": 11}})
         blocks += figure_blocks(figure, f"{title}, as Optuna draws it.", title)
     return blocks
 
@@ -181,8 +186,9 @@ def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]
     if best is None:
         return [shown]
     text = read_text(tuner.folder / "best.toml")
-    if summary.verdict != Verdict.PROVEN:
-        return [shown, Block("code", title=f"best.toml, not recommended: {summary.verdict.value}", text=text)]
+    if summary.verdict != Verdict.PROVEN or summary.keeps_default:
+        why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
+        return [shown, Block("code", title=f"best.toml, not recommended: {why}", text=text)]
     command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
     return [shown, Block("code", text=text), Block("code", title="Use them", text=command)]
 
@@ -364,9 +370,7 @@ def _trials(tuner: Study, summary: StudySummary, links: Mapping[int, str]) -> Ta
     rows = [
         [
             TableCell(str(trial.number), value=float(trial.number), link=links.get(trial.number, "")),
-            TableCell(
-                trial.state.name.lower(), tip=trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, "")
-            ),
+            TableCell(trial.state.name.lower(), trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, "")),
             *(number(math.exp(value), ".3f") for value in trial.values or ()),
             *(TableCell("-") for _ in tuner.objectives if not trial.values),
             number(trial.user_attrs.get("coverage"), ".3f"),
@@ -377,10 +381,7 @@ def _trials(tuner: Study, summary: StudySummary, links: Mapping[int, str]) -> Ta
     ]
     headings = _marked(summary, *((f"ratio of {objective.what}", "tune") for objective in tuner.objectives))
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings, "coverage", "fps", *names)]
-    caption = (
-        "Behind the state stand the reasons of pruned and failed trials, and the study that an earlier trial is of. A "
-        f"trial's number leads to its runs; of more than {_MOST_RUNS} runs the first ones have pages."
-    )
+    caption = f"A trial's number leads to its runs; of more than {_MOST_RUNS} runs the first ones have pages."
     return Table("trials", "All trials", caption + fewer_starts(tuner.design) + _cautions(summary), columns, rows)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
 from typing import Any
@@ -34,18 +34,21 @@ MEANINGS = {
 """Categories in everyday words."""
 
 
-def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol: Protocol) -> list[dict[str, Any]]:
+def entries_of(
+    board: Board, whole: Board, boards: Mapping[str, Board], protocol: Protocol, paged: Collection[str] = ()
+) -> list[dict[str, Any]]:
     """The rows of one category, cells by the names that `board.html.j2` calls them by.
 
     ``at`` numbers the tracker on all pages; ``group`` is 0 for ranked trackers, 1 for others, 2 for controls (bounds).
-    The name leads to the tracker's run with the median error on the first sequence that it has, and the successes lead
-    to its first failure.
+    The name leads to the tracker's run with the median error on the first sequence where that has a page, and the
+    successes lead to its first failure.
 
     Args:
         board: Of the category.
         whole: Of all sequences: the numbers of trackers.
         boards: Of all categories, for the column that shows them side by side.
         protocol: How errors were computed.
+        paged: Ids of the runs that have a page.
     """
     keys = [*whole.trackers, *whole.final_only]
     standings = {standing.key: standing for standing in board.standings}
@@ -56,7 +59,8 @@ def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol
     for key, row in zip(board.trackers, table.rows, strict=True):
         standing, cells, runs = standings.get(key), dict(zip(names, row, strict=True)), board.cells[key]
         first = board.first(key)
-        start = next((runs[name].typical for name in board.sequences if name in runs), first)
+        typical = [runs[name].typical for name in board.sequences if name in runs] or [first]
+        start = next((run for run in typical if run.run_id in paged), typical[0])
         kind = TableCell("imported") if first.imported else cells["provenance"]
         ended = [run for run in board.runs(key) if not run.failed]
         marks = cells["tracker"].text.removeprefix(board.labels[key])
@@ -73,9 +77,7 @@ def entries_of(board: Board, whole: Board, boards: Mapping[str, Board], protocol
                 "rank": TableCell("–") if standing is None else rank_cell(standing),
                 "ratio": _ratio_cell(board, key, standing),
                 "bar": Markup("") if standing is None else interval_bar(standing.ratio, limits),
-                "verdict": cells["better?"]
-                if key not in board.no_better
-                else TableCell("no", "no better than a static camera"),
+                "verdict": TableCell("not ranked", why) if (why := board.unranked_why(key)) else cells["better?"],
                 "success": cells["success"],
                 "coverage": cells["coverage"],
                 "time": number(middle(run.frame_ms for run in timed(ended)), ".1f"),

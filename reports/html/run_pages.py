@@ -325,7 +325,7 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
         ("real time", row.real_time_factor, 1, " ×"),
         ("keyframes", record.keyframes, 1, ""),
         ("map points", record.map_points, 1, ""),
-        ("overlap (IoU) of undilated masks", row.mask_iou, 1, ""),
+        ("overlap (IoU) of the masks, dilated", row.mask_iou, 1, ""),
     ]
     return [[name, f"{value * by:.4g}{unit}"] for name, value, by, unit in numbers if value is not None]
 

@@ -154,6 +154,20 @@ class Board:
         row = self.first(key)
         return row.ranked and row.is_current and row.tracker.provenance != "control"
 
+    def unranked_why(self, key: str) -> str:
+        """Why a tracker is not ranked, in a few words; empty for one that is, and where nothing is known of it."""
+        row = self.first(key)
+        reasons = {
+            "no better than a static camera": key in self.no_better,
+            "nothing succeeded": key in self.hopeless,
+            "lacks sequences": key in self.incomplete,
+            "in real time": row.realtime,
+            "exact masks: a bound": row.segmentation == EXACT_MASKS,
+            "by an older program": not row.is_current,
+            row.tracker.provenance: not self.is_rankable(key),
+        }
+        return "" if key in self.ranked else next((words for words, holds in reasons.items() if holds), "")
+
     def no_better_than_static(self, key: str, sequence: str) -> bool:
         """Whether a tracker's runs that ended well have, by their median, a static camera's error or more.
 

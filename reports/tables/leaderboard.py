@@ -198,7 +198,7 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
         )
     wins = TableCell(f"{standing.wins} of {standing.sequences}", value=standing.wins)
     return cells | {
-        "#": TableCell("–", "no better than a static camera") if key in board.no_better else rank_cell(standing),
+        "#": TableCell("–", why) if (why := board.unranked_why(key)) else rank_cell(standing),
         "ATE ratio": ratio,
         "better?": verdict_cell(board, standing),
         "wins": TableCell() if key == board.reference else wins,
@@ -581,7 +581,8 @@ def mask_quality(board: Board) -> Table | None:
         lambda row: row.mask_iou,
         "mask_iou",
         "Mask quality",
-        "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs.",
+        "Mean overlap (IoU) of the tracker's dynamic mask with the exact masks of people, median over runs. "
+        "Dilation counts against it: exact masks, dilated, have less than 1.",
         unit="IoU",
         text=significant_text,
         larger_is_better=True,

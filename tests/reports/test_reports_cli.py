@@ -42,7 +42,7 @@ def test_the_sequences_to_rank_on_are_a_switch(store, cli, tmp_path):
     assert "The ranking stands on the 2 of 3 sequences that all ranked trackers have." in common
     assert "| 1–2 | 2/2 | orb-slam2 |" in common
     assert "Not ranked, since they lack sequences: orb-slam2." in everything
-    assert "| – | 2/2 | orb-slam2 |" in everything
+    assert "| – lacks sequences | 2/2 | orb-slam2 |" in everything
     assert "--on all" in (tmp_path / "all" / "reproduce.html").read_text()
     code, _, error = cli("report", "results", "--on", "some")
     assert (code, error) == (1, "error: --on is 'common' or 'all', got 'some'\n")
