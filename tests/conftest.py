@@ -8,19 +8,24 @@ import pytest
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # They import the installed package, also from the checkout's folder; else the kernels compile twice.
 os.environ["PYTHONSAFEPATH"] = "1"
-COMPILING = pytest.StashKey[subprocess.Popen]()
+KERNELS = (
+    "from dynslam_bench.cli.demo import compile_kernels; compile_kernels('orb-slam2')",
+    """
+import numpy as np
+from dynslam_bench.flow.registry import build_flow
+rng, flow = np.random.default_rng(0), build_flow()
+image, points = rng.integers(0, 256, (240, 320), np.uint8), rng.uniform(60, 180, (200, 2)).astype(np.float32)
+flow.track(flow.prepare(image), flow.prepare(np.roll(image, 3, 1)), points)
+""",
+)
+"""What compiles half of the kernels each: those of rendering and SLAM, those of the flow."""
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels once, beside the first tests: several workers would each compile all of them."""
+    """Compile the kernels once, on two cores: several workers would each compile all of them."""
     if getattr(session.config.option, "numprocesses", None) and not hasattr(session.config, "workerinput"):
-        code = "from dynslam_bench.cli.demo import compile_kernels; compile_kernels()"
-        session.config.stash[COMPILING] = subprocess.Popen([sys.executable, "-c", code])
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    if COMPILING in session.config.stash:
-        session.config.stash[COMPILING].kill()
+        for half in [subprocess.Popen([sys.executable, "-c", code]) for code in KERNELS]:
+            half.wait()
 
 
 @pytest.fixture(scope="session")

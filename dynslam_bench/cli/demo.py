@@ -138,14 +138,14 @@ def tell(rows: Iterable[RunRow]) -> list[str]:
     return [*lines, "One run each shows, and proves nothing: `dynslam-bench bench dynamic` repeats."]
 
 
-def compile_kernels() -> None:
-    """Use all kernels once, so that they lie compiled beside their sources (or in the user's cache folder)."""
+def compile_kernels(tracker: str = STUDIED) -> None:
+    """Use all kernels of rendering and a tracker once: then they lie compiled beside their sources (or in a cache)."""
     from dynslam_bench.envs import SlamEnv
     from dynslam_bench.sequences.synthetic import open_synthetic
     from dynslam_bench.testing import CornerSequence
 
     open_synthetic("synthetic/walking_xyz?frames=2", None)[0]
-    env = SlamEnv(CornerSequence(KERNEL_FRAMES), STUDIED)
+    env = SlamEnv(CornerSequence(KERNEL_FRAMES), tracker)
     env.reset(seed=0)
     for _ in range(KERNEL_FRAMES - 1):
         env.step(env.neutral_action)

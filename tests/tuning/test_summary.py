@@ -97,6 +97,15 @@ def accuracy(bound: float) -> dict[str, Ratio]:
     return {"accuracy": Ratio(ratio=1.0, low=0.9, high=bound, n=8, sequences=4, bound=bound)}
 
 
+def test_the_verdict_names_a_baseline_that_is_not_the_default_and_what_the_default_reaches() -> None:
+    best = Candidate(trial=4, params={}, values=[0.0], confirm=CONFIRM, held_out=WIDE)
+    assert beside_default("worse.toml", {}, best) == beside_default("worse.toml", {"held_out": WIDE}, None) == ""
+    better, worse = (WIDE.model_copy(update={"ratio": ratio}) for ratio in (0.8, 0.95))
+    said = beside_default("worse.toml", {"held_out": better}, best)
+    assert said == f" Ratios are to worse.toml; the default settings have {better} there, so keep them."
+    assert "keep" not in beside_default("worse.toml", {"held_out": worse}, best)
+
+
 @pytest.mark.parametrize(
     ("changes", "p_value", "notes", "verdict", "named"),
     [
