@@ -315,8 +315,10 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
         if p_value is None:
             return Verdict.NOT_JUDGED, f"{text}; one trial or one scene cannot tell whether settings matter"
         return Verdict.WORSE, f"the settings matter, but {text}"
-    missing = max(part.missing for part in ([ratio] if best.chosen else [ratio, best.confirm]) if part.ratio < 1)
+    missing = max(part.missing for part in ([ratio] if best.chosen else [ratio, best.confirm]))
     more = f"about {missing} more scene{'s' * (missing != 1)} would settle it"
+    if best.confirm.ratio >= 1:
+        more = f"and as it has {best.confirm} there, nobody can tell how many more scenes would settle it"
     return Verdict.PROMISING, f"{name} has perhaps {gain}: {numbers}; {unsettled}, {more}"
 
 

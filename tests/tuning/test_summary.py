@@ -15,7 +15,7 @@ from scipy.stats import mstats
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning import Study, StudySpec, Verdict, finish, run_study, write_page
-from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, compared, judge
+from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, beside_default, compared, judge
 from dynslam_bench.tuning.objectives import (
     Outcome,
     bounds,
@@ -113,6 +113,7 @@ def test_the_verdict_names_a_baseline_that_is_not_the_default_and_what_the_defau
         ({}, 0.5, ["same"], Verdict.PROMISING, "not apart"),
         ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "upper bound 1.200"),
         ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "about 62 more scenes would settle it"),
+        ({"confirm": LUCKY.model_copy(update={"ratio": 1.07})}, 0.5, [], Verdict.PROMISING, "nobody can tell how many"),
         ({"held_out": WIDE}, 0.5, [], Verdict.PROMISING, "about 60 more scenes would settle it"),
         ({"held_out": None}, 0.5, [], Verdict.PROMISING, "fewer than 3 held-out scenes"),
         ({"confirm": LUCKY, "held_out": WIDE}, 0.5, [], Verdict.NO_MATTER, "p = 0.50"),
