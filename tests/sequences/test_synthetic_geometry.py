@@ -226,6 +226,7 @@ def test_an_older_processor_and_several_threads_render_the_same_bytes() -> None:
     """OpenBLAS's kernels for a Nehalem, numpy without the SIMD that it found, the C library without multiply-adds."""
     extensions = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     older = {
+        "PYTHONPATH": str(Path(__file__).parent),
         "OPENBLAS_CORETYPE": "Nehalem",
         "NPY_DISABLE_CPU_FEATURES": " ".join(extensions),
         "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX2,-FMA,-AVX",
@@ -234,9 +235,7 @@ def test_an_older_processor_and_several_threads_render_the_same_bytes() -> None:
     code = (
         f"from test_synthetic_geometry import fingerprint; print(*(fingerprint(*frame) for frame in {list(expected)}))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=Path(__file__).parent, env=os.environ | older, text=True, capture_output=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | older, text=True, capture_output=True)
     assert done.stdout.split() == list(expected.values()), done.stderr
 
 
