@@ -320,6 +320,6 @@ def seen_note(splits: PySequence[str]) -> str:
     judged = (
         "so nothing here judges the masks: held-out instances are rendered scenes from 100 on"
         if "held_out" in splits
-        else "so the errors there are optimistic, and the held-out instances, which it has not seen, may gain less"
+        else "so errors there are optimistic, and the held-out instances, which it has not seen, may gain less or more"
     )
     return f"{SEEN} In the {named} the masks come from a network that was trained on those very scenes, {judged}."
