@@ -187,6 +187,7 @@ def bench(
     retry: Collection[str] = (),
     time_limit_s: float | None = None,
     memory_limit_mb: float | None = None,
+    shard: tuple[int, int] = (1, 1),
     on_plan: Callable[[Collection[ResolvedRun]], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_fault: OnFault | None = None,
@@ -203,22 +204,26 @@ def bench(
         retry: See `run_many`, as the callbacks `on_plan`, `on_event` and `on_fault`.
         time_limit_s: Seconds that a run may take, in place of the suite's limit.
         memory_limit_mb: Memory that a run may take, in place of the suite's limit.
+        shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ... of them.
         on_plan: Called before the first run.
         on_event: Called with every `RunEvent`.
         on_fault: Called with every run that cannot be made.
         **choice: Arguments of `Suite.specs`: ``trackers``, ``seeds``, ``offsets``, ``frames``, ``data_root``, ...
 
     Raises:
-        DynslamError: The suite names something unknown, or a run cannot be made.
+        DynslamError: The suite names something unknown, a run cannot be made, or the part holds no run.
     """
     from dynslam_bench.suites import load_suite
 
     asked = {"time_s": time_limit_s, "memory_mb": memory_limit_mb}
     limits = {name: value for name, value in asked.items() if value is not None}
+    every = load_suite(suite).specs(**choice)
     specs = [
         spec.model_copy(update={"limits": checked(Limits, **(spec.limits.model_dump() | limits))})
-        for spec in load_suite(suite).specs(**choice)
+        for spec in every[shard[0] - 1 :: shard[1]]
     ]
+    if not specs:
+        raise RunError(f"part {shard[0]} of {shard[1]} holds none of the suite's {len(every)} runs", "make fewer parts")
     how: dict[str, Any] = {"on_plan": on_plan, "on_event": on_event, "on_fault": on_fault, "retry": retry}
     return run_specs(specs, results=results, protocol=protocol, jobs=jobs, scheduler=scheduler, **how)
 

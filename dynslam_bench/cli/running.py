@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from datetime import timedelta
@@ -25,6 +26,7 @@ from dynslam_bench.cli.output import (
     write_error,
 )
 from dynslam_bench.cli.runs import recording_note, show_files, show_runs, training_scene_note
+from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.toml import label_text
 
 if TYPE_CHECKING:
@@ -206,6 +208,12 @@ def bench(
             rich_help_panel=opts.MACHINE,
         ),
     ] = None,
+    shard: Annotated[
+        str,
+        typer.Option(
+            metavar="K/N", help="Only the K-th of N parts of the runs; see `runs merge`.", rich_help_panel=opts.MACHINE
+        ),
+    ] = "1/1",
     retry: opts.Retry = None,
     time_limit: opts.TimeLimit = None,
     memory_limit: opts.MemoryLimit = None,
@@ -235,8 +243,20 @@ def bench(
         seeds=tuple(seed or ()),
         offsets=tuple(offset or ()),
         frames=None if frames is None else parse_frames(frames),
+        shard=parse_shard(shard),
     )
     finish(make, results, jobs, protocol, yes)
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """``3/64`` as ``(3, 64)``.
+
+    Raises:
+        RunError: It is not written so, or K is not 1 to N.
+    """
+    if not (match := re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)) or not 1 <= int(match[1]) <= int(match[2]):
+        raise RunError(f"--shard is '{text}'", "write K/N with K from 1 to N, e.g. 3/64")
+    return int(match[1]), int(match[2])
 
 
 def finish(

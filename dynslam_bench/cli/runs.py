@@ -1,4 +1,4 @@
-"""``runs list|show|rescore|rm``, and runs as the rows of a table."""
+"""``runs list|show|rescore|merge|rm``, and runs as the rows of a table."""
 
 from __future__ import annotations
 
@@ -22,7 +22,17 @@ from dynslam_bench.cli.options import (
     complete_statuses,
     complete_trackers,
 )
-from dynslam_bench.cli.output import announce, fields, json_mode, present, progress, table, warn, write
+from dynslam_bench.cli.output import (
+    SOME_RUNS_FAILED,
+    announce,
+    fields,
+    json_mode,
+    present,
+    progress,
+    table,
+    warn,
+    write,
+)
 from dynslam_bench.core.errors import RunError, did_you_mean
 from dynslam_bench.core.toml import assignments, label_text
 
@@ -159,6 +169,26 @@ def rescore(
     present(outcomes, *lines)
     for reason in outcomes[0].unreadable if outcomes else ():
         announce(f"unreadable: {reason}")
+
+
+@app.command()
+def merge(
+    sources: Annotated[list[Path], typer.Argument(metavar="RESULTS...", help="Results folders, e.g. of shards.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Results folder that gets the runs.")],
+    as_json: AsJson = False,
+) -> None:
+    """Copy the runs of results folders into one; exit with 3 if another result of a run is there, which stays."""
+    store = stored.RunStore(output)
+    merged = stored.merge([_open(folder) for folder in sources], store)
+    present(
+        merged,
+        f"{len(merged.added)} runs copied to {store.root}, {len(merged.stored)} were there already, "
+        f"{len(merged.left_out)} left out",
+    )
+    for entry in merged.left_out:
+        warn(f"left out {entry.path}: {entry.reason}")
+    if merged.left_out:
+        raise typer.Exit(SOME_RUNS_FAILED)
 
 
 @app.command()

@@ -17,7 +17,16 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
     from dynslam_bench.runs.running import RunEvent, pictures_asked, run_many, run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
-    from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, list_runs, part_words, rescore, run_row, score
+    from dynslam_bench.runs.store import (
+        DEFAULT_PROTOCOL,
+        RunStore,
+        list_runs,
+        merge,
+        part_words,
+        rescore,
+        run_row,
+        score,
+    )
 
 _HOMES = {
     "DEFAULT_PROTOCOL": "store",
@@ -28,6 +37,7 @@ _HOMES = {
     "Limits": "spec",
     "list_runs": "store",
     "load_frames": "frames",
+    "merge": "store",
     "MetricRecord": "record",
     "part_words": "store",
     "pictures_asked": "running",
@@ -60,6 +70,7 @@ __all__ = [
     "import_trajectory",
     "list_runs",
     "load_frames",
+    "merge",
     "part_words",
     "pictures_asked",
     "read_trajectory",

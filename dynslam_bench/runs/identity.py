@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +34,9 @@ from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.catalogue import DATASETS
-from dynslam_bench.sequences.view import part_of
+from dynslam_bench.sequences.view import Part, part_of
 from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
@@ -70,7 +73,7 @@ class ResolvedRun:
     identity: dict[str, Any]
     start_map: StartMap | None = None
 
-    @property
+    @cached_property
     def run_id(self) -> str:
         """Sixteen hexadecimal digits that stand for the identity."""
         return digest(self.identity, 16)
@@ -84,62 +87,107 @@ def resolve(spec: RunSpec) -> ResolvedRun:
             than two frames; a semantic source that is not available; a tracker that needs a missing package, or
             depth that the sequence has not; a map to begin in that does not fit.
     """
-    spec = spec.absolute()
+    return Resolver()(spec)
+
+
+class Resolver:
+    """Looks up many runs as `resolve` does, but each sequence, tracker with settings, and device once.
+
+    What they name must not change meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._opened = lru_cache(maxsize=None)(_opened)
+        self._device = lru_cache(maxsize=None)(resolve_device)
+        self._configured: dict[str, tuple[TrackerSpec, Settings, dict[str, Any]]] = {}
+        self._code: dict[tuple[str, str], dict[str, Any]] = {}
+
+    def __call__(self, spec: RunSpec) -> ResolvedRun:
+        """Look up a run; see `resolve`."""
+        spec = spec.absolute()
+        configuration = json.dumps([spec.tracker, spec.settings], sort_keys=True, default=str)
+        if configuration not in self._configured:
+            self._configured[configuration] = _configured(spec)
+        tracker, settings, flat = self._configured[configuration]
+        where = (spec.sequence, spec.data_root, spec.camera, spec.frames_seen, spec.stride)
+        sequence, part, sequence_plugin = self._opened(*where, spec.offset, preprocessing_of(settings))
+        check_sensors(tracker, sequence)
+        strengths = set(Degradation.__dataclass_fields__) - {"seed"}
+        for unknown in sorted(set(spec.degrade) - strengths):
+            raise RunError(f"unknown degradation '{unknown}'", did_you_mean(unknown, strengths))
+        Degradation(seed=0, **spec.degrade)  # checks the strengths
+        device = self._device(spec.device)
+        source = segmentation_source(settings, sequence)
+        if (configuration, source) not in self._code:
+            self._code[configuration, source] = _code_of(tracker, settings, source)
+        code = self._code[configuration, source]
+        start_map = start_map_of(settings, sequence.camera, tracker.sensors, code["weights"])
+        by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
+        identity = {
+            "scheme": IDENTITY_SCHEME,
+            "tracker": tracker.id,
+            "tracker_version": tracker.version,
+            **code,
+            "settings": flat | by_content if by_content else flat,
+            "segmentation": source,
+            "sequence": part.id,
+            "content": part.content,
+            "camera": part.camera,
+            "frames": [part.start, part.stop],
+            "offset": spec.offset,
+            "stride": part.stride,
+            "seed": spec.seed,
+            "device": device,
+            "threads": spec.threads,
+            **({"cache": True} if spec.cache else {}),
+            "realtime": spec.realtime,
+            **({"machine": this_machine().model_dump()} if spec.realtime else {}),
+            "drop_share": spec.drop_share,
+            "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
+            **({"sequence_plugin": sequence_plugin} if sequence_plugin else {}),
+        }
+        return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
+
+
+def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
+    """The tracker of a run, its complete settings, and these by dotted name."""
     tracker = TRACKERS.get(spec.tracker)
-    missing = tracker.missing()
-    if missing:
+    if missing := tracker.missing():
         raise RunError(f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing))
     settings = resolve_settings(tracker, spec.settings)
-    sequence = open_frames(
-        spec.sequence, spec.data_root, spec.camera, spec.frames_seen, spec.stride, preprocessing_of(settings)
-    )
-    check_frames(sequence)
-    check_sensors(tracker, sequence)
-    strengths = set(Degradation.__dataclass_fields__) - {"seed"}
-    for unknown in sorted(set(spec.degrade) - strengths):
-        raise RunError(f"unknown degradation '{unknown}'", did_you_mean(unknown, strengths))
-    Degradation(seed=0, **spec.degrade)  # checks the strengths
-    device = resolve_device(spec.device)
-    source = segmentation_source(settings, sequence)
-    weights = weights_of(settings, source)
-    start_map = start_map_of(settings, sequence.camera, tracker.sensors, weights)
-    by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
-    part = part_of(sequence, spec.offset)
+    return tracker, settings, flatten(settings)
+
+
+def _opened(
+    sequence: str,
+    data_root: str | None,
+    camera: str | None,
+    frames: tuple[int, int | None] | None,
+    stride: int,
+    offset: int,
+    preprocessing: PreprocessingSettings | None,
+) -> tuple[Sequence, Part, str]:
+    """A checked sequence, the part of it, and the digest of the plug-in that reads it, if one does."""
+    opened = open_frames(sequence, data_root, camera, frames, stride, preprocessing)
+    check_frames(opened)
+    datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
+    dataset = datasets.get(sequence.partition("/")[0])
+    return opened, part_of(opened, offset), "" if dataset is None else plugin_digest(dataset.entry_point)
+
+
+def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> dict[str, Any]:
+    """What of a run's identity says by which code, libraries, weights and files it is made."""
     with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
         files = contents_digest(load_object(tracker.files)(settings)) if tracker.files else ""
     installed = versions()  # another version of what computes with the run's data may give other bits
-    datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
-    dataset = datasets.get(spec.sequence.partition("/")[0])
-    sequence_plugin = "" if dataset is None else plugin_digest(dataset.entry_point)
-    identity = {
-        "scheme": IDENTITY_SCHEME,
-        "tracker": tracker.id,
-        "tracker_version": tracker.version,
+    return {
         "distribution": distribution_of(tracker),
         "source": source_fingerprint(tracker, settings, source),
         "requires": {module: distribution_of_module(module)[1] for module in sorted(tracker.requires)},
-        "settings": flatten(settings) | by_content,
-        "segmentation": source,
-        "weights": weights,
+        "weights": weights_of(settings, source),
         **({"files": files} if files else {}),
-        "sequence": part.id,
-        "content": part.content,
-        "camera": part.camera,
-        "frames": [part.start, part.stop],
-        "offset": spec.offset,
-        "stride": part.stride,
-        "seed": spec.seed,
-        "device": device,
-        "threads": spec.threads,
-        **({"cache": True} if spec.cache else {}),
-        "realtime": spec.realtime,
-        **({"machine": this_machine().model_dump()} if spec.realtime else {}),
-        "drop_share": spec.drop_share,
-        "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
         "libraries": {name: installed.get(name, "") for name in LIBRARIES},
-        **({"sequence_plugin": sequence_plugin} if sequence_plugin else {}),
     }
-    return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
 
 
 def distribution_of(tracker: TrackerSpec) -> str:

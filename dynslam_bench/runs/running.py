@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import re
-import shutil
+import socket
 import sys
 import threading
 import time
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -29,7 +32,7 @@ from dynslam_bench.core.errors import (
     raising,
     reason_of,
 )
-from dynslam_bench.core.files import TemporaryFolder, write_atomic
+from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
@@ -37,7 +40,7 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.runs.artifacts import SHEET_FILE, VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
-from dynslam_bench.runs.identity import ResolvedRun, check_unchanged, resolve
+from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
@@ -250,6 +253,8 @@ def judge_coverage(tracked: int, due: int, lost_at_end: int, total: int) -> tupl
 OnFault = Callable[[RunSpec, DynslamError], None]
 """Called as ``on_fault(spec, error)`` for a run that cannot be made; nothing of it is stored."""
 _CLAIM_AGAIN_S = 0.2
+_SENT = 1000
+"""Runs that an executor is given at a time."""
 EventKind = Literal["reused", "started", "progress", "finished"]
 
 
@@ -329,9 +334,10 @@ def run_many(
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
     resolved: list[ResolvedRun] = []
     faults: list[tuple[RunSpec, DynslamError]] = []
+    look_up = Resolver()
     for spec in specs:
         try:
-            resolved.append(resolve(spec))
+            resolved.append(look_up(spec))
         except (SequenceError, TrajectoryError) as error:
             faults.append((spec, error))
     if resolved:
@@ -389,7 +395,15 @@ class _Bench:
     def run_here(self, todo: dict[str, ResolvedRun]) -> dict[str, RunRecord]:
         waiting = list(todo.values())
         with ThreadPoolExecutor(self.jobs, thread_name_prefix="dynslam-run") as pool:
-            return self._collect([pool.submit(self._next, waiting) for _ in todo])
+            futures = [pool.submit(self._next, waiting) for _ in todo]
+            try:
+                records = [future.result() for future in as_completed(futures)]
+            except BaseException:
+                self.aborted.set()
+                for future in futures:
+                    future.cancel()
+                raise
+        return {record.run_id: record for record in records if record is not None}
 
     def _next(self, waiting: list[ResolvedRun]) -> RunRecord | None:
         """Make the first run that no other process is making, or take what another one has made of it meanwhile.
@@ -432,18 +446,29 @@ class _Bench:
         return self._finished(run, record)
 
     def run_remotely(self, todo: dict[str, ResolvedRun], executor: Executor) -> dict[str, RunRecord]:
-        protocol = self.protocol.model_dump_json()
-        futures: dict[Future[Any], ResolvedRun] = {}
-        for run in todo.values():
-            self._report("started", run)
-            futures[_asked(executor.submit, run_packed, run.spec.model_dump_json(), protocol)] = run
+        waiting, protocol = iter(todo.values()), self.protocol.model_dump_json()
+        sent: dict[Future[Any], ResolvedRun] = {}  # a future holds all bytes of its run, so few are kept
+        records: dict[str, RunRecord] = {}
+        try:
+            while True:
+                for run in islice(waiting, _SENT - len(sent)):
+                    self._report("started", run)
+                    spec = run.spec.model_copy(update={"device": run.device})
+                    asked = (spec.model_dump_json(), protocol, json.dumps(run.identity, default=str))
+                    sent[_asked(executor.submit, run_packed, *asked)] = run
+                if not sent:
+                    return records
+                for future in wait(sent, return_when=FIRST_COMPLETED).done:
+                    run = sent.pop(future)
+                    record = self._attempt(run, partial(self._take, future))
+                    records |= {} if record is None else {run.run_id: record}
+        except BaseException:
+            for future in sent:
+                future.cancel()
+            raise
 
-        def take(future: Future[Any]) -> RunRecord | None:
-            return self._attempt(
-                futures[future], lambda run: self._finished(run, unpack(_asked(future.result), self.store))
-            )
-
-        return self._collect(futures, take)
+    def _take(self, future: Future[Any], run: ResolvedRun) -> RunRecord:
+        return self._finished(run, unpack(_asked(future.result), self.store))
 
     def _attempt(self, run: ResolvedRun, make: Callable[[ResolvedRun], RunRecord]) -> RunRecord | None:
         """The run's record; None, once that is reported, if it cannot be made although nothing is broken here."""
@@ -466,21 +491,6 @@ class _Bench:
             self.faults.append(error)
             if self.on_fault is not None:
                 self.on_fault(spec, error)
-
-    def _collect(
-        self,
-        futures: Iterable[Future[Any]],
-        take: Callable[[Future[Any]], RunRecord | None] = lambda future: future.result(),
-    ) -> dict[str, RunRecord]:
-        futures = list(futures)
-        try:
-            records = [take(future) for future in as_completed(futures)]
-        except BaseException:
-            self.aborted.set()
-            for future in futures:
-                future.cancel()
-            raise
-        return {record.run_id: record for record in records if record is not None}
 
     def _is_cancelled(self) -> bool:
         return self.aborted.is_set() or self.cancelled()
@@ -523,24 +533,36 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
 _ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16})/([A-Za-z0-9_]+\.[a-z0-9]+)")
 
 
-def run_packed(spec_json: str, protocol_json: str) -> bytes:
+def run_packed(spec_json: str, protocol_json: str, identity_json: str) -> bytes:
     """Make a run on a worker that does not share the results folder; the function that executors are handed.
 
     Args:
         spec_json: A `RunSpec` as JSON.
         protocol_json: The protocol of the partial metrics as JSON.
+        identity_json: The run's identity where it was asked for, as JSON.
 
     Returns:
         A zip archive with the run's folder and its sequence's stamps and ground truth, for `unpack`.
 
     Raises:
-        DynslamError: The request names something that this worker does not have.
+        RunError: The request names something that this worker does not have, or its code, packages or data are others.
     """
+    name = f"worker {socket.gethostname()}"
+    try:
+        resolved = resolve(RunSpec.model_validate_json(spec_json))
+    except DynslamError as error:
+        raise RunError(f"{name} cannot make the run: {error.args[0]}", error.hint) from error
+    asked, own = json.loads(identity_json), json.loads(json.dumps(resolved.identity, default=str))
+    differing = [key for key in sorted(asked | own) if asked.get(key) != own.get(key) and key != "machine"]
+    if differing:
+        raise RunError(
+            f"{name} would make another run: {', '.join(differing)} differ",
+            "give all workers the same code, packages and data",
+        )
     with contextlib.closing(TemporaryFolder()) as folder:
         store = RunStore(folder.path)
         store.prepare()
-        protocol = Protocol.model_validate_json(protocol_json)
-        return pack(store, run_one(RunSpec.model_validate_json(spec_json), store, protocol=protocol))
+        return pack(store, run_one(resolved, store, protocol=Protocol.model_validate_json(protocol_json)))
 
 
 def pack(store: RunStore, record: RunRecord) -> bytes:
@@ -570,11 +592,4 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
         runs = sent.ids()
         if odd or len(runs) != 1:
             raise RunError(f"a packed run holds {len(runs)} runs, and {len(odd)} odd names")
-        record = sent.read_whole(runs[0])
-        for file in sorted(folder.path.glob(f"sequences/{record.sequence.part}/*")):
-            target = store.root / file.relative_to(folder.path)
-            if not target.is_file():
-                write_atomic(target, file.read_bytes())
-        with store.work_folder(record.run_id) as work:
-            shutil.copytree(sent.folder(record.run_id), work, dirs_exist_ok=True)
-            return store.publish(work, record)
+        return store.copy_from(sent, sent.read_whole(runs[0]))

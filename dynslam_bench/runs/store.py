@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -318,6 +319,20 @@ class RunStore:
         LOGGER.warning("run %s: %s", record.run_id, note)
         return record.model_copy(update={"notes": [*record.notes, note]})
 
+    def copy_from(self, other: RunStore, record: RunRecord) -> RunRecord:
+        """Copy a run of another store, with its part of a sequence; replaces an earlier run of the id.
+
+        Raises:
+            InfrastructureError: It cannot be written.
+        """
+        for file in sorted(other._part(record.sequence.part).iterdir()):
+            target = self._part(record.sequence.part) / file.name
+            if not target.is_file():
+                write_atomic(target, file.read_bytes())
+        with self.work_folder(record.run_id) as work:
+            shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
+            return self.publish(work, record)
+
     def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
         """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth; done once a part."""
         folder = self._part(part)
@@ -587,6 +602,53 @@ def score(
 ) -> MetricRecord:
     """The metrics of a stored run under a protocol, see `RunStore.score`."""
     return store.score(record, protocol, again=again)
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What `merge` did.
+
+    Attributes:
+        added: Ids of the runs that were copied.
+        stored: Ids of the runs that the store had already, with the same result.
+        left_out: Folders of the runs that were not copied, with reasons.
+    """
+
+    added: list[str]
+    stored: list[str]
+    left_out: list[Unreadable]
+
+
+def merge(sources: Iterable[RunStore], store: RunStore) -> Merged:
+    """Copy the runs of stores into one; nothing that it holds is changed.
+
+    A run is left out if its record is damaged, if the store holds another result under its id, or other stamps or
+    another ground truth of its sequence.
+    """
+    merged = Merged([], [], [])
+    store.prepare()
+    for source in sources:
+        records, unreadable = source.all()
+        merged.left_out.extend(unreadable)
+        for record in records:
+            folder = source.folder(record.run_id)
+            part, own_part = source._part(record.sequence.part), store._part(record.sequence.part)
+            earlier = store.get(record.run_id)
+            if own_part.is_dir() and not _equal(part, own_part, ("timestamps.txt", "groundtruth.txt")):
+                merged.left_out.append(Unreadable(folder, f"{store.root} holds other stamps or truth of its sequence"))
+            elif earlier is None:
+                store.copy_from(source, record)
+                merged.added.append(record.run_id)
+            elif earlier.status == record.status and _equal(folder, store.folder(record.run_id), (ONLINE, FINAL)):
+                merged.stored.append(record.run_id)
+            else:
+                merged.left_out.append(Unreadable(folder, f"{store.root} holds another result of this run"))
+    return merged
+
+
+def _equal(one: Path, other: Path, names: Iterable[str]) -> bool:
+    """Whether files of two folders have the same content; a missing file is an empty one."""
+    return all(_content(one / name) == _content(other / name) for name in names)
 
 
 def list_runs(
