@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import fcntl
+import inspect
+import itertools
 import json
 import math
 import os
 import random
 import socket
+import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache, wraps
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -21,11 +26,11 @@ import numpy as np
 import optuna
 import pandas as pd
 import psutil
-from optuna.exceptions import StorageInternalError
+from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
 from optuna.storages import BaseStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState, create_trial
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.reading import read_json
@@ -262,13 +267,54 @@ def open_database(url: str) -> BaseStorage:
     """
     for attempt in range(_ATTEMPTS):
         try:
-            return optuna.storages.get_storage(RDBStorage(url, engine_kwargs={"pool_pre_ping": True}))
+            return optuna.storages.get_storage(PatientStorage(url, engine_kwargs={"pool_pre_ping": True}))
         except (DBAPIError, StorageInternalError) as error:
             cause = str(error.__cause__ or error).lower()
             if attempt + 1 == _ATTEMPTS or not any(words in cause for words in _BEING_MADE):
                 raise
             time.sleep(random.uniform(0.05, 0.5))
     raise AssertionError("unreachable")
+
+
+class PatientStorage(RDBStorage):
+    """Optuna's SQL storage, which waits up to `PATIENCE_S` for a database that does not answer, as while it restarts.
+
+    Raises:
+        StudyError: It does not answer for longer.
+    """
+
+
+PATIENCE_S = 60.0
+_NO_ANSWER = (OperationalError, InterfaceError)
+
+
+def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(method)
+    def call(storage: PatientStorage, *arguments: Any, **named: Any) -> Any:
+        began, failed = time.monotonic(), False
+        while True:
+            try:
+                return method(storage, *arguments, **named)
+            except UpdateFinishedTrialError:
+                if not failed:
+                    raise
+                return True  # the call before had arrived, its answer had not
+            except (DBAPIError, StorageInternalError) as error:
+                if not isinstance(error, _NO_ANSWER) and not isinstance(error.__cause__, _NO_ANSWER):
+                    raise
+                if time.monotonic() - began > PATIENCE_S:
+                    line = str(error.__cause__ or error).splitlines()[0]
+                    text = without_password(f"the study's database does not answer: {line}", storage.url)
+                    raise StudyError(text, "finished trials are stored; the same command goes on from there") from error
+            failed = True
+            time.sleep(random.uniform(0.2, 2.0))
+
+    return call
+
+
+for _name, _method in inspect.getmembers(RDBStorage, inspect.isfunction):
+    if not _name.startswith("_"):
+        setattr(PatientStorage, _name, _patient(_method))
 
 
 def without_password(text: str, address: str) -> str:
@@ -283,19 +329,71 @@ def without_password(text: str, address: str) -> str:
 
 
 def worker_name() -> str:
-    """Names this process: host and process number."""
-    return f"{socket.gethostname()}:{os.getpid()}"
+    """Names this process: host, boot and process namespace, process number."""
+    return f"{_machine()}:{os.getpid()}"
 
 
-def worker_is_dead(name: str) -> bool:
-    """Whether a worker on this host no longer runs; workers of other hosts count as alive."""
-    host, _, pid = name.rpartition(":")
-    if host != socket.gethostname() or not pid.isdigit():
-        return False
-    try:
-        return bool(psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE)
-    except psutil.NoSuchProcess:
-        return True
+@cache
+def _machine() -> str:
+    """Where process numbers are the same: the host, and on Linux its boot and the namespace, e.g. of a container."""
+    names = [socket.gethostname()]
+    with suppress(OSError):
+        names.append(Path("/proc/sys/kernel/random/boot_id").read_text("ascii")[:8])
+        names.append(Path("/proc/self/ns/pid").readlink().name.strip("pid:[]"))
+    return "-".join(names)
+
+
+HEARTBEAT_S, GRACE_S = 20.0, 120.0
+"""A worker counts up so often, and is dead elsewhere once it has not for so long."""
+
+
+class Heartbeats:
+    """Which workers of a study live.
+
+    One of this machine is dead once its process is, any other one once the number that it counts up in the study's
+    attributes has stood still for `GRACE_S` on this process' clock.
+
+    Args:
+        study: The study.
+    """
+
+    def __init__(self, study: optuna.Study) -> None:
+        self._study, self._seen = study, dict[str, tuple[Any, float]]()
+
+    def is_dead(self, trial: FrozenTrial) -> bool:
+        """Whether the worker of a running trial has ended."""
+        name = trial.user_attrs.get("worker", "")
+        machine, _, pid = name.rpartition(":")
+        if machine == _machine() and pid.isdigit():
+            try:
+                return bool(psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE)
+            except psutil.NoSuchProcess:
+                return True
+        now, count = time.monotonic(), self._study.user_attrs.get(f"alive {name}")
+        key = name or f"trial {trial.number}"
+        if key not in self._seen or self._seen[key][0] != count:
+            self._seen[key] = count, now
+        return now - self._seen[key][1] > GRACE_S
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        """Count up while the block lasts."""
+        ended = threading.Event()
+
+        def beat() -> None:
+            for count in itertools.count():
+                with suppress(Exception):  # the trials themselves say what is wrong with the storage
+                    self._study.set_user_attr(f"alive {worker_name()}", f"{time.time():.0f} {count}")
+                if ended.wait(HEARTBEAT_S):
+                    return
+
+        thread = threading.Thread(target=beat, name="dynslam-heartbeat", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
 
 
 class JournalFile(JournalFileBackend):

@@ -49,6 +49,7 @@ from dynslam_bench.tuning.splits import design_of
 from dynslam_bench.tuning.storage import (
     EARLIER,
     SPEC_FILE,
+    Heartbeats,
     best_trials,
     load_study,
     open_storage,
@@ -56,7 +57,6 @@ from dynslam_bench.tuning.storage import (
     study_folder,
     trials_frame,
     without_password,
-    worker_is_dead,
     worker_name,
 )
 from dynslam_bench.tuning.study_file import ProblemInstance, PrunerName, StudySpec, read_study
@@ -66,6 +66,7 @@ if TYPE_CHECKING:
 
     from dynslam_bench.tuning.judgement import StudySummary
 
+_WAIT_S = 2.0
 CRASHED_WORKER = "worker ended in the middle of the trial"
 
 
@@ -170,6 +171,7 @@ class Study(Plan):
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
         self.study = self._open(sampler, [] if reading else list(self._beginnings()))
+        self._heartbeats = Heartbeats(self.study)
         if self.extension["scenes"]:
             self.design = design_of(spec, accept=reading, further=self.extension["scenes"])
 
@@ -209,7 +211,12 @@ class Study(Plan):
         deadline, tell = time.monotonic() + (self.spec.timeout_s or math.inf), on_event or (lambda _: None)
 
         def work() -> None:
-            while time.monotonic() < deadline and not self._interrupted.is_set() and self._more():
+            while time.monotonic() < deadline and not self._interrupted.is_set():
+                if not self._more():
+                    if not self._others_run():
+                        return
+                    self._interrupted.wait(_WAIT_S)  # should one of their workers end, its trial is made again here
+                    continue
                 trial = self.ask()
                 tell(StudyEvent("started", trial.number, self.trials, f"trial {trial.number}"))
                 evaluation = self.evaluate(trial)
@@ -348,6 +355,10 @@ class Study(Plan):
 
     def evaluate(self, trial: optuna.Trial) -> Evaluation:
         """Run a trial on growing sets of instances until it ends or is pruned."""
+        with self._heartbeats.beating():
+            return self._evaluate(trial)
+
+    def _evaluate(self, trial: optuna.Trial) -> Evaluation:
         outcomes: dict[ProblemInstance, Outcome] = {}
         reference, values = self._reference or self.reference(), list[float]()
         for step in self.steps:
@@ -405,7 +416,7 @@ class Study(Plan):
             lost = set()
             trials = self.study.get_trials(deepcopy=False)
             for trial in trials:
-                if trial.state == TrialState.RUNNING and worker_is_dead(trial.user_attrs.get("worker", "")):
+                if trial.state == TrialState.RUNNING and self._heartbeats.is_dead(trial):
                     lost.add(trial.number)
                     with suppress(RuntimeError):  # another worker has done so meanwhile
                         self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
@@ -414,6 +425,11 @@ class Study(Plan):
                 if trial.state == TrialState.WAITING or crashed or EARLIER in trial.user_attrs:
                     lost.add(trial.number)
             return len(trials) - len(lost) < self.trials
+
+    def _others_run(self) -> bool:
+        """Whether workers of other processes run trials."""
+        running = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+        return any(trial.user_attrs.get("worker") != worker_name() for trial in running)
 
     def _beginnings(self) -> Iterator[FrozenTrial | dict[str, Scalar]]:
         """What a new study knows of earlier ones (trials), and what it tries after its baseline (settings)."""

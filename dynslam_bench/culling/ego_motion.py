@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, coherent
+from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, failing_regions
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
@@ -198,7 +198,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         tested = flow.valid & (frame.z > 0)
         failed = np.zeros(len(xy), dtype=bool)
         failed[tested] = self._fails(frame, state, tested)
-        failed = coherent(failed, tested, xy, self.settings.min_share, shape)
+        failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
         evidence = failed.astype(np.float64)
         if self._evidence is not None:
             evidence[flow.valid] += MEMORY * self._evidence[cell_index(flow.xy[flow.valid], CELL // 2, shape)[0]]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Number, ObjectRule, Rule
 from dynslam_bench.culling.ego_motion import rigid_flow
-from dynslam_bench.culling.regions import NEAR, coherent
+from dynslam_bench.culling.regions import NEAR, failing_regions
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import (
     BoxEpipolarSettings,
@@ -161,7 +161,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         distance = matches.distances(fit)
         if distance is None:
             return self.verdict(keep, **stats)
-        failing = distance > self.settings.threshold_px
+        failing = distance > self.settings.threshold_px  # dynamic: farther from the epipolar line, Eq. 25
         stats["inliers"] = np.count_nonzero(fit & ~failing)
         if self.settings.max_contradiction < 1:
             share = stats["contradiction"] = contradiction(frame, state, failing, matches)
@@ -172,7 +172,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
             keep, stats["moving_objects"] = vote_on_objects(frame, failing, matches.valid)
             return self.verdict(keep, **stats)
         xy, shape = frame.keypoints.xy, frame.gray.shape
-        return self.verdict(~coherent(failing, matches.valid, xy, self.settings.min_share, shape), **stats)
+        return self.verdict(~failing_regions(failing, matches.valid, xy, self.settings.min_share, shape), **stats)
 
     def _is_degenerate(self, before: Points, now: Points, camera: Camera, stats: dict[str, Number]) -> bool:
         """Whether matches or parallax are too small or one homography explains the view; fills in both stats."""

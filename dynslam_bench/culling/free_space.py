@@ -10,7 +10,7 @@ import numpy as np
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma
-from dynslam_bench.culling.regions import coherent
+from dynslam_bench.culling.regions import failing_regions
 from dynslam_bench.culling.settings import FreeSpaceSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
@@ -62,5 +62,5 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         votes, tested = np.zeros(len(xy), dtype=int), np.zeros(len(xy), dtype=bool)
         votes[rows], tested[rows] = violated.sum(axis=0), observed.any(axis=0)
         violating = votes >= min(self.settings.min_votes, len(keyframes))
-        moving = coherent(violating, tested, xy, self.settings.min_share, frame.gray.shape)
+        moving = failing_regions(violating, tested, xy, self.settings.min_share, frame.gray.shape)
         return self.verdict(~moving, asked=len(keyframes), tested=np.count_nonzero(tested))

@@ -34,7 +34,7 @@ def cell_mean(
     return np.where(count > 0, total / np.maximum(count, 1), empty)
 
 
-def coherent(
+def failing_regions(
     failing: NDArray[np.bool_],
     tested: NDArray[np.bool_],
     xy: NDArray[np.floating],

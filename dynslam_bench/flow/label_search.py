@@ -284,7 +284,7 @@ def move_moths(
     moths: Floats, flames: Floats, lower: Floats, upper: Floats, iteration: int, table: FlightTable, spiral: Floats,
     cauchy: Floats, steps: Floats, random: Scalar,
 ) -> Scalar:  # fmt: skip
-    """Move every moth once (Eq. 8-18); returns the next random state."""
+    """Move every moth once (Eq. 8, 10, 12, 13, 17), as `moth_flame.moth_positions`; returns the next random state."""
     population = len(moths)
     now = table.coefficients[iteration]
     span, own, best, stepping, pulling = now[0], now[1], now[2], now[3] > 0, now[2] > 0

@@ -285,7 +285,7 @@ class RunStore:
         return claimed(self.runs / f".{run_id}.claim")
 
     def publish(self, work: Path, record: RunRecord) -> RunRecord:
-        """Write the record into its work folder and rename that to the run's; replaces an earlier run of the id.
+        """Write the record, ``run.json``, into its work folder, rename that to the run's; replaces a run of the id.
 
         Returns:
             The record as it is stored, with a note if the earlier run gave another result.

@@ -29,7 +29,16 @@ from dynslam_bench.sequences.tags import Tag
 from dynslam_bench.sequences.view import SequenceView
 
 Split = Literal["tune", "held-out", ""]
-_FILES = ("tum", "bonn", "wild_slam", "eth3d", "icl", "seven_scenes", "shibuya", "openloris")
+_FILES = (  # of `published/`: a new TOML file there is named here
+    "tum",
+    "bonn",
+    "wild_slam",
+    "eth3d",
+    "icl",
+    "seven_scenes",
+    "shibuya",
+    "openloris",
+)
 
 
 class CatalogueEntry(Settings):

@@ -335,7 +335,7 @@ class RgbdBackend:
     ) -> TrackResult:
         """Make the tracked frame a keyframe if the policy or a merge asks for it, and add its pose to the history."""
         timings, pose = {}, fit.estimate.T_cam_world
-        needed = root is not None or self._keyframes.needed(self.world, tracked, frame.index, self._reference)
+        needed = root is not None or self._keyframes.needs_keyframe(self.world, tracked, frame.index, self._reference)
         if self._grows and needed:
             timings = self._insert_keyframe(frame, tracked, root)
             pose = tracked.T_cam_world

@@ -300,8 +300,8 @@ class KeyframePolicy:
         self._last = frame
         self._most_inliers = 0
 
-    def needed(self, world: Map, tracked: TrackedFrame, frame: int, reference: int) -> bool:
-        """Whether a tracked frame should become a keyframe.
+    def needs_keyframe(self, world: Map, tracked: TrackedFrame, frame: int, reference: int) -> bool:
+        """Whether a tracked frame should become a keyframe (ORB-SLAM's ``NeedNewKeyFrame``).
 
         Args:
             world: The map.

@@ -383,7 +383,7 @@ class LoopCloser:
         return (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
 
     def _merge(self, slot: int, loop: Loop) -> None:
-        """Move the younger of two submaps as a whole to where the older one has the place."""
+        """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger one moves onto the older one."""
         world = self.world
         younger, older, correction = self._merge_of(slot, loop)
         slots = world.submap(younger)

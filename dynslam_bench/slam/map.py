@@ -186,7 +186,7 @@ class Map:
         return slots[order], counts[slots[order]]
 
     def move_submap(self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0) -> None:
-        """Move all keyframes of a submap, and their points, into another, and make them part of that.
+        """Merge a submap into another: all its keyframes and points move, and become part of that.
 
         Args:
             number: The submap.

@@ -31,7 +31,7 @@ from dynslam_bench.culling.ego_motion import (
 from dynslam_bench.culling.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.free_space import MAX_AGE_S, FreeSpaceFilter
 from dynslam_bench.culling.multiview_depth import BIN_M, MultiViewFilter, grow, hidden, refine_by_matches
-from dynslam_bench.culling.regions import coherent
+from dynslam_bench.culling.regions import failing_regions
 from dynslam_bench.culling.settings import (
     CorrelationSettings,
     EpipolarSettings,
@@ -210,9 +210,9 @@ def test_a_region_that_fails_moves_and_a_lone_point_is_noise() -> None:
     rng = np.random.default_rng(0)
     xy, noise = rng.uniform((0, 0), (640, 480), (1000, 2)), rng.random(1000) < 0.05
     away = np.abs(xy - (320, 240)).max(axis=1)
-    moving = coherent((away < 60) | noise, np.ones(1000, bool), xy, 0.4, (480, 640))
+    moving = failing_regions((away < 60) | noise, np.ones(1000, bool), xy, 0.4, (480, 640))
     assert moving[away < 40].all() and moving[(away > 120) & noise].mean() < 0.05
-    np.testing.assert_array_equal(coherent(noise, np.ones(1000, bool), xy, 0.0, (480, 640)), noise)
+    np.testing.assert_array_equal(failing_regions(noise, np.ones(1000, bool), xy, 0.0, (480, 640)), noise)
 
 
 def test_correlation_separates_the_moving_body_of_known_and_of_new_keypoints() -> None:
