@@ -309,8 +309,8 @@ def _first_page(
 ) -> str:
     """The board: the sentence first, then the data, the ranking by category, and accuracy against speed."""
     caption = (
-        "Lower right is better. The dotted line joins ranked trackers that no other beats in both; open ones are not "
-        "ranked. Frame times hold for the machine named under Reproduce."
+        f"{'All categories. ' * (len(boards) > 1)}Lower right is better. The dotted line joins ranked trackers that no "
+        "other beats in both; open ones are not ranked. Frame times hold for the machine named under Reproduce."
     )
     caption += f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
     speed = figures.speed_figure(board)

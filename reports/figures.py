@@ -151,6 +151,7 @@ def speed_figure(board: Board) -> go.Figure | None:
     figure = figure_of(
         traces,
         min(max(420, 110 + 21 * len(points)), 1000),
+        showlegend=True,
         xaxis=log_axis("× real time (right is better)"),
         yaxis=log_axis("ATE ratio (down is better)"),
     )
@@ -184,7 +185,9 @@ def mask_figure(board: Board) -> go.Figure | None:
     if not traces:
         return None
     overlap = {"title": "overlap (IoU) of the mask, dilated, with the exact one", "range": [-0.02, 1.02]}
-    return figure_of(traces, max(420, 110 + 21 * len(traces)), xaxis=overlap, yaxis=log_axis("ATE (mm)"))
+    return figure_of(
+        traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=overlap, yaxis=log_axis("ATE (mm)")
+    )
 
 
 def share_figure(board: Board, bins: Mapping[str, Sequence[Sequence[float | None]]], edges: Sequence[float]) -> Any:
@@ -215,7 +218,7 @@ def share_figure(board: Board, bins: Mapping[str, Sequence[Sequence[float | None
         return None
     shares = {"title": "share of the image that shows people (%)", "type": "category"}
     errors = log_axis("frame-to-frame error, RMSE (mm)")
-    return figure_of(traces, max(420, 110 + 21 * len(traces)), xaxis=shares, yaxis=errors)
+    return figure_of(traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=shares, yaxis=errors)
 
 
 FIGURES = {"mean": 9, "median": 10, "rmse": 11, "std": 12}
@@ -252,6 +255,7 @@ def bar_figure(board: Board, statistic: str) -> go.Figure | None:
         traces,
         max(380, 100 + 19 * len(traces)),
         barmode="group",
+        showlegend=True,
         xaxis={"title": "sequence", "type": "category"},
         yaxis={"title": f"{STATISTICS[statistic]} (mm)", "rangemode": "tozero"},
     )

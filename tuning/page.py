@@ -311,19 +311,19 @@ def _seeds_change_nothing(tuner: Study) -> bool:
 def _candidates(summary: StudySummary, links: Mapping[int, str]) -> Table:
     def ratio(value: Ratio | None) -> TableCell:
         if value is None:
-            return TableCell("-")
+            return TableCell()
         return TableCell(f"{value.ratio:.3f}", f"{value.interval} n={value.n}".strip(), value.ratio)
 
     def time(candidate: Candidate) -> TableCell:
         if candidate.frame_ms is None:
-            return TableCell("-")
+            return TableCell()
         return TableCell(f"{candidate.frame_ms:.1f}", f"baseline {candidate.baseline_frame_ms:.1f}", candidate.frame_ms)
 
     rows = [
         [
             TableCell(
                 str(candidate.trial),
-                value=float(candidate.trial),
+                value=candidate.trial,
                 link=links.get(candidate.trial, ""),
                 emphasis="best" if candidate is summary.best else "",
             ),
@@ -369,10 +369,10 @@ def _trials(tuner: Study, summary: StudySummary, links: Mapping[int, str]) -> Ta
     names = [parameter.name for parameter in tuner.space]
     rows = [
         [
-            TableCell(str(trial.number), value=float(trial.number), link=links.get(trial.number, "")),
+            TableCell(str(trial.number), value=trial.number, link=links.get(trial.number, "")),
             TableCell(trial.state.name.lower(), trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, "")),
             *(number(math.exp(value), ".3f") for value in trial.values or ()),
-            *(TableCell("-") for _ in tuner.objectives if not trial.values),
+            *(TableCell() for _ in tuner.objectives if not trial.values),
             number(trial.user_attrs.get("coverage"), ".3f"),
             number(trial.user_attrs.get("fps"), ".1f"),
             *(_value(trial.params.get(name)) for name in names),

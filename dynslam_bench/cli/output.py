@@ -227,7 +227,7 @@ def _progress_lines(label: str) -> Iterator[Advance]:
 
     def update(done: float, total: float | None, step: str = "") -> None:
         nonlocal text
-        share = f": {done:.3g} of {total:.0f}" if total else ""
+        share = f": {done:{'.0f' if done >= 100 else '.3g'}} of {total:.0f}" if total else ""
         spent_s = time.monotonic() - began
         left = f", about {spent_s * (total - done) / done:.0f} s left" if total and 0 < done < total else ""
         text = f"{label}{share}{left}" + (f" ({step})" if step else "")

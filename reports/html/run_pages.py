@@ -8,6 +8,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -391,7 +392,7 @@ def _series(frames: RunFrames, pictures: Sequence[int]) -> tuple[Series, list[tu
 
 
 def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series, str]:
-    """The aligned track and the whole true path over the time since `start`, and why there is none.
+    """The aligned track and the true path of the run's frames over the time since `start`, and why there is none.
 
     Without ground truth the track is as the tracker gave it. Where the time between two poses exceeds twice the median
     interval, all series have a gap.
@@ -401,8 +402,9 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
     first = start if start is not None else 0.0 if longest is None else float(longest.timestamps[0])
     series: Series = {}
     if truth is not None and len(truth) > 1:
-        columns = np.column_stack([truth.positions, _angles(truth, truth)])
-        series |= _along("true", truth.timestamps - first, columns)
+        drawn = _of_part(row, truth)
+        columns = np.column_stack([drawn.positions, _angles(drawn, truth)])
+        series |= _along("true", drawn.timestamps - first, columns)
     if estimate is None or len(estimate) < 2:
         return series, ""
     error_mm = np.full(len(estimate), np.nan)
@@ -414,6 +416,17 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
         error_mm = 1000 * errors["trans_m"]
     columns = np.column_stack([estimate.positions, _angles(estimate, truth or estimate), error_mm])
     return series | _along("track", estimate.timestamps - first, columns), ""
+
+
+def _of_part(row: RunRow, truth: Trajectory) -> Trajectory:
+    """The ground truth between the first and the last frame of the run's part; all of it where that is not known."""
+    with suppress(DynslamError):
+        stamps = row.store.timestamps(row.sequence.part)
+        if len(stamps) > 1:
+            margin = float(np.median(np.diff(stamps)))
+            inside = (truth.timestamps >= stamps[0] - margin) & (truth.timestamps <= stamps[-1] + margin)
+            return truth.select(inside) if np.count_nonzero(inside) > 1 else truth
+    return truth
 
 
 def _along(name: str, stamps: Array, columns: Array) -> Series:
@@ -488,7 +501,7 @@ HEAT = {
 
 
 def _track_figure(track: Series) -> dict[str, Any]:
-    """The track in space, coloured by its error, beside the whole true path."""
+    """The track in space, coloured by its error, beside the true path."""
     data = []
     if "true_t" in track:
         data.append(_path("true path", "true", {"color": NEUTRAL, "width": 3}))

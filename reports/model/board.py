@@ -164,7 +164,7 @@ class Board:
             "in real time": row.realtime,
             "exact masks: a bound": row.segmentation == EXACT_MASKS,
             "by an older program": not row.is_current,
-            row.tracker.provenance: not self.is_rankable(key),
+            "ablation" if row.tracker.provenance == "own" else row.tracker.provenance: not self.is_rankable(key),
         }
         return "" if key in self.ranked else next((words for words, holds in reasons.items() if holds), "")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
 from functools import cached_property
 from itertools import chain
@@ -187,7 +187,8 @@ class RunRow(RunRecord):
     @property
     def cached(self) -> bool:
         """Whether stage times come from the stage cache and were not taken in this run."""
-        return bool(self.identity.get("cache"))
+        # controls and external systems have no such stage
+        return bool(self.identity.get("cache")) and self.tracker.provenance not in ("control", "external")
 
     @property
     def rotation_reliable(self) -> bool:
@@ -207,7 +208,10 @@ class RunRow(RunRecord):
     def machine_words(self) -> str:
         """Computer and versions in words."""
         machine, git = self.machine, self.git
-        parts = [f"{name} {version}" for name, version in self.versions.items()]
+        versions = dict(self.versions)
+        if git is not None and "dynslam-bench" in versions:  # a checkout is older than its code: git's revision holds
+            versions["dynslam-bench"] = versions["dynslam-bench"].partition("+")[0]
+        parts = [f"{name} {version}" for name, version in versions.items()]
         if machine is not None:
             hardware = f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}"
             parts = [hardware, *filter(None, [machine.gpu]), *parts]
@@ -342,11 +346,13 @@ def _hold_last_pose_error(
 
 
 def command_line(command: list[str]) -> str:
-    """The command line as one would type it."""
+    """The command line as one would type it; a results folder named by its absolute path is ``RESULTS``."""
     if not command:
         return ""
     head = Path(command[0]).name
-    return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *command[1:]])
+    place = _option(command, "--results")
+    words = [word.replace(place, "RESULTS") for word in command] if place and Path(place).is_absolute() else command
+    return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *words[1:]])
 
 
 def run_command(row: RunRow) -> str:
@@ -378,7 +384,19 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
 
 
 def part_options(row: RunRow) -> list[str]:
-    """Its part of the sequence as options of the command line."""
+    """Its part of the sequence, and the camera that its command named, as options of the command line."""
     start, stop = row.frames or (0, None)
     frames = ["--frames", f"{start}:{'' if stop is None else stop}"] if row.frames is not None else []
-    return frames + (["--stride", str(row.stride)] if row.stride != 1 else [])
+    camera = _option(row.command, "--camera") if row.place else None
+    options = frames + (["--camera", camera] if camera else [])
+    return options + (["--stride", str(row.stride)] if row.stride != 1 else [])
+
+
+def _option(command: Sequence[str], name: str) -> str | None:
+    """The value of an option in a command line; None where it is not named."""
+    for at, word in enumerate(command):
+        if word.startswith(f"{name}="):
+            return word.partition("=")[2]
+        if word == name and at + 1 < len(command):
+            return command[at + 1]
+    return None

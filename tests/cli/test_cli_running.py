@@ -138,6 +138,10 @@ def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) >= 2 and lines[0].startswith("3 runs: 1.5 of 3, about ")
     assert "(orb-slam2 on walk, frame 5 of 10)" in lines[0]
+    with output.progress("report") as advance:
+        advance(1280, 1500)
+        time.sleep(0.4)
+    assert capsys.readouterr().err.startswith("report: 1280 of 1500, about ")
 
 
 def test_with_json_nothing_but_errors_goes_to_standard_error(cli, capsys, monkeypatch):

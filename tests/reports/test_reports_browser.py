@@ -91,6 +91,9 @@ def test_nothing_faults_nothing_is_fetched_and_nothing_runs_over(browser, report
     folder = report.html.parent.absolute().as_uri()
     assert browser.fetched and all(url.startswith((folder, "data:", "blob:")) for url in browser.fetched)
     assert browser.run("document.documentElement.scrollWidth") == width
+    cut = browser.run("all('.dt-layout-table > div').filter((each) => each.scrollWidth > each.clientWidth + 1).length")
+    assert cut == browser.run("all('.dt-layout-table > .wide').length"), "tables that are cut say so"
+    assert width > 500 or page != "index" or cut
     right = browser.run("all('.figure').map((each) => each.getBoundingClientRect().right)")
     assert max(right, default=0) <= width
 

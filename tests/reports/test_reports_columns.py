@@ -8,7 +8,7 @@ from dynslam_bench.reports import build_report, compare
 from dynslam_bench.reports.model.board import make_board, missing_commands
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
-from dynslam_bench.reports.model.row import run_command
+from dynslam_bench.reports.model.row import command_line, run_command
 
 
 def test_recordings_that_share_a_folders_name_keep_their_columns(store, tmp_path):
@@ -88,6 +88,16 @@ def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(st
     (mine,) = (each for each in rows if (each.tracker.id, each.sequence.id) == ("mine", "s/a"))
     assert run_command(mine) == f"dynslam-bench run {given} s/a --set loop=true"
     assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
+
+
+def test_commands_name_the_camera_of_a_folder_and_no_results_folder_of_one_machine(store):
+    asked = ("dynslam-bench", "run", "ours", "mine", "--camera", "bonn", "--results", "/home/me/results")
+    add_run(store, "ours", "folder/mine", place="/home/me/mine", command=asked)
+    add_run(store, "mine", "s/a", command=asked)
+    rows = {row.tracker.id: row for row in load_runs([store], PROTOCOL).rows}
+    assert run_command(rows["ours"]) == "dynslam-bench run ours /home/me/mine --camera bonn"
+    assert "--camera" not in run_command(rows["mine"]), "a sequence with an id says its camera"
+    assert command_line(list(asked)) == "dynslam-bench run ours mine --camera bonn --results RESULTS"
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ const TABLE = { paging: false, info: false, autoWidth: false, order: [], layout:
 
 /** Tables that are wider than their place say so. */
 const widths = new ResizeObserver((entries) => entries.forEach(({ target }) => {
-  const place = target.closest(".scroll");
+  const whole = target.closest(".scroll"), place = whole?.querySelector(".dt-layout-table > div") ?? whole; // DataTables' own scroller
   place?.classList.toggle("wide", place.scrollWidth > place.clientWidth + 1);
 }));
 
@@ -94,6 +94,10 @@ function sortable(table, options = {}) {
 }
 
 startTheme();
-select("table.sorts").forEach((table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {}));
+const sorts = (table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {});
+for (const table of select("table.sorts")) { // those of closed folds once they are opened: thousands of cells take seconds
+  const fold = table.closest("details:not([open])");
+  fold ? fold.addEventListener("toggle", () => sorts(table), { once: true }) : sorts(table);
+}
 addEventListener("DOMContentLoaded", drawFigures);
 addEventListener("beforeprint", () => select("details").forEach((fold) => { fold.open = true; }));
