@@ -24,7 +24,6 @@ globalThis.slide = (input, value) => { input.value = value; input.dispatchEvent(
 """
 AXE_PACKAGE = importlib.util.find_spec("axe_playwright_python")
 AXE = AXE_PACKAGE and Path(AXE_PACKAGE.origin).with_name("axe.min.js")
-needs_axe = pytest.mark.skipif(AXE is None, reason="axe-core is not installed: pip install axe-playwright-python")
 needs_browser = pytest.mark.skipif(EXECUTABLE is None, reason=f"no browser is installed: {', '.join(NAMES)}")
 
 

@@ -17,6 +17,7 @@ from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.loading import FORMAT, load_network
 from dynslam_bench.segmentation.networks.network import IGNORED, NEGATIVE, MaskRCNN, crop_masks, match, sample
 from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.training import train as training
 from dynslam_bench.segmentation.training.evaluate_masks import SegmenterScore, evaluate_segmenter
 from dynslam_bench.segmentation.training.labelled_images import (
     LabelledImage,
@@ -139,6 +140,14 @@ def test_mask_targets_are_the_mask_inside_the_box():
     assert (target[0, :, :14] == 1).all() and (target[0, :, 14:] == 0).all()
 
 
+@pytest.fixture
+def small_images(monkeypatch):
+    """Networks of 160 x 120 pixels, a quarter of the embedded one's."""
+    small = lambda settings: network_config(settings).model_copy(update={"min_side": 120})  # noqa: E731
+    monkeypatch.setattr(training, "network_config", small)
+    return small
+
+
 def settings_for(folder, **changes):
     values = {
         "data": (f"yolo:{folder}",), "validation": f"yolo:{folder}", "iterations": 3, "batch": 1, "proposals": 16,
@@ -147,7 +156,7 @@ def settings_for(folder, **changes):
     return TrainSettings(**values)
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, small_images):
     data = write_yolo(tmp_path / "data", 4)
     cache = tmp_path / "cache"
     whole = train(settings_for(data), tmp_path / "whole", data_cache=cache)
@@ -166,7 +175,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
     assert first["rows"] == second["rows"]
     assert (tmp_path / "whole" / "curve.html").stat().st_size > 0
     assert (tmp_path / "whole" / "curve.csv").read_text().startswith("step,objectness,anchor,class,box,mask,loss,iou")
-    assert load_network(whole.best).config == network_config(settings_for(data))
+    assert load_network(whole.best).config == small_images(settings_for(data))
     with pytest.raises(SegmentationError, match="another learning_rate"):
         train(settings_for(data, learning_rate=0.5), tmp_path / "parts", data_cache=cache)
     started = train(
@@ -175,6 +184,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path):
     assert started.step == 1
 
 
+@pytest.mark.usefixtures("small_images")
 def test_losses_fall_on_a_simple_task(tmp_path):
     data = write_yolo(tmp_path / "data", 4)
     seen = []

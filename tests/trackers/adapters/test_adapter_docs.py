@@ -102,7 +102,7 @@ def test_filter_beside_masks(example):
     path = example("people_slam.py")
     carried, settings = load_object(f"{path}:CarriedFilter"), load_object(f"{path}:CarriedSettings")
     check_filter(lambda: carried(settings()))
-    check_tracker(f"{path}:SPEC", frames=3)
+    check_tracker(f"{path}:SPEC", frames=3, settings={"segmentation.source": "oracle"})
     with pytest.raises(SettingsError, match="needs masks"):
         TRACKERS.get(f"{path}:SPEC").settings(segmentation={"source": "none"}).verify()
     sequence = open_sequence("synthetic/walking_xyz", frames=(0, 2))

@@ -1,4 +1,4 @@
-"""Every system on rendered walking: it runs, says what it culls, culls where it should, and refuses what it must."""
+"""Systems: their settings reach what they are for, masks are asked for, and their specs say what they do."""
 
 from pathlib import Path
 
@@ -29,16 +29,13 @@ from dynslam_bench.trackers.systems.composition import (
     describe_tracks,
 )
 
-FRAMES = 6
+FRAMES = 4
 SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)]
 MASKED = [
     spec
     for spec in SYSTEMS
     if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto"
 ]
-IDENTITY = {"orb-slam2-mono", "orb-slam2"}
-SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
-"""Need five keyframes, or a window of frames, before they judge."""
 
 
 @pytest.fixture(scope="module")
@@ -55,24 +52,6 @@ def run(spec: TrackerSpec, sequence) -> list[TrackResult]:
     tracker = build(spec, sequence)
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     return [tracker.track(sequence[index]) for index in range(FRAMES)]
-
-
-@pytest.mark.parametrize("spec", SYSTEMS, ids=lambda spec: spec.id)
-def test_every_system_tracks_and_says_what_it_culls(spec: TrackerSpec, walking) -> None:
-    results = run(spec, walking)
-    waiting = {"initialising"} if spec.sensors == "rgb" else set()  # until the camera has moved enough
-    assert {result.state for result in results} <= {"ok"} | waiting and len(results) == FRAMES
-    keys = [set(result.stats) for result in results[2:]]
-    assert all(names == keys[0] for names in keys), "the same stats on every frame"
-    assert all(np.isfinite(list(result.stats.values())).all() for result in results)
-    culled = sum(result.stats["culled"] for result in results)
-    if spec.id in IDENTITY:
-        assert culled == 0
-    elif spec.id not in SLOW_STARTERS:
-        degenerate = [result.stats.get("epipolar_degenerate") for result in results[1:]]
-        assert culled > 0 or set(degenerate) == {1.0}, "it culls, or says that the camera shows too little parallax"
-    for result in results:
-        assert np.count_nonzero(~result.keypoints_keep) == result.stats["culled"]
 
 
 @pytest.mark.parametrize("name", ["emfoa-oft", "yolo-slam"])
