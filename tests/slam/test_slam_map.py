@@ -154,7 +154,7 @@ def test_the_local_map_is_the_whole_map_or_the_connected_part(chain, monkeypatch
 
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-POSES, VARIABLE, POINTS = 5, 3, 30
+POSES, VARIABLE, POINTS = 4, 2, 16
 
 
 def measured(poses, points):

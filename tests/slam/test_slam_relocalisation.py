@@ -64,10 +64,7 @@ def test_a_kidnapped_camera_is_relocalised_at_once_in_a_known_place():
 
 @pytest.mark.parametrize(
     ("alike", "blind", "more", "recognised"),
-    [
-        *((alike, 30, more, alike < 0.5) for alike in (0.0, 0.2, 0.5, 0.9) for more in (0, 10)),
-        *((alike, 0, 0, alike < 0.5) for alike in (0.0, 0.5, 1.0)),
-    ],
+    [(0.0, 30, 10, True), (0.2, 30, 0, True), (0.5, 30, 0, False), (0.9, 30, 10, False), (0.5, 0, 0, False)],
 )
 def test_a_frame_of_two_places_tells_nothing(alike, blind, more, recognised):
     """Blind for three seconds, in which both can be reached, or kidnapped from one frame to the next."""
@@ -78,7 +75,7 @@ def test_a_frame_of_two_places_tells_nothing(alike, blind, more, recognised):
     assert blind or tracking[2 * QUARTER] == "lost", "too far for a tenth of a second"
 
 
-@pytest.mark.parametrize(("alike", "aliased"), [(0.0, False), (0.2, False), (0.6, True), (1.0, True)])
+@pytest.mark.parametrize(("alike", "aliased"), [(0.2, False), (0.6, True)])
 def test_perceptual_aliasing(alike, aliased):
     world, settings = RingWorld(alike=alike), TrackingSettings()
     backend, tracking, _ = run(world, [*range(2 * QUARTER)])
