@@ -8,6 +8,8 @@ import pytest
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # They import the installed package, also from the checkout's folder; else the kernels compile twice.
 os.environ["PYTHONSAFEPATH"] = "1"
+# Their matrices are small: threads of OpenBLAS would only wait for each other.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 KERNELS = (
     "from dynslam_bench.cli.demo import compile_kernels; compile_kernels('orb-slam2')",
     """

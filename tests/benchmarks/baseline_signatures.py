@@ -1,7 +1,7 @@
 """Do the re-implemented systems fail and survive where the published ones do?
 
 Reads the results folder of ``dynslam-bench bench dynamic`` and prints, in Markdown, each system's class on each
-rendered replica beside the class that published figures put it in, and how long filters take and what they cull.
+rendered replica beside the class that published figures put it in.
 
     dynslam-bench bench dynamic --results results
     python tests/benchmarks/baseline_signatures.py results --instances 100:200
@@ -36,7 +36,6 @@ from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.load import load_runs, open_stores
 from dynslam_bench.reports.model.published import published, static_camera_errors
 from dynslam_bench.reports.model.row import RunRow
-from dynslam_bench.runs.frames import read_csv
 from dynslam_bench.runs.record import FAILED
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -54,8 +53,6 @@ class Cell:
     ates: list[float] = field(default_factory=list)
     coverages: list[float] = field(default_factory=list)
     broken: int = 0
-    filter_ms: list[float] = field(default_factory=list)
-    culled: list[float] = field(default_factory=list)
     standstills: list[float] = field(default_factory=list)
 
     @property
@@ -183,16 +180,6 @@ def add(cell: Cell, run: RunRow) -> None:
     cell.broken += run.status in FAILED
     if run.static_camera_ate_rmse_m is not None:
         cell.standstills.append(run.static_camera_ate_rmse_m)
-    stages = [
-        time.median_s for name, time in run.store.read_whole(run.run_id).timings.items() if name.startswith("culling_")
-    ]
-    cell.filter_ms.append(1e3 * sum(stages))
-    cell.culled += culled(run.folder / "frames.csv")
-
-
-def culled(path: Path) -> list[float]:
-    """How many features each frame of a run culled."""
-    return [row.stats["culled"] for row in read_csv(path) if "culled" in row.stats] if path.is_file() else []
 
 
 def report(folder: Path, instances: range | None = None) -> str:
@@ -260,7 +247,7 @@ def report(folder: Path, instances: range | None = None) -> str:
     share = f"{100 * matched / clear:.0f} %" if clear else "-"
     lines += ["", f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %)."]
     lines += ["", "Misses:", "", *(f"- {miss}" for miss in misses)] if misses else []
-    return "\n".join([*lines, "", *filter_table(trackers, replicas, cells)])
+    return "\n".join(lines)
 
 
 def standstill_of(replica: str, cells: dict[tuple[str, str], Cell], reference: dict[str, Cell]) -> float:
@@ -271,27 +258,6 @@ def standstill_of(replica: str, cells: dict[tuple[str, str], Cell], reference: d
         if known is None and ("never-move", replica) in cells
         else known or float("nan")
     )
-
-
-def filter_table(trackers: list[str], replicas: list[str], cells: dict[tuple[str, str], Cell]) -> list[str]:
-    """How long each system's filters take and what they cull."""
-    lines = [
-        "| system | filters ms per frame (median, worst replica) | culled per frame, walking | sitting |",
-        "| --- | --- | --- | --- |",
-    ]
-    for tracker in trackers:
-        found = {replica: cells[tracker, replica] for replica in replicas if (tracker, replica) in cells}
-        counts = {
-            kind: [n for replica, cell in found.items() if f"/{kind}_" in replica for n in cell.culled]
-            for kind in ("walking", "sitting")
-        }
-        if not any(counts.values()):
-            continue  # controls and adapters cull nothing by nature and say nothing
-        ms = {replica: float(np.median(cell.filter_ms)) for replica, cell in found.items()}
-        worst = max(ms, key=lambda replica: ms[replica])
-        mean = [f"{np.mean(counts[kind]):.0f}" if counts[kind] else "-" for kind in ("walking", "sitting")]
-        lines.append(f"| `{tracker}` | {ms[worst]:.1f} ({short(worst)}) | {mean[0]} | {mean[1]} |")
-    return lines
 
 
 def short(replica: str) -> str:

@@ -1,8 +1,6 @@
 """Time of the sparse flow by budget and thread count, and of the dense flow.
 
-    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40] [--bars]
-
-``--bars`` prints the sparse mode at its defaults only: wall and processor time on one thread, wall time on two.
+    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40]
 
 1,000 points, 640x480. Minimum and median over repeats; pyramidal Lucas-Kanade on the same points is the yardstick
 for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
@@ -15,7 +13,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from flow_data import Pair, corners, synthetic
+from flow_data import corners, synthetic
 
 from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.flow.dense_flow import DenseDaisyFlow
@@ -47,31 +45,14 @@ def a_thousand(reference: np.ndarray) -> np.ndarray:
     return np.concatenate([points] * (1 + 1000 // len(points)))[:1000]
 
 
-def bars(pair: Pair, repeats: int) -> None:
-    """The sparse mode at its defaults: maps of one new image, search, refinement and the way back."""
-    points = a_thousand(pair.reference)
-    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, {len(points)} points, default settings\n")
-    print("| threads | wall ms, median | wall ms, minimum | processor ms, median | minimum | aimed at |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for threads, aim in ((1, "30 (25)"), (2, "16")):
-        run = one_frame(build_flow(FlowSettings(), threads=threads), pair.reference, pair.target, points)
-        low, median, used, often = timed(run, repeats)
-        processor = f"{often:.1f} | {used:.1f}" if threads == 1 else "- | -"
-        print(f"| {threads} | {median:.1f} | {low:.1f} | {processor} | {aim} |", flush=True)
-
-
 def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeats", type=int, default=40)
-    parser.add_argument("--bars", action="store_true")
     options = parser.parse_args()
     repeats = options.repeats
     cv2.setNumThreads(1)
     pair = synthetic(("similarity",), 3)[-1]
-    if options.bars:
-        bars(pair, repeats)
-        return
     first, second = pair.reference, pair.target
     points = a_thousand(first)
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, {len(points)} points\n")
@@ -97,8 +78,6 @@ def main() -> None:
             )
             cost = f"{took[2]:.1f} | {took[2] / yardstick[2]:.2f}" if threads == 1 else "- | -"
             print(f"| {note} | {threads} | {took[0]:.1f} | {took[1]:.1f} | {cost} | {good:.1f} |", flush=True)
-    maps = timed(lambda: build_flow(FlowSettings()).prepare(second), repeats)
-    print(f"\norientation maps alone, 1 thread: {maps[0]:.1f} / {maps[1]:.1f} ms (processor {maps[2]:.1f})")
     for threads in (1, 2):
         dense = DenseDaisyFlow(threads=threads)
         took = timed(lambda dense=dense: dense.flow(dense.prepare(first), dense.prepare(second)), 3)

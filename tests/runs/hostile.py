@@ -56,7 +56,7 @@ class Hostile:
                 os._exit(0)
             case "hang":
                 while True:
-                    pass
+                    time.sleep(0.1)
             case "segfault":
                 os.kill(os.getpid(), signal.SIGSEGV)
             case "deaf":

@@ -90,12 +90,16 @@ def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:
     assert records[1].status in ("stopped", "ok")
 
 
+def _be_daemonic() -> None:
+    """In a worker: be one that multiprocessing refuses children of its own."""
+    multiprocessing.current_process()._config["daemon"] = True  # type: ignore[attr-defined]
+    assert multiprocessing.current_process().daemon
+
+
 def test_any_executor(tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
     here = run_many(specs(toy_folder, range(2)), results=tmp_path / "here")
-    executors = [
-        ThreadPoolExecutor(2),
-        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")),
-    ]
+    context = multiprocessing.get_context("spawn")
+    executors = [ThreadPoolExecutor(2), ProcessPoolExecutor(1, mp_context=context, initializer=_be_daemonic)]
     for number, executor in enumerate(executors):
         events: list = []
         with executor:
@@ -131,21 +135,6 @@ def test_an_executor_that_dies_is_one_clear_line_and_no_outcome(tmp_path, toy_fo
     with pytest.raises(InfrastructureError, match=rf"^the executor gave up: {type(error).__name__}") as told:
         run_many(specs(toy_folder, range(2)), results=tmp_path, executor=_Dying(error, at_once=at_once))
     assert "\n" not in str(told.value) and RunStore(tmp_path).ids() == []
-
-
-def test_children_can_be_made_in_a_daemonic_process(tmp_path: Path, toy_folder: str) -> None:
-    context = multiprocessing.get_context("spawn")
-    process = context.Process(target=_run_one_here, args=(toy_folder, str(tmp_path / "results")), daemon=True)
-    process.start()
-    process.join(120)
-    assert process.exitcode == 0
-    assert len(RunStore(tmp_path / "results").ids()) == 1
-
-
-def _run_one_here(folder: str, root: str) -> None:
-    assert multiprocessing.current_process().daemon
-    record = run_many(specs(folder, range(1)), results=root)[0]
-    assert record.status == "ok", record.reason
 
 
 def test_packed_runs_that_are_none(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
