@@ -17,6 +17,7 @@ from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning import Plan, StudySpec, Verdict, finish, read_preset_text, run_study, write_page
 from dynslam_bench.tuning.storage import EARLIER, best_trials, importances
+from dynslam_bench.tuning.study_file import SpaceSpec
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 
@@ -61,6 +62,8 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     preview = plan.preview()
     assert {name.split(".")[0] for name in preview.unused} == {"epipolar"}
     assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.lines[-1]
+    alone = spec.model_copy(update={"space": SpaceSpec(include=("epipolar.*",))})
+    assert Plan(alone, tmp_path).preview().lines[-1] == "Nothing would be left of the space without them."
 
 
 def test_ratios_are_to_the_baseline_and_the_default_stands_beside(folders: list[str], tmp_path: Path) -> None:

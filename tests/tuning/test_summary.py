@@ -78,6 +78,14 @@ def test_one_lucky_start_of_the_default_decides_nothing() -> None:
     assert by_scene({starts[0]: 0.02}, default) == {starts[0].scene: pytest.approx(0.0)}, "no pairing with that luck"
 
 
+def test_scenes_count_alike_however_many_starts_they_have() -> None:
+    many = [ProblemInstance("synthetic/walking_xyz?scene=0", offset=start) for start in range(9)]
+    one = ProblemInstance("synthetic/walking_xyz?scene=1")
+    ratios = by_scene(dict.fromkeys(many, 0.02) | {one: 0.005}, dict.fromkeys([*many, one], 0.01))
+    assert list(ratios.values()) == [pytest.approx(math.log(2)), pytest.approx(-math.log(2))]
+    assert centre(ratios.values()) == pytest.approx(0.0)
+
+
 def test_few_scenes_have_an_interval_over_starts_that_shows_nothing() -> None:
     starts = [ProblemInstance("s", offset=offset) for offset in range(4)]
     found = compared(outcomes(dict.fromkeys(starts, 0.01)), outcomes(dict.fromkeys(starts, 0.02)))
