@@ -305,8 +305,8 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
     luck = not best.chosen or ratio.ratio >= 1
     if p_value is not None and p_value > MATTER_LEVEL and luck and not ratio.shows_gain:
         return Verdict.NO_MATTER, (
-            f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}); the best, "
-            f"{name}, has {numbers}"
+            f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}, level "
+            f"{MATTER_LEVEL}); the best, {name}, has {numbers}"
         )
     if ratio.low is not None and 1 - NEGLIGIBLE < ratio.low and ratio.ratio < 1:
         return Verdict.NO_MATTER, f"the best, {name}, gains at most {100 * (1 - ratio.low):.1f} %: {numbers}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -91,15 +92,22 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 @app.command()
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
+    from dynslam_bench.tuning.judgement import StudySummary
     from dynslam_bench.tuning.storage import best_trials, count_states
 
     tuner = tuning.Study(tuning.read_study(study), results, reading=True)
     facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.trials}
     facts |= count_states(tuner.study)
     settings: dict[str, Any] = {}
-    for trial in best_trials(tuner.study, 1):
-        facts |= {"best_trial": trial.number, "best_values": trial.values}
-        settings = trial.params
+    summary = tuner.folder / "summary.json"
+    conclusion = StudySummary.read(summary) if summary.is_file() else None
+    if conclusion is not None and conclusion.best is not None:  # as `tune best`
+        facts |= {"best_trial": conclusion.best.trial, "conclusion": conclusion.conclusion}
+        settings = conclusion.best.params
+    else:
+        for trial in best_trials(tuner.study, 1):
+            facts |= {"best_trial": trial.number, "best_ratios": [math.exp(value) for value in trial.values]}
+            settings = trial.params
     lines = ["", table(("setting", "value"), list(settings.items()))] if settings else []
     present(facts | {"best_settings": settings}, fields(facts), *lines)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from optuna.trial import TrialState
 from scipy import stats
 from scipy.stats import mstats
 
+from dynslam_bench.cli.studies import status
 from dynslam_bench.core.errors import StudyError
 from dynslam_bench.tuning import Study, StudySpec, Verdict, finish, run_study, write_page
 from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, beside_default, compared, judge
@@ -199,7 +201,9 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return [str(toy_tracker.make_sequence(root / f"s{i}", 0.8 * i)) for i in range(5)]
 
 
-def test_a_study_is_a_frame(folders: list[str], tmp_path: Path) -> None:
+def test_a_study_is_a_frame(
+    folders: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     spec = StudySpec.model_validate({
         "name": "toy", "tracker": TRACKER, "tune": folders[:1], "held_out": folders[1:], "trials": 5, "top": 1,
         "sampler": "random", "sampler_seed": 3, "pruner": "none", "min_coverage": 0.5, "recorded": [],
@@ -212,6 +216,11 @@ def test_a_study_is_a_frame(folders: list[str], tmp_path: Path) -> None:
     assert summary.conclusion in page and "dynslam-bench tune run 'my study.toml'" in page
     assert ("Use them" in page) == (summary.verdict == Verdict.PROVEN)
     assert StudySummary.read(tuner.folder / "summary.json").conclusion == summary.conclusion
+    monkeypatch.setattr("dynslam_bench.tuning.read_study", lambda path: spec)
+    status(Path("toy.toml"), tmp_path)
+    shown = capsys.readouterr().out
+    assert summary.best is not None and summary.conclusion in shown, "status names the trial of best.toml"
+    assert re.search(rf"best_trial +{summary.best.trial}\n", shown)
 
     frame, trials = Study.open(tuner.folder).frame(), tuner.study.get_trials()
     assert frame.equals(Study.open(spec, tmp_path).frame()) and len(trials) == 5
