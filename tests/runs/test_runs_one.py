@@ -90,9 +90,6 @@ def test_a_start_offset_is_a_repeat_of_the_same_block(store: RunStore, toy_folde
         ("raise", "crashed", "frame 4 of 60: ValueError: the toy tracker raised on purpose (envs_toys.py:"),
         ("segfault", "crashed", "SIGSEGV (segmentation fault), after frame 3 of 60"),
         ("nan", "invalid", "tracker 'toy' at frame 4 returned a pose with 16 values that are not finite"),
-        ("scaled", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
-        ("mirrored", "invalid", "tracker 'toy' at frame 4 returned a pose that is no rigid transformation"),
-        ("string", "invalid", "tracker 'toy' at frame 4 returned a str"),
         (
             "memoryerror",
             "out-of-memory",
@@ -159,6 +156,7 @@ def test_masks_are_compared_with_the_exact_ones(store: RunStore) -> None:
     spec = RunSpec(tracker="mask-rcnn", sequence="synthetic/walking_xyz", frames=(0, 4))
     record = run_one(spec.model_copy(update={"settings": {"segmentation.source": "oracle"}}), store)
     assert record.status == "ok" and record.segmentation == "oracle" and 0.3 < record.mask_iou <= 1
+    assert record.epipolar_skipped is None, "it has no such test"
     assert (store.folder(record.run_id) / "keyframes.csv").is_file()
     assert (store.folder(record.run_id) / "map.ply").is_file()
     assert record.keyframes >= 1 and record.map_points > 10
@@ -171,8 +169,7 @@ def test_the_record_says_how_often_the_fundamental_matrix_was_not_used(store: Ru
     oracle = {"segmentation.source": "oracle"}
     never = run_one(spec.model_copy(update={"settings": {**oracle, "epipolar.min_parallax_px": 50.0}}), store)
     always = run_one(spec.model_copy(update={"tracker": "sof-slam", "settings": oracle}), store)
-    without = run_one(spec.model_copy(update={"tracker": "mask-rcnn", "settings": oracle}), store)
-    assert (never.epipolar_skipped, always.epipolar_skipped, without.epipolar_skipped) == (1.0, 0.0, None)
+    assert (never.epipolar_skipped, always.epipolar_skipped) == (1.0, 0.0)
     rows = read_csv(store.folder(never.run_id) / "frames.csv")
     assert [row.stats["epipolar_f_asked"] for row in rows] == [0, 1, 1]
 
