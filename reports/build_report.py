@@ -458,6 +458,7 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
         tables.failure_rule_table(board),
         *tables.relative_errors(board, protocol),
         tables.rotation_errors(board, protocol),
+        tables.false_motion(board, protocol),
         published_table(lines),
         span_table(spans(lines)),
         folded=True,

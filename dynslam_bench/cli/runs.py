@@ -50,6 +50,7 @@ COLUMNS = {
     "coverage": "coverage",
     "masks": "segmentation",
     "static camera (m)": "static_camera_ate_rmse_m",
+    "false motion (m)": "false_motion_max_m",
     "identity": "identity",
     "from the store": "from_store",
     "study": "study",
@@ -256,11 +257,14 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
         present([row | {"protocol": protocol, "folder": store.folder(row["run_id"])} for row in rows])
         return
     columns = {
-        title: name for title, name in COLUMNS.items() if any(row.get(name) not in (None, "", False) for row in rows)
+        title: name
+        for title, name in COLUMNS.items()
+        if any(row.get(name) not in (None, "") and row[name] is not False for row in rows)
     }
     cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in rows]
     write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
-    pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in rows]
+    moving = [row for row in rows if row["false_motion_max_m"] is None]
+    pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving]
     ended = Counter(row["status"] for row in rows if row["status"] != "ok")
     if ended:
         write(f"{ended.total()} of {len(rows)} runs are not ok: {', '.join(f'{n} {s}' for s, n in ended.items())}.")
@@ -333,6 +337,7 @@ def recording_note(
         metrics = {} if record.status == "stopped" else store.score(record, protocol).metrics
         error, bound = metrics.get("ate_rmse_m"), metrics.get("static_camera_ate_rmse_m")
         static = record.tracker.id != "never-move" and error is not None and bound is not None and error >= bound
+        static = static and "false_motion_max_m" not in metrics
         if spec.sequence.startswith("synthetic/") or not (record.failed or record.status == "lost" or static):
             continue
         diagnosis = diagnose(spec.sequence, data_root=spec.data_root, camera=spec.camera, most_frames=HINT_FRAMES)

@@ -123,3 +123,18 @@ def static_camera_metrics(comparison: Comparison) -> dict[str, float]:
         errors = static_camera(truth, comparison.input_timestamps, protocol.max_dt)
     fit = "first" if protocol.alignment in ("none", "origin") else "constant"
     return {"static_camera_ate_rmse_m": errors[f"{fit}_rmse_m"]}
+
+
+def false_motion_metrics(comparison: Comparison) -> dict[str, float]:
+    """``false_motion_path_m`` and ``false_motion_max_m``, where the true camera stands still; else nothing.
+
+    They are the length of the estimated path and its largest distance from its first pose. Alignment does not change
+    them; where it would fit the scale, they are left out.
+    """
+    if comparison.protocol.finds_scale or not se3.stands_still(comparison.truth):
+        return {}
+    positions = comparison.aligned[:, :3, 3]
+    return {
+        "false_motion_path_m": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
+        "false_motion_max_m": float(np.linalg.norm(positions - positions[0], axis=1).max()),
+    }

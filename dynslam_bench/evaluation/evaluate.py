@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.evaluation.ape import absolute_errors, absolute_metrics, static_camera_metrics
+from dynslam_bench.evaluation.ape import absolute_errors, absolute_metrics, false_motion_metrics, static_camera_metrics
 from dynslam_bench.evaluation.comparison import AssociationRecord, Comparison, apply_policy, compare, truth_of_file
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
@@ -21,6 +21,7 @@ METRICS: tuple[Callable[[Comparison], dict[str, float]], ...] = (
     relative_metrics,
     segment_metrics,
     static_camera_metrics,
+    false_motion_metrics,
 )
 """Everything that is measured. To add a metric, add a function here that gives plain floats by name with their unit."""
 
@@ -48,6 +49,8 @@ class Evaluation(Record):
             relative ones ``rpe_<delta><unit>_trans_<statistic>_m`` and ``..._rot_<statistic>_deg``, KITTI's
             ``kitti_trans_percent`` and ``kitti_rot_deg_per_m``, and ``static_camera_ate_rmse_m``: what a camera that
             does not move scores under the same alignment. The statistics are rmse, mean, median, std, min, max, sse.
+            Where the true camera stands still, the false motion: ``false_motion_path_m``, the length of the estimated
+            path, and ``false_motion_max_m``, its largest distance from its first pose.
         n_pairs: Pairs of poses that the absolute error is taken over.
         n_pairs_rpe: The same for each relative error.
         n_input: Input frames; None where they are not known.

@@ -103,6 +103,17 @@ def rotation_angle(pose: Array) -> Array:
     return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0))
 
 
+STILL_M, STILL_DEG = 1e-3, 0.1
+"""How far the poses of a camera that stands still may lie apart: the noise of a motion capture system."""
+
+
+def stands_still(poses: Array) -> bool:
+    """Whether all poses ``[N, 4, 4]``, N > 0, are the first one, to a millimetre and a tenth of a degree."""
+    moved = inverse(poses[0]) @ poses
+    within = np.linalg.norm(moved[:, :3, 3], axis=1).max() <= STILL_M
+    return bool(within and np.degrees(rotation_angle(moved)).max() <= STILL_DEG)
+
+
 def transform(pose: Array, points: Array) -> Array:
     """Points ``[N, 3]`` moved by one pose ``[4, 4]``."""
     return points @ pose[:3, :3].T + pose[:3, 3]

@@ -748,7 +748,7 @@ def rescore(
 
 FIELDS = (
     *("run_id", "tracker", "sequence", "frames", "seed", "offset", "noise", "repeat", "settings", "status"),
-    *("ate_rmse_m", "static_camera_ate_rmse_m", "coverage", "frame_ms", "segmentation"),
+    *("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m", "coverage", "frame_ms", "segmentation"),
     *("seen_in_training", "study", "identity", "reason", "started"),
 )
 """Names of the values of a list's row, in order."""
@@ -778,6 +778,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "status": record.status,
         "ate_rmse_m": errors.get("ate_rmse_m"),
         "static_camera_ate_rmse_m": errors.get("static_camera_ate_rmse_m"),
+        "false_motion_max_m": errors.get("false_motion_max_m"),
         "coverage": record.coverage,
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
         "segmentation": record.segmentation,

@@ -17,10 +17,12 @@ STEP_S = 0.1
 LOOP_PATH_M, LOOP_EXTENT_M, LOOP_GAP_M = 10.0, 2.0, 1.0
 """A loop is a path of such a length and extent at least, whose ends come as close as this."""
 MOST_POSES = 500
+FIXED_CAMERA = "fixed-camera"
+"""Tag of a sequence whose camera stands still: not moving is right there, and a static camera's error is zero."""
 
 
 def sequence_tags(sequence: Any) -> list[str]:
-    """Tags of a sequence or a part of one: those it brings, and ``fast`` and ``loop`` from its ground truth."""
+    """Tags of a sequence or a part of one: those it brings, and those of the camera's motion from its ground truth."""
     truth: Trajectory | None = sequence.ground_truth
     if truth is not None:
         times = sequence.timestamps
@@ -30,7 +32,9 @@ def sequence_tags(sequence: Any) -> list[str]:
 
 
 def motion_tags(truth: Trajectory) -> set[str]:
-    """``fast`` and ``loop``, as far as they hold for the ground truth of a camera of two poses or more."""
+    """``fast``, ``loop`` or ``fixed-camera``, as far as they hold for the truth of a camera of two poses or more."""
+    if se3.stands_still(truth.T_world_cam):
+        return {FIXED_CAMERA}
     times = truth.timestamps
     index = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + STEP_S, STEP_S)).clip(max=len(times) - 1))
     poses, duration_s = truth.T_world_cam[index], times[-1] - times[0]

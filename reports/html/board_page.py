@@ -30,6 +30,7 @@ MEANINGS = {
     "low dynamic": "people sit",
     "high dynamic": "people walk",
     "unknown objects": "objects of no class",
+    "fixed camera": "the camera stands still",
 }
 """Categories in everyday words."""
 

@@ -258,7 +258,7 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
     if score is not None and static:
         error += f", {significant_text(100 * score / static, 2)} % of a static camera's"
     lost = row.n_frames - row.n_tracked
-    if score is not None and static and score >= static:
+    if score is not None and static and score >= static and not row.fixed_camera:
         return "amber", f"No better than a static camera: {error}"
     if row.coverage < 1:
         loss = _loss(frames, length)
@@ -323,6 +323,8 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
     numbers = [
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, " mm"),
         ("ATE of the final trajectory", row.final_ate_m, 1000, " mm"),
+        ("false motion, farthest", row.metrics.get("false_motion_max_m"), 1000, " mm"),
+        ("false motion, path", row.metrics.get("false_motion_path_m"), 1000, " mm"),
         ("real time", row.real_time_factor, 1, " ×"),
         ("keyframes", record.keyframes, 1, ""),
         ("map points", record.map_points, 1, ""),

@@ -33,6 +33,7 @@ from dynslam_bench.reports.model.statistics import (
     standings,
 )
 from dynslam_bench.runs.store import RunStore, part_words
+from dynslam_bench.sequences.tags import FIXED_CAMERA
 
 STATIC_CAMERA = "static camera (from ground truth)"
 DEFAULT_REFERENCE = "orb-slam2"
@@ -41,7 +42,9 @@ On = Literal["common", "all"]
 OVERALL = "overall"
 EXACT_MASKS = "oracle"
 """Source of masks that no tracker could have: a bound, which never ranks beside others."""
+_FIXED = "fixed camera"
 _GROUPS = {
+    FIXED_CAMERA: _FIXED,
     "unknown-objects": "unknown objects",
     "static": "static",
     "low-dynamic": "low dynamic",
@@ -171,17 +174,23 @@ class Board:
     def no_better_than_static(self, key: str, sequence: str) -> bool:
         """Whether a tracker's runs that ended well have, by their median, a static camera's error or more.
 
-        Controls make no claim: never.
+        Controls make no claim: never. Nor does it count before a fixed camera.
         """
-        cell, static_m = self.cells[key].get(sequence), self.static_camera.get(sequence)
+        cell = self.cells[key].get(sequence)
+        static_m = None if self.groups[sequence] == _FIXED else self.static_camera.get(sequence)
         if cell is None or static_m is None or not cell.succeeded or self.first(key).tracker.provenance == "control":
             return False
         return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * static_m
 
     def static_ratio(self, key: str) -> float:
-        """Geometric mean over the common sequences of a tracker's median error over that of a static camera."""
-        pairs = [(self.cells[key][name].median or 0.0, self.static_camera[name]) for name in self.common]
-        return geometric_mean([max(error, FLOOR_M) / max(static, FLOOR_M) for error, static in pairs])
+        """Geometric mean over the common sequences of a tracker's median error over that of a static camera.
+
+        Sequences of a fixed camera do not count; 0 if there are no others.
+        """
+        names = [name for name in self.common if self.groups[name] != _FIXED]
+        pairs = [(self.cells[key][name].median or 0.0, self.static_camera[name]) for name in names]
+        ratios = [max(error, FLOOR_M) / max(static, FLOOR_M) for error, static in pairs]
+        return geometric_mean(ratios) if ratios else 0.0
 
     def scored(self, key: str) -> list[str]:
         """The sequences on which a tracker has a score."""
@@ -347,7 +356,7 @@ def rank(
     for key in {*scored} if board.reference is None else {*scored, board.reference}:
         rows = {name: board.cells[key][name].kept for name in board.common if name in board.cells[key]}
         cells[key] = {name: [error for error in map(score, kept) if error is not None] for name, kept in rows.items()}
-    static = {name: [board.static_camera[name]] for name in board.common}
+    static = {name: [board.static_camera[name]] for name in board.common if board.groups[name] != _FIXED}
     reference = static if board.reference is None else cells[board.reference]
     shared = {name: errors for name, errors in reference.items() if errors}
     if not shared:
@@ -430,7 +439,7 @@ def _order_sequences(board: Board) -> None:
         board.groups[name] = group_of(board.tags[name])
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
-    order = ["static", "low dynamic", "high dynamic", "unknown objects", _OTHER, ""]
+    order = ["static", "low dynamic", "high dynamic", "unknown objects", _FIXED, _OTHER, ""]
     board.sequences = sorted(board.static_camera, key=lambda name: (order.index(board.groups[name]), name))
     board.short = shortened(board.sequences)
 

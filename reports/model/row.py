@@ -26,6 +26,7 @@ from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
+from dynslam_bench.sequences.tags import FIXED_CAMERA
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -164,6 +165,11 @@ class RunRow(RunRecord):
         return super().failed or self.status == "lost" or self.not_evaluated
 
     @property
+    def fixed_camera(self) -> bool:
+        """Whether the true camera stands still."""
+        return FIXED_CAMERA in self.sequence.tags
+
+    @property
     def final_ate_m(self) -> float | None:
         """ATE of the final trajectory; None if there is none."""
         return self.final_metrics.get("ate_rmse_m")
@@ -172,10 +178,11 @@ class RunRow(RunRecord):
     def score_m(self) -> float | None:
         """The ATE that ranks: lost frames held, failures as a static camera or worse; None without ground truth.
 
-        A failure whose held trajectory is even further off than a static camera keeps that error.
+        A failure whose held trajectory is even further off than a static camera keeps that error. Before a fixed camera
+        a failure has no error: a static camera has none there.
         """
         if self.failed:
-            static_m = self.static_camera_ate_rmse_m
+            static_m = None if self.fixed_camera else self.static_camera_ate_rmse_m
             return None if static_m is None else max(static_m, self.hold_last_pose_ate_m or 0.0)
         return self.hold_last_pose_ate_m if self.hold_last_pose_ate_m is not None else self.metrics.get("ate_rmse_m")
 

@@ -574,6 +574,31 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
     )
 
 
+def false_motion(board: Board, protocol: Protocol) -> Table | None:
+    """How far each tracker says that a fixed camera moved; None without a recording of one."""
+    farthest = medians(board, lambda row: row.metrics.get("false_motion_max_m"))
+    if not farthest:
+        return None
+    values = {"farthest": farthest, "path": medians(board, lambda row: row.metrics.get("false_motion_path_m"))}
+    marks = {kind: column_marks(board, numbers) for kind, numbers in values.items()}
+    still = {name for _, name in farthest}
+
+    def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
+        return TableCell(mm(values[kind][place]), value=values[kind][place], emphasis=marks[kind].get(place, ""))
+
+    return _sequence_table(
+        replace(board, sequences=[name for name in board.sequences if name in still]),
+        values,
+        shown,
+        "false_motion",
+        "False motion before a fixed camera",
+        "Of the estimated poses of a camera that stands still: the largest distance from the first one, and the length "
+        "of the path. Millimetres (metres in the CSV), median over the runs that succeeded, on the frames that they "
+        f"tracked. {protocol.describe()}.",
+        "False motion before a fixed camera (mm)",
+    )
+
+
 def mask_quality(board: Board) -> Table | None:
     """Overlap of the trackers' masks with the exact ones, of the trackers that have masks."""
     return metric_table(
@@ -598,14 +623,16 @@ def _rotation_doubt(cell: Cell) -> str:
 
 def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
     cell = board.cells[key].get(sequence)
-    if cell is None or cell.median is None:
-        return TableCell("–" if cell is None else "", emphasis="muted", tip="not run" if cell is None else "")
+    if cell is None:
+        return TableCell("–", emphasis="muted", tip="not run")
     coverage = f"coverage {100 * float(np.mean([row.coverage for row in cell.rows])):.1f} %"
     link = run_link(cell.typical)
     count = "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
     if not cell.success:
-        tip = f"counts as {mm(cell.median)} mm, {coverage}"
+        tip = f"counts as {mm(cell.median)} mm, {coverage}" if cell.median is not None else coverage
         return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
+    if cell.median is None:
+        return TableCell("", emphasis="muted")
     notes = [
         _spread(cell),
         count,

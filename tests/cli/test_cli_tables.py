@@ -59,8 +59,18 @@ def test_a_reports_table_has_no_markup():
 def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
     for coverage in (0.5, 1.0):
         row = dict.fromkeys(runs.COLUMNS.values(), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
+        row |= {"false_motion_max_m": None}
         runs.show_rows([row | {"static_camera_ate_rmse_m": 0.2}], None, "p")
         assert ("of the tracked frames alone" in capsys.readouterr().out) == (coverage < 1)
+
+
+def test_no_motion_of_a_fixed_camera_is_shown_and_nothing_is_worse_than_it(capsys):
+    numbers = {"static_camera_ate_rmse_m": 0.0, "coverage": 1.0, "from_store": False, "status": "ok"}
+    for error in (0.0, 0.002):
+        row = dict.fromkeys(runs.COLUMNS.values(), "") | numbers | {"ate_rmse_m": error, "false_motion_max_m": error}
+        runs.show_rows([row], None, "p")
+        out = capsys.readouterr().out.splitlines()
+        assert len(out) == 2 and "ATE (m)" in out[0] and "false motion (m)" in out[0] and "from the store" not in out[0]
 
 
 def test_report_prints_its_message_the_leaderboard_and_its_place(cli, walk, tmp_path):

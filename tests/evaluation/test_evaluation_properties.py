@@ -97,6 +97,25 @@ def test_static_camera_equals_the_evaluation_of_a_camera_that_does_not_move(alig
     assert expected["first_rmse_m"] > expected["constant_rmse_m"]
 
 
+def test_false_motion_is_what_the_estimate_of_a_fixed_camera_moves():
+    """Its numbers by hand, whatever the world frame; none where the camera moves or turns, or the scale is fitted."""
+    truth = Trajectory(np.arange(5) / 10, np.tile(se3.exp(np.ones(6)), (5, 1, 1)))
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :2, 3] = [[0, 0], [0.3, 0], [0.3, 0.4], [0, 0.4], [0, 0]]
+    there_and_back = Trajectory(truth.timestamps, se3.exp(np.full(6, 0.7)) @ poses)
+    result = evaluate(there_and_back, truth)
+    assert result.metrics["false_motion_path_m"] == pytest.approx(1.4)
+    assert result.metrics["false_motion_max_m"] == pytest.approx(0.5)
+    spread = np.linalg.norm(poses[:, :3, 3].std(axis=0))
+    assert result.metrics["ate_rmse_m"] == pytest.approx(spread) and result.metrics["static_camera_ate_rmse_m"] == 0.0
+    never = evaluate(truth, truth).metrics
+    assert (never["false_motion_path_m"], never["false_motion_max_m"], never["ate_rmse_m"]) == (0.0, 0.0, 0.0)
+    turning = truth.T_world_cam @ np.stack([se3.exp(np.array([0, 0, 0, 0, 0.01 * i, 0])) for i in range(5)])
+    for other, protocol in ((truth.with_poses(turning), "tum-rgbd/v1"), (truth, "tum-rgbd/v1-sim3")):
+        assert "false_motion_max_m" not in evaluate(there_and_back, other, protocol).metrics
+    assert "false_motion_max_m" not in evaluate(TRUTH, TRUTH).metrics
+
+
 def test_motion_on_a_line_is_aligned_to_the_minimum_and_the_roll_comes_from_the_orientations():
     n = 60
     poses = np.tile(np.eye(4), (n, 1, 1))

@@ -10,9 +10,9 @@ from reports_rows import PROTOCOL, crashed, row
 from dynslam_bench.cli.output import report_table
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import MONOCULAR, get_protocol
-from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.board import category_boards, make_board
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.reports.tables.leaderboard import leaderboard
+from dynslam_bench.reports.tables.leaderboard import false_motion, leaderboard, per_sequence, time_table
 from dynslam_bench.runs import RunStore
 
 LIVE = {"realtime": True, "machine": MACHINE}
@@ -45,6 +45,46 @@ def test_worse_than_a_static_camera_is_a_geometric_mean(s, t, ranked):
     (key,) = (key for key in board.labels if board.first(key).tracker.id == "one")
     assert board.static_ratio(key) == pytest.approx(np.sqrt(s * t) / 0.3)
     assert (key in board.ranked) == ranked != (key in board.no_better)
+
+
+def fixed(tracker, error, **changes):
+    """A run before a fixed camera, where a static camera has no error."""
+    moved = {"ate_rmse_m": error, "false_motion_max_m": 3 * error, "false_motion_path_m": 90 * error}
+    return row(tracker, "f", error, tags=["fixed-camera"], static_camera_ate_rmse_m=0.0, metrics=moved, **changes)
+
+
+def test_before_a_fixed_camera_trackers_rank_though_none_is_better_than_not_moving():
+    errors = {"orb-slam2": 0.05, "good": 0.002, "bad": 0.24}
+    rows = [*(fixed(name, error) for name, error in errors.items()), fixed("never", 0.0, provenance="control")]
+    board = make_board(rows)
+    assert names(board, board.ranked) == ["good", "orb-slam2", "bad"] and not board.no_better
+    assert board.groups == {"f": "fixed camera"} and board.static_camera == {"f": 0.0}
+    assert "no better" not in per_sequence(board, PROTOCOL).caption.replace("or are no better", "")
+    table = false_motion(board, PROTOCOL)
+    cells = {line[0].text: [cell.text for cell in line[1:]] for line in table.rows}
+    assert cells["GOOD"] == ["6.00", "180"] and cells["NEVER"] == ["0", "0"]
+    assert time_table(board) is None, "no percentage of zero"
+    assert make_board([fixed("good", 0.002), fixed("bad", 0.24)]).standings == [], "no ratio to zero either"
+
+
+def test_beside_other_sequences_the_fixed_camera_is_a_category_and_no_yardstick_of_not_moving():
+    rows = [row(name, s, error) for name, error in (("orb-slam2", 0.1), ("good", 0.05)) for s in "st"]
+    board = make_board([*rows, fixed("orb-slam2", 0.05), fixed("good", 0.002)])
+    assert names(board, board.ranked) == ["good", "orb-slam2"]
+    assert set(category_boards(board)) == {"overall", "fixed camera", "other"}
+    assert (
+        false_motion(board, PROTOCOL).columns[1].name == "farthest" and len(false_motion(board, PROTOCOL).columns) == 3
+    )
+    assert false_motion(make_board(rows), PROTOCOL) is None
+
+
+def test_who_fails_before_a_fixed_camera_does_not_win_with_an_error_of_zero():
+    gone = fixed("gone", 0.001, status="crashed", n_processed=20, n_tracked=20, coverage=1 / 3, reason="boom")
+    assert gone.score_m is None
+    board = make_board([fixed("good", 0.002), fixed("orb-slam2", 0.05), gone])
+    assert names(board, board.ranked) == ["good", "orb-slam2"]
+    cells = {line[0].text: line[1].text for line in per_sequence(board, PROTOCOL).rows}
+    assert cells["GONE"] == "crashed at 20/60"
 
 
 def test_a_reference_worse_than_a_static_camera_stays_the_reference():

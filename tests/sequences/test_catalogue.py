@@ -229,5 +229,6 @@ def test_noise_of_the_ground_truth_is_no_fast_motion():
     still = path(noise)
     at_300_hz = Trajectory(still.timestamps / 10, still.T_world_cam)
     assert motion_tags(at_300_hz) == set()
+    assert motion_tags(path(0.0 * noise)) == {"fixed-camera"}
     straight = path(np.linspace(0, 1.2, 31)[:, None])
     assert motion_tags(straight) == {"fast"}
