@@ -3,10 +3,10 @@
 import json
 
 import pytest
+from cli_helpers import PROGRAM
 from envs_toys import write_sequence
 
-from dynslam_bench.cli import output
-from dynslam_bench.cli.app import start
+from dynslam_bench.cli import app, output
 from dynslam_bench.testing import CornerSequence
 
 
@@ -16,11 +16,12 @@ def cli(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
+    monkeypatch.setattr(app, "app", PROGRAM)
     monkeypatch.setattr(output, "HEARTBEAT_S", 1000.0)  # no lines of progress where the machine is slow
 
     def call(*arguments):
         with pytest.raises(SystemExit) as ended:
-            start([str(argument) for argument in arguments])
+            app.start([str(argument) for argument in arguments])
         captured = capsys.readouterr()
         return ended.value.code or 0, captured.out, captured.err
 

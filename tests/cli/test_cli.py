@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer.main
-from cli_helpers import one_line
+import toy_tracker
+from cli_helpers import PROGRAM, one_line
 from envs_toys import write_sequence
 
 import dynslam_bench as db
-from dynslam_bench.cli.app import app, expand_lists
+from dynslam_bench.cli.app import expand_lists
 from dynslam_bench.core.errors import RunError, SettingsError
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.evaluation import evaluate_files
@@ -29,9 +29,8 @@ from dynslam_bench.testing import TurningSequence
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def commands(command=None, words=()):
+def commands(command=PROGRAM, words=()):
     """Every command and group of the program, with the words that lead to it."""
-    command = typer.main.get_command(app) if command is None else command
     yield words, command
     for name, inner in getattr(command, "commands", {}).items():
         yield from commands(inner, (*words, name))
@@ -143,7 +142,7 @@ def test_sequences_verify(cli, facts, walk, tmp_path):
 
 
 def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli, facts, tmp_path):
-    scene = TurningSequence(40)
+    scene = TurningSequence(24)
     sound = write_sequence(tmp_path / "sound", scene)
     scene.ground_truth = Trajectory(scene.timestamps, inverse(scene.ground_truth.T_world_cam))
     faulty = write_sequence(tmp_path / "faulty", scene)
@@ -282,26 +281,28 @@ def test_help_all_shows_every_option(cli):
     assert [name for name in options if name not in whole] == [] and "--realtime" not in short
 
 
-STUDY = """
+STUDY = f"""
 name = "tiny"
-tracker = "orb-slam2"
-tune = ["synthetic/sitting_xyz?scene=1&frames=5"]
-confirm = ["synthetic/sitting_xyz?scene=2&frames=5"]
-held_out = ["synthetic/sitting_xyz?scene=101&frames=5"]
+tracker = "{toy_tracker.__file__}:SPEC"
+tune = ["1"]
+confirm = ["2"]
+held_out = ["3"]
 seeds = [0]
 offsets = [0]
 trials = 2
 top = 1
 [space]
-include = ["features.n_features"]
+include = ["gain"]
 """
 
 
 def test_a_study(cli, facts, tmp_path):
+    for name in (1, 2, 3):
+        toy_tracker.make_sequence(tmp_path / str(name), name)
     Path("study.toml").write_text(STUDY)
     plan = facts("tune", "space", "study.toml")
     (parameter,) = plan["settings"]
-    assert parameter["name"] == "features.n_features" and plan["preview"]["needed"] > 2
+    assert parameter["name"] == "gain" and plan["preview"]["needed"] > 2
     assert "there is no study 'tiny'" in one_line(cli("tune", "best", "study.toml")[2])
     found = facts("tune", "run", "study.toml")
     assert Path(found["page"]).is_file() and found["summary"]["trials"]["complete"] == 2
@@ -311,11 +312,10 @@ def test_a_study(cli, facts, tmp_path):
     assert more["summary"]["trials"]["complete"] == 3 == facts("tune", "status", "study.toml")["complete"]
     assert "not judged" in cli("tune", "best", "study.toml", "--trial", "0")[1]
     assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
-    name = "synthetic/sitting_xyz?scene=1&frames=5"
-    assert facts("run", "orb-slam2", name, "--settings", "preset.toml")[0]["status"] == "ok"
+    assert facts("run", f"{toy_tracker.__file__}:SPEC", "1", "--settings", "preset.toml")[0]["status"] == "ok"
     assert cli("tune", "report", "study.toml")[1].splitlines()[0] == more["summary"]["conclusion"]
-    Path("study.toml").write_text(STUDY.replace("n_features", "n_featurs"))
-    assert "did you mean 'features.n_features'" in one_line(cli("tune", "space", "study.toml")[2])
+    Path("study.toml").write_text(STUDY.replace("gain", "gian"))
+    assert "did you mean 'gain'" in one_line(cli("tune", "space", "study.toml")[2])
 
 
 @pytest.mark.parametrize(

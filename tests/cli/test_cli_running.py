@@ -81,7 +81,7 @@ def fetched(tmp_path, monkeypatch):
 
 
 def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetched, monkeypatch):
-    command = ("run", "mask-rcnn", walk)
+    command = ("run", "mask-rcnn", walk, "--frames", "0:2")
     code, out, err = cli(*command)
     assert code == 1 and not out and not fetched.exists() and len(err.splitlines()) == 5, "an error and four cures"
     for agrees in (False, True):
@@ -91,8 +91,8 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetche
         assert code == 1 - agrees and "170 MB" in err and fetched.is_file() is agrees
     fetched.unlink()
     monkeypatch.setattr(running, "is_interactive", lambda: False)
-    assert cli(*command, "--frames", "0:2", "--yes")[0] == 0 and fetched.is_file()
-    assert cli(*command, "--frames", "0:2", "--seed", "1")[0] == 0, "nobody is asked again"
+    assert cli(*command, "--yes", "--seed", "1")[0] == 0 and fetched.is_file()
+    assert cli(*command, "--seed", "2")[0] == 0, "nobody is asked again"
 
 
 def test_bench_has_limits(cli, walk, tmp_path):
@@ -108,13 +108,13 @@ def test_bench_has_limits(cli, walk, tmp_path):
         assert ended == code and json.loads(out)[0]["status"] in statuses
 
 
-@pytest.mark.parametrize(("option", "name"), [("--sheet", "sheet.png"), ("--video", "video.webm")])
-def test_pictures_of_a_stored_run_are_made(facts, walk, option, name):
-    folder = Path(facts("run", "orb-slam2", walk)[0]["folder"])
-    assert not (folder / name).exists()
-    for from_store in (False, True):
-        (row,) = facts("run", "orb-slam2", walk, option)
-        assert row["from_store"] is from_store and Path(row["folder"]) == folder and (folder / name).is_file()
+def test_pictures_of_a_stored_run_are_made(facts, walk):
+    folder = Path(facts("run", "never-move", walk)[0]["folder"])
+    for option, name in (("--sheet", "sheet.png"), ("--video", "video.webm")):
+        assert not (folder / name).exists()
+        for from_store in (False, True):
+            (row,) = facts("run", "never-move", walk, option)
+            assert row["from_store"] is from_store and Path(row["folder"]) == folder and (folder / name).is_file()
 
 
 def test_a_map_that_cannot_be_had_is_no_success(cli, walk):
@@ -225,7 +225,7 @@ def attentive():
 
 @pytest.mark.parametrize(
     ("verb", "text", "number"),
-    [("bench", SUITE, signal.SIGHUP), ("bench", SUITE, signal.SIGTERM), ("tune run", STUDY, signal.SIGINT)],
+    [("bench", SUITE, signal.SIGHUP), ("tune run", STUDY, signal.SIGINT)],
 )
 def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     tracker = tmp_path / "waits.py"
@@ -264,6 +264,13 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     assert took < 2 + 10 * _crowded(), f"{took:.1f} s"
     assert not Path(f"/proc/{pids.read_text().split()[0]}").exists()
     assert not list(tmp_path.glob("results/runs/*")), "what was interrupted is no outcome"
+
+
+def test_sigterm_ends_with_the_shells_code():
+    code = "from dynslam_bench import cli; from dynslam_bench.cli import app; from os import getpid, kill; "
+    code += f"app.start = lambda: kill(getpid(), {signal.SIGTERM:d}); cli.main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 128 + signal.SIGTERM and done.stderr == "interrupted\n"
 
 
 def _crowded():

@@ -62,10 +62,15 @@ def setting_names() -> frozenset[str]:
 
 
 @cache
+def program() -> Any:
+    return typer.main.get_command(app)
+
+
+@cache
 def options() -> frozenset[str]:
     """Every option of every verb, and those that the benchmark scripts take."""
     found = set(FOREIGN_OPTIONS) | {f"--dynslam-{kind}" for kind in CHECKED_KINDS}
-    waiting: list[Any] = [typer.main.get_command(app)]
+    waiting = [program()]
     while waiting:
         command = waiting.pop()
         found.update(name for taken in command.params for name in (*taken.opts, *taken.secondary_opts))
@@ -141,7 +146,7 @@ def documented() -> list[str]:
 @pytest.mark.parametrize("line", documented())
 def test_the_documented_command_parses(line: str) -> None:
     words = expand_lists(shlex.split(line, comments=True)[1:])
-    command: Any = typer.main.get_command(app)
+    command = program()
     assert command.commands, "the command line has no verbs"
     while commands := getattr(command, "commands", None):  # a group, of whichever click typer brings
         name = words.pop(0) if words and words[0] in commands else "make"  # the default verb of `DefaultGroup`

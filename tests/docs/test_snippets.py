@@ -5,16 +5,14 @@ import contextlib
 import doctest
 import importlib
 import io
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from documented_names import PAGES, ROOT, sources
 
+from dynslam_bench.cli.app import start
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.core.toml import parse_toml
 from dynslam_bench.sequences.cameras import read_camera
@@ -103,8 +101,11 @@ def test_pages_that_show_outputs_are_compared() -> None:
 
 
 @pytest.mark.parametrize("page", WITH_OUTPUT)
-def test_commands_print_what_the_page_shows(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_print_what_the_page_shows(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
     for code, shown in outputs(page, "python"):
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
@@ -117,10 +118,11 @@ def test_commands_print_what_the_page_shows(page: str, tmp_path: Path, monkeypat
         assert {line[0] for line in lines} == {"dynslam-bench"}
         printed = ""
         for line in lines:
-            command = [sys.executable, "-m", "dynslam_bench", *line[1:]]
-            done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"})
-            assert done.returncode == 0, done.stderr
-            printed += done.stdout
+            with pytest.raises(SystemExit) as ended:
+                start(line[1:])
+            told = capsys.readouterr()
+            assert not ended.value.code, told.err
+            printed += told.out
         options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
         assert doctest.OutputChecker().check_output(shown, printed, options), printed
 
