@@ -142,7 +142,7 @@ def test_sequences_verify(cli, facts, walk, tmp_path):
 
 
 def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli, facts, tmp_path):
-    scene = TurningSequence(24)
+    scene = TurningSequence(40)
     sound = write_sequence(tmp_path / "sound", scene)
     scene.ground_truth = Trajectory(scene.timestamps, inverse(scene.ground_truth.T_world_cam))
     faulty = write_sequence(tmp_path / "faulty", scene)

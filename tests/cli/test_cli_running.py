@@ -109,11 +109,11 @@ def test_bench_has_limits(cli, walk, tmp_path):
 
 
 def test_pictures_of_a_stored_run_are_made(facts, walk):
-    folder = Path(facts("run", "never-move", walk)[0]["folder"])
+    folder = Path(facts("run", "orb-slam2", walk)[0]["folder"])
     for option, name in (("--sheet", "sheet.png"), ("--video", "video.webm")):
         assert not (folder / name).exists()
         for from_store in (False, True):
-            (row,) = facts("run", "never-move", walk, option)
+            (row,) = facts("run", "orb-slam2", walk, option)
             assert row["from_store"] is from_store and Path(row["folder"]) == folder and (folder / name).is_file()
 
 

@@ -72,7 +72,7 @@ SHOWN = {
     "leaderboard": ["never move", "droid-w/v1", "'ok': 4"],
     "culling": ["epipolar_f_judged", "precision 70%, recall 35%"],
 }
-"""Texts in the outputs of a notebook, from its first cells to its last one. `study` runs in `tests/tuning`, on drawn runs."""
+"""Texts in the outputs of a notebook, from its first cells to its last one; `tests/tuning` runs that of studies."""
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda notebook: notebook.stem)
