@@ -35,8 +35,23 @@ def sound():
 
 
 @pytest.fixture(scope="module")
-def diagnosed(sound):
-    return cache(lambda name: examine(Altered(sound, **FAULTS[name])))
+def pairs(sound):
+    """The motions that `examine` compares with a truth."""
+    return [pair for start in (0, 40) for pair in rgbd_pairs(sound.frames[start : start + 40], sound.camera)]
+
+
+@pytest.fixture(scope="module")
+def diagnosed(sound, pairs):
+    """What is found of a fault; faults of the truth alone share the images' motions."""
+
+    @cache
+    def found(name):
+        if "truth" not in FAULTS[name]:
+            return examine(Altered(sound, **FAULTS[name]))
+        truth = FAULTS[name]["truth"](sound.ground_truth)
+        return Diagnosis(sound.id, FRAMES, tuple(truth_findings(sound.timestamps, truth, sound.camera, pairs)))
+
+    return found
 
 
 def of_poses(change):
@@ -109,8 +124,7 @@ def test_a_fault_is_measured(diagnosed, name, value):
     assert finding.value == pytest.approx(value, rel=0.1)
 
 
-def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound):
-    pairs = [pair for start in (0, 40) for pair in rgbd_pairs(sound.frames[start : start + 40], sound.camera)]
+def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound, pairs):
     truths = [wander(seed)(sound.ground_truth) for seed in (0, 1, 2)]
     ids = [finding.id for truth in truths for finding in truth_findings(sound.timestamps, truth, sound.camera, pairs)]
     assert ids == ["truth-unclear", "truth-other-sequence", "truth-unclear"]
@@ -248,7 +262,7 @@ def window(first, readout_s, delay_s, rng):
     return Window(CAMERA, stamps, pixels[np.isfinite(pixels[..., 0]).sum(1) >= 4], depth, np.zeros(WINDOW))
 
 
-@pytest.mark.parametrize(("readout_s", "delay_s"), [(0.0, 0.0), (0.02, 0.012), (0.03, -0.034)])
+@pytest.mark.parametrize(("readout_s", "delay_s"), [(0.0, 0.0), (0.03, -0.034)])
 def test_exact_points_give_back_readout_and_delay(readout_s, delay_s):
     rng = np.random.default_rng(3)
     readout, delay = adjust([window(first, readout_s, delay_s, rng) for first in (0, 12, 24, 36)])

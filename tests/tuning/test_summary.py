@@ -41,7 +41,7 @@ def candidate(low: float, ratio: float, high: float, sequences: int = 6, **chang
     return Candidate.model_validate(values | changes)
 
 
-@pytest.mark.parametrize("scenes", [3, 4, 6, 9, 10, 15, 20, 40])
+@pytest.mark.parametrize("scenes", [3, 9, 10, 40])
 @pytest.mark.parametrize("lost", [0.0, 0.1], ids=["normal", "one in ten is a catastrophe"])
 def test_intervals_and_bounds_cover_the_truth(scenes: int, lost: float) -> None:
     rng = np.random.default_rng([scenes, round(10 * lost)])
