@@ -57,7 +57,7 @@ async function showPair(board, pair, names) {
   const truth = runs.flatMap(({ figures }) => figures.track?.data.filter(({ name }) => name === "true path") ?? []).slice(0, 1);
   const tracks = runs.flatMap(({ figures }, side) => (figures.track?.data ?? []).filter(({ name }) => name === "estimate").map((trace) => ({ ...trace, name: safe(names[side]), showlegend: true, line: { color: SIDES[side], width: 5 } })));
   const layout = runs.map(({ figures }) => figures.track?.layout).find(Boolean);
-  if (layout) await draw(byId("tracks"), { data: [...truth, ...tracks], layout });
+  if (layout) await draw(byId("tracks"), { data: [...truth, ...tracks, ...corners([...truth, ...tracks])], layout });
   const lines = runs.map(({ series }, side) => ({ type: "scatter", mode: "lines", name: safe(names[side]), x: series.track_t, y: series.track_error, line: { color: SIDES[side], dash: ["solid", "dash"][side] } })).filter(({ x }) => x);
   if (lines.length === 2) {
     const [first, second] = runs.map(({ series }) => series), gap = 0.1;

@@ -29,6 +29,15 @@ function marker(run, t) {
   return { type: "scatter3d", mode: "markers", x: at < 0 ? [] : [x[at]], y: at < 0 ? [] : [y[at]], z: at < 0 ? [] : [z[at]], marker: { size: 6, color: "#e69f00", line: { width: 1, color: "#000" } }, showlegend: false, hoverinfo: "skip" };
 }
 
+/** Two unseen corners around paths: a straight one, too, has a box that fits the view. */
+function corners(paths) {
+  const sides = ["x", "y", "z"].map((axis) => paths.flatMap((path) => [...path[axis]]).filter(Number.isFinite)).map((values) => [Math.min(...values), Math.max(...values)]);
+  const least = 0.4 * Math.max(...sides.map(([low, high]) => high - low));
+  if (!Number.isFinite(least)) return [];
+  const [x, y, z] = sides.map(([low, high]) => [-0.5, 0.5].map((side) => (low + high) / 2 + side * Math.max(high - low, least)));
+  return [{ type: "scatter3d", mode: "markers", x, y, z, marker: { opacity: 0 }, showlegend: false, hoverinfo: "skip" }];
+}
+
 const chooser = (name, options, value, onchange) => {
   const list = make("select", { ariaLabel: name, onchange: ({ target }) => onchange(target.value) }, ...options.map(([key, text]) => make("option", { value: key, textContent: text })));
   list.value = value;
@@ -80,7 +89,7 @@ class RunView {
     const { figures } = this.run;
     if (!figures.track) return;
     const other = this.second?.figures.track?.data.filter(({ name }) => name === "estimate").map((trace) => ({ ...trace, name: this.second.label.replace(/</g, "&lt;"), showlegend: true, line: { color: "#cc79a7", width: 4 } })) ?? [];
-    await draw(byId("track"), { data: [...figures.track.data, ...other, marker(this.run, this.times[this.at] ?? 0)], layout: figures.track.layout });
+    await draw(byId("track"), { data: [...figures.track.data, ...other, ...corners([...figures.track.data, ...other]), marker(this.run, this.times[this.at] ?? 0)], layout: figures.track.layout });
   }
 
   move(at, write = true) {
