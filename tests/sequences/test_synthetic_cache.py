@@ -127,11 +127,11 @@ def test_the_cache_is_a_folder_in_tum_layout(tmp_path: Path) -> None:
 def test_two_processes_may_render_the_same_sequence(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from dynslam_bench.sequences.synthetic import render_synthetic; "
-        "render_synthetic('synthetic/walking_static?frames=5', Path(sys.argv[1]), threads=1)"
+        "render_synthetic('synthetic/walking_static?frames=3', Path(sys.argv[1]), threads=1)"
     )
     children = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(2)]
     assert [child.wait() for child in children] == [0, 0]
-    sequence = open_synthetic("synthetic/walking_static?frames=5", tmp_path)
+    sequence = open_synthetic("synthetic/walking_static?frames=3", tmp_path)
     assert sequence.render() == 0
     assert not [path for path in tmp_path.rglob(".*")]
 

@@ -122,7 +122,7 @@ if __name__ == "__main__":
 
 
 def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_path: Path) -> None:
-    spec = make(sequences, trials=8)
+    spec = make(sequences, trials=6)
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
     command = [sys.executable, str(script), spec.model_dump_json(), str(tmp_path)]
@@ -141,7 +141,7 @@ def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_
     assert len(before) >= 3
     assert all(after[number].values == values for number, values in before.items()), "no finished trial was lost"
     lost = [trial for trial in after if trial.user_attrs.get("reason") == CRASHED_WORKER]
-    assert len(lost) <= 1 and len(after) == 8 + len(lost), "none doubled"
+    assert len(lost) <= 1 and len(after) == 6 + len(lost), "none doubled"
     assert [trial.number for trial in after] == list(range(len(after)))
 
 
@@ -190,8 +190,8 @@ def test_resuming_something_else_is_refused_with_the_difference(sequences: list[
     run_study(make(sequences, trials=2), results=tmp_path)
     with pytest.raises(StudyError, match=r"stored with other seeds: \[0\] there, \[0, 1\] here"):
         run_study(make(sequences, trials=2, seeds=[0, 1]), results=tmp_path)
-    more = run_study(make(sequences, trials=5), results=tmp_path, jobs=3)
-    assert len(more.study.get_trials()) == 5, "more trials of the same study are welcome"
+    more = run_study(make(sequences, trials=4), results=tmp_path, jobs=3)
+    assert len(more.study.get_trials()) == 4, "more trials of the same study are welcome"
 
 
 def test_a_study_does_not_go_on_after_its_data_changed(tmp_path: Path) -> None:
