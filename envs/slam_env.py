@@ -252,6 +252,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self._final = check_trajectory(final, self.tracker_spec.id).with_exact(self.exact_stamps)
         return self._final
 
+    @property
+    def measured(self) -> dict[str, Any]:
+        """What the adapter of a batch program measured of it at the end; empty for other trackers."""
+        return dict(getattr(self._tracker, "measured", {}))
+
     def map_outputs(self) -> Any:
         """The tracker's keyframes and map points (``slam.outputs.MapOutputs``); None if it offers none."""
         outputs = getattr(self._tracker, "map_outputs", None)

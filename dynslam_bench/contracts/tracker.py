@@ -83,6 +83,9 @@ class TrackerSpec:
         bound: Settings fixed by the way it was named, dotted name to value; ``TRACKERS.get("id:value")`` fills it in.
         check: ``"module:function"``; the function returns an install hint if the tracker cannot run here although all
             of `requires` can be imported, else an empty string.
+        online: Whether it gives poses frame by frame; of a batch program only the final trajectory exists.
+        describe: ``"module:function"``; called with the file behind ``id:``, the function returns what the file
+            tells of this spec, by field; empty if there is none.
         files: ``"module:function"``; called with the settings, the function returns the files whose content decides
             what the tracker does and that no setting names by itself, for a run's identity; empty if there are none.
     """
@@ -109,6 +112,8 @@ class TrackerSpec:
     bound: Mapping[str, Any] = field(default_factory=dict)
     check: str = ""
     files: str = ""
+    online: bool = True
+    describe: str = ""
 
     @property
     def metric(self) -> bool:

@@ -79,6 +79,10 @@ class TrackerError(DynslamError):
     """A tracker cannot be built, or broke its contract while it ran."""
 
 
+class TrackerTimeoutError(TrackerError):
+    """An external program did not end in the time that it was given."""
+
+
 class DownloadError(DynslamError):
     """A file cannot be downloaded."""
 

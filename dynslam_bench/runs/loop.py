@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.wrappers import DegradeFrames, DropFrames
+from dynslam_bench.evaluation.comparison import tracked_frames
 from dynslam_bench.evaluation.masks import compare_masks
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry import write_tum
@@ -36,6 +38,7 @@ from dynslam_bench.runs.frames import FRAMES_FILE, FrameRow
 from dynslam_bench.runs.process.child import at
 from dynslam_bench.runs.spec import RunSpec
 
+_BEAT_S = 5.0
 Send = Callable[[dict[str, Any]], None]
 
 
@@ -101,10 +104,29 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             with at(position):
                 _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
-        with at(lambda: "after the last frame"):
+        signs = _signs_of_life(send, total - 1) if not base.tracker_spec.online else contextlib.nullcontext()
+        with at(lambda: "after the last frame"), signs:
             outcome = recorder.finish()
             env.close()
     return {"type": "done", **outcome}
+
+
+@contextlib.contextmanager
+def _signs_of_life(send: Send, frame: int) -> Iterator[None]:
+    """Tell the parent every few seconds that a batch program, which has a time limit of its own, is at work."""
+    over = threading.Event()
+
+    def beat() -> None:
+        while not over.wait(_BEAT_S):
+            send({"type": "frame", "index": frame})
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:
@@ -172,6 +194,10 @@ class _Recorder:
             outcome["finalize_s"] = time.perf_counter() - began
             write_tum(folder / "trajectory_final.txt", final)
         outputs, counts, notes = keep_map(env, folder, self._spec)
+        if not env.tracker_spec.online and final is not None:
+            measured, tracked = env.measured, tracked_frames(final, env.sequence.timestamps)
+            notes += measured.pop("notes")
+            outcome |= measured | {"tracked": int(tracked.sum()), "lost_at_end": int(tracked[::-1].argmax())}
         track = env.online_trajectory() if final is None else final
         if self._sheet is not None and outputs is not None:
             self._sheet.write(outputs, track)

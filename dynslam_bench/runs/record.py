@@ -50,6 +50,7 @@ class TrackerInfo(Record):
     citation: str = ""
     remarks: str = ""
     sensors: Literal["rgbd", "rgb"] = "rgbd"
+    online: bool = True
     given: str = ""
 
 

@@ -44,7 +44,7 @@ from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, 
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
-from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, Status, TrackerInfo
+from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, StageTime, Status, TrackerInfo
 from dynslam_bench.runs.spec import RunSpec, place_of
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
 from dynslam_bench.sequences.tags import sequence_tags
@@ -56,6 +56,7 @@ WORK = "dynslam_bench.runs.loop:run_loop"
 """What the child does."""
 PROGRESS_EVERY = 50
 CACHED_TIMES = "times of features and masks are those of the stage cache's entries, not of this run"
+BATCH_NOTE = "a batch program: only the final trajectory exists; a frame's time is the program's over all frames"
 LOST_AT_END = 10
 """A run whose coverage is below `LOST_COVERAGE`, or that is lost on so many frames at its end, has status ``lost``."""
 
@@ -173,13 +174,26 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
     spec, tracker, identity, final = resolved.spec, resolved.tracker, resolved.identity, verdict.final
     total, states = len(resolved.sequence), Counter(row.state for row in frames.rows)
     status, reason, dropped = verdict.status, verdict.reason, states["dropped"]
+    tracked, lost, initialising, lost_at_end = (
+        states["ok"],
+        states["lost"],
+        states["initialising"],
+        frames.lost_streak(),
+    )
+    timings, batch = frames.timings(), not tracker.online
+    if batch:
+        tracked, lost_at_end = final.get("tracked", 0), final.get("lost_at_end", total)
+        lost, initialising = total - dropped - tracked, 0
+        each_s = final.get("program_s", 0.0) / total
+        timings = {"total": StageTime(median_s=each_s, p95_s=each_s, mean_s=each_s)} if each_s else {}
     if status == "ok" and frames.damage:
         status, reason = "invalid", frames.damage
     elif status == "ok":  # it may still have lost its way
-        status, reason = judge_coverage(states["ok"], total - dropped, frames.lost_streak(), total)
+        status, reason = judge_coverage(tracked, total - dropped, lost_at_end, total)
     if status == "ok" and spec.realtime and dropped:
         reason = f"{dropped} of {total} frames dropped while the tracker was busy"
     notes = [CACHED_TIMES] if spec.cache else []
+    notes += [BATCH_NOTE] if batch else []
     notes += [] if resolved.start_map is None else [resolved.start_map.describe()]
     return RunRecord(
         run_id=resolved.run_id,
@@ -200,19 +214,19 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
         segmentation=resolved.segmentation,
         n_frames=total,
         n_processed=len(frames.rows) - dropped,
-        n_tracked=states["ok"],
-        n_lost=states["lost"],
-        n_initialising=states["initialising"],
+        n_tracked=tracked,
+        n_lost=lost,
+        n_initialising=initialising,
         n_dropped=dropped,
-        coverage=states["ok"] / total,
+        coverage=tracked / total,
         **{name: final.get(name) for name in ("keyframes", "map_points", "maps", "finalize_s")},
         start_map=resolved.start_map,
         epipolar_skipped=frames.epipolar_skipped(),
         mask_iou=frames.mask_iou(),
-        timings=frames.timings(),
+        timings=timings,
         started=started,
         wall_s=wall_s,
-        peak_memory_mb=verdict.peak_memory_mb or None,
+        peak_memory_mb=final.get("program_memory_mb", verdict.peak_memory_mb) or None,
         peak_gpu_memory_mb=final.get("gpu_memory_mb"),
         machine=this_machine().model_copy(update={"gpu": final.get("gpu", "")}),
         versions=versions(),
@@ -227,7 +241,7 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
 _AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share", "study")
 """What a record takes from the request as it is."""
 _OF_THE_TRACKER = (
-    *("id", "version", "provenance", "ranked", "deterministic", "license", "citation", "remarks", "sensors"),
+    *("id", "version", "provenance", "ranked", "deterministic", "license", "citation", "remarks", "sensors", "online"),
 )
 """What a record takes from the tracker's spec as it is."""
 

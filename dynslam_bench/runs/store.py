@@ -515,6 +515,8 @@ class RunStore:
         asked: Which = protocol.trajectory
         if record.kind == "imported":  # it has only one trajectory
             asked = "online" if (self.folder(record.run_id) / ONLINE).is_file() else "final"
+        elif not record.tracker.online:
+            asked = "final"
         metrics = MetricRecord(
             run_id=record.run_id,
             protocol_id=protocol.id,

@@ -13,7 +13,7 @@ from typing import Any
 
 from dynslam_bench.contracts import Tracker, TrackerContext, TrackerSpec
 from dynslam_bench.core.errors import PluginError, TrackerError
-from dynslam_bench.core.plugins import Registry, build_plugin
+from dynslam_bench.core.plugins import Registry, build_plugin, load_object
 from dynslam_bench.core.settings import Settings, apply_overrides
 from dynslam_bench.trackers.adapters.specs import ADAPTERS
 from dynslam_bench.trackers.systems import emfoa_oft, published
@@ -73,14 +73,10 @@ def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
         raise PluginError(f"'{spec.id}:' lacks its {spec.parameter}", f"write {spec.id}:{spec.parameter.upper()}")
     path = Path(value).expanduser()
     content = f"+{sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else ""
-    return replace(
-        spec,
-        id=f"{spec.id}:{value}",
-        label=f"{spec.label}: {path.name if content else value}",
-        bound={**spec.bound, spec.parameter: value},
-        version=spec.version + content,
-        parameter="",
-    )
+    described = load_object(spec.describe)(path) if spec.describe else {}
+    named = {"label": f"{spec.label}: {path.name if content else value}", "version": spec.version} | described
+    named |= {"id": f"{spec.id}:{value}", "version": named["version"] + content, "parameter": ""}
+    return replace(spec, **named, bound={**spec.bound, spec.parameter: value})
 
 
 TRACKERS: Registry[TrackerSpec] = TrackerRegistry("trackers", TrackerSpec, all_specs)

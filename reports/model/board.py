@@ -68,7 +68,7 @@ class Board:
         rank_seen: Whether cells rank whose masks come from a network that was trained on the scene.
         columns: Column id of a row to the name of its sequence.
         trackers: Variant keys in order of standing; those of which only final trajectories are known stand apart.
-        final_only: Variant keys of imports of which only the final trajectory is known.
+        final_only: Variant keys of imports and batch programs of which only the final trajectory is known.
         labels: Variant key to the name in tables.
         sequences: Names of the sequences with ground truth, grouped and sorted.
         common: Those of them that the standings are taken over.
@@ -310,8 +310,8 @@ def _completed(board: Board) -> Board:
         board.cells[key] = {name: make_cell(runs) for name, runs in cells.items()}
     board.final_only = [
         key
-        for key in board.labels  # imports that have nothing of the trajectory that the protocol asks for
-        if all(row.imported and not row.metrics and row.final_ate_m is not None for row in board.runs(key))
+        for key in board.labels  # imports and batch programs without the trajectory that the protocol asks for
+        if all(_final_only(row) for row in board.runs(key))
     ]
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
@@ -323,6 +323,11 @@ def _completed(board: Board) -> Board:
     board.trackers = sorted(placed, key=lambda key: key in board.hopeless)
     board.ranked = [key for key in board.trackers if key in board.ranked]
     return board
+
+
+def _final_only(row: RunRow) -> bool:
+    """Whether nothing but the final trajectory of a run is known, and the protocol asks for the online one."""
+    return (row.imported or not row.tracker.online) and not row.metrics and row.final_ate_m is not None
 
 
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:

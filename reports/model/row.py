@@ -299,7 +299,8 @@ def _outcome(
     record: RunRecord, scored: MetricRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> dict[str, Any]:
     """Fields of a row that differ from the record's: which trajectory is scored, how the run ended, its coverage."""
-    if record.kind == "imported" and scored.online is None and scored.final is not None:
+    final_only = record.kind == "imported" or not record.tracker.online
+    if final_only and not record.failed and scored.online is None and scored.final is not None:
         return {"trajectory": "final"}
     if evaluation is None:
         if record.failed or record.status == "lost" or not record.sequence.ground_truth:

@@ -36,6 +36,7 @@ from dynslam_bench.core.errors import (
     SegmentationError,
     SequenceError,
     SettingsError,
+    TrackerTimeoutError,
     TrajectoryError,
 )
 from dynslam_bench.core.files import TemporaryFolder
@@ -197,6 +198,8 @@ def describe_failure(error: BaseException) -> dict[str, Any]:
     if isinstance(cause, MemoryError) or "out of memory" in text.lower() or kind == "OutOfMemoryError":
         return message("out-of-memory", named, line=True)
     data = {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
+    if isinstance(cause, TrackerTimeoutError):
+        return message("timeout", text)
     if isinstance(cause, DynslamError):
         return message("crashed", text, refused=isinstance(cause, _REFUSALS), **data)
     return message("crashed", named, line=True, **data)

@@ -238,13 +238,14 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
         )
 
 
-def settings_yaml(camera: Camera, settings: OrbSlam3Settings, fps: float) -> str:
-    """ORB-SLAM3's settings file (format 1.0) for images of this camera; depth comes in metres already."""
+def settings_yaml(camera: Camera, settings: OrbSlam3Settings, fps: float, depth_factor: float = 1.0) -> str:
+    """ORB-SLAM3's settings file (format 1.0) for images of this camera; depth comes in metres unless a factor says."""
     k1, k2, p1, p2, k3 = camera.distortion
     numbers = {
         "Camera1.fx": camera.fx, "Camera1.fy": camera.fy, "Camera1.cx": camera.cx, "Camera1.cy": camera.cy,
         "Camera1.k1": k1, "Camera1.k2": k2, "Camera1.p1": p1, "Camera1.p2": p2, "Camera1.k3": k3,
-        "Stereo.b": camera.baseline_m, "Stereo.ThDepth": settings.close_depth_baselines, "RGBD.DepthMapFactor": 1.0,
+        "Stereo.b": camera.baseline_m, "Stereo.ThDepth": settings.close_depth_baselines,
+        "RGBD.DepthMapFactor": depth_factor,
         "ORBextractor.scaleFactor": settings.scale_factor,
         **{f"Viewer.{key}": value for key, value in _VIEWER},
     }  # fmt: skip

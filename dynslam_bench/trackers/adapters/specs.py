@@ -6,17 +6,20 @@ Imports neither torch nor OpenCV.
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.errors import SettingsError, raising
+from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.settings import Settings, names, tunable
+from dynslam_bench.core.toml import read_toml
 from dynslam_bench.core.version import install_hint
 
 
@@ -98,6 +101,73 @@ class SubprocessSettings(ProgramSettings):
         program = command[0] if os.sep not in command[0] else str((folder / Path(command[0]).expanduser()).absolute())
         if shutil.which(program) is None:
             raise SettingsError(f"subprocess: cannot start '{command[0]}': no such program", "check its path and mode")
+
+
+class BatchProgram(Record):
+    """What the TOML file of `batch:FILE` says.
+
+    Attributes:
+        name: Shown in tables.
+        command: Program and arguments, run without a shell. ``{sequence}`` (a folder in TUM layout), ``{camera}``
+            (ORB-SLAM's YAML), ``{associations}``, ``{output}``, ``{threads}`` and ``{here}`` (the TOML file's folder)
+            are put in. A word that names a file below that folder is that file.
+        output: What it writes, in its working folder, which is new for every run.
+        format: ``tum`` (stamp tx ty tz qx qy qz qw, camera to world), or ``indices``: the frame's index for the stamp.
+        sensors: ``rgb`` for a program without depth.
+        version: Part of a run's identity.
+        license: SPDX id.
+        citation: What to cite.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = Field(min_length=1)
+    command: list[str] = Field(min_length=1)
+    output: str = "trajectory.txt"
+    format: Literal["tum", "indices"] = "tum"
+    sensors: Literal["rgbd", "rgb"] = "rgbd"
+    version: str = ""
+    license: str = ""
+    citation: str = ""
+
+    def words(self, here: Path, **places: str) -> list[str]:
+        """The command with these paths for its placeholders."""
+        words = [
+            str(here / word) if re.search(r"[./]", word) and (here / word).is_file() else word for word in self.command
+        ]
+        for name, place in {"here": str(here), **places}.items():
+            words = [word.replace(f"{{{name}}}", place) for word in words]
+        return words
+
+
+class BatchSettings(Settings):
+    """Settings of `batch:FILE`."""
+
+    program: str = names("", "file", meaning="TOML file that describes the program, see docs/how-to/program.md")
+    timeout_s: float = Field(3600.0, gt=0, description="seconds that the program may take")
+
+    @property
+    def path(self) -> Path:
+        """The TOML file."""
+        return Path(self.program).expanduser().absolute()
+
+    def read(self) -> tuple[BatchProgram, Path]:
+        """The program, and the folder of its file.
+
+        Raises:
+            SettingsError: The file is missing or damaged.
+        """
+        if not self.program.strip():
+            raise SettingsError("batch needs a file that describes the program", "write batch:FILE.toml")
+        document = read_toml(self.path, kind=SettingsError)
+        return validated(BatchProgram, document, str(self.path), SettingsError), self.path.parent
+
+    def verify(self) -> None:
+        """The file must be sound, and the program there."""
+        program, here = self.read()
+        first = program.words(here)[0]
+        if shutil.which(first) is None:
+            raise SettingsError(f"batch: cannot start '{first}': no such program", f"see command in {self.path}")
 
 
 class OrbSlam3Settings(ProgramSettings):
@@ -205,6 +275,21 @@ SUBPROCESS = TrackerSpec(
     ),
 )
 
+BATCH = TrackerSpec(
+    id="batch",
+    entry_point=f"{_HERE}.batch:BatchTracker",
+    label="batch program",
+    settings=BatchSettings,
+    summary="A program that reads a sequence folder and writes a trajectory at its end: batch:FILE.toml.",
+    deterministic=False,
+    provenance="external",
+    parameter="program",
+    files=f"{_HERE}.batch:files",
+    online=False,
+    describe=f"{_HERE}.batch:describe",
+    remarks="Only its final trajectory exists. The time of a frame is the program's whole time over the frames.",
+)
+
 ORBSLAM3 = TrackerSpec(
     id="orbslam3",
     entry_point=f"{_HERE}.orbslam3:OrbSlam3",
@@ -269,6 +354,6 @@ OPEN3D_ODOMETRY = TrackerSpec(
 )
 
 ADAPTERS = (
-    NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, ORBSLAM3, ORBSLAM3_MONO, OPENCV_ODOMETRY, OPEN3D_ODOMETRY,
+    NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, BATCH, ORBSLAM3, ORBSLAM3_MONO, OPENCV_ODOMETRY, OPEN3D_ODOMETRY,
 )  # fmt: skip
 """The control trackers and the adapters."""

@@ -329,15 +329,26 @@ class ImageExchange:
         for old in self.folder.glob("*.png"):
             old.unlink()
         rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
-        units = np.rint(np.nan_to_num(frame.depth) * self.camera.depth_factor).clip(0, 65535).astype(np.uint16)
-        for path, image in ((rgb, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)), (depth, units)):
-            if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-                raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
+        write_images(frame, rgb, depth, self.camera.depth_factor)
         return {"rgb": str(rgb), "depth": str(depth)}
 
     def close(self) -> None:
         """Remove the folder; may be called more than once."""
         self._temporary.close()
+
+
+def write_images(frame: Frame, rgb: Path, depth: Path | None, depth_factor: float) -> None:
+    """Write an 8-bit colour PNG and, unless `depth` is None, a 16-bit depth PNG in ``1 / depth_factor`` metres.
+
+    Raises:
+        TrackerError: A file cannot be written.
+    """
+    images = {rgb: cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)}
+    if depth is not None:
+        images[depth] = np.rint(np.nan_to_num(frame.depth) * depth_factor).clip(0, 65535).astype(np.uint16)
+    for path, image in images.items():
+        if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
 
 
 def _with_space(size: int) -> TemporaryFolder:

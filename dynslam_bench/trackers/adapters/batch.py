@@ -1,0 +1,222 @@
+"""A program that reads a whole sequence folder and writes one trajectory at its end: `batch:FILE.toml`."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from dynslam_bench.contracts import Frame, TrackerContext, TrackResult
+from dynslam_bench.core.code_files import files_of_command
+from dynslam_bench.core.errors import TrackerError, TrackerTimeoutError, TrajectoryError, raising
+from dynslam_bench.core.files import TemporaryFolder
+from dynslam_bench.geometry import Camera, Trajectory, nearest_gap, read_table, read_tum, se3
+from dynslam_bench.trackers.adapters.orbslam3 import settings_yaml
+from dynslam_bench.trackers.adapters.specs import BatchProgram, BatchSettings, OrbSlam3Settings
+from dynslam_bench.trackers.adapters.subprocess_tracker import LOGGER, end_with_parent, write_images
+
+_POLL_S = 0.1
+LONGEST_TAIL = 1 << 16
+"""Bytes of a program's output of which the end is kept."""
+
+
+def files(settings: BatchSettings) -> list[Path]:
+    """The files that decide what the program does: the TOML file and those of its command."""
+    program, place = settings.read()
+    return [settings.path, *files_of_command(program.words(place), place)]
+
+
+class BatchTracker:
+    """Collects the frames in a folder in TUM layout and runs the program on it at the end.
+
+    No frame has a pose before: only the final trajectory exists. Time and memory are those of the program, measured
+    from outside.
+
+    Args:
+        settings: The program and its time limit.
+        context: Where it runs.
+
+    Raises:
+        SettingsError: The file that describes the program is damaged.
+    """
+
+    def __init__(self, settings: BatchSettings, context: TrackerContext) -> None:
+        self._program, self._place = settings.read()
+        self._limit_s, self._context = settings.timeout_s, context
+        self._folder: TemporaryFolder | None = None
+        self.measured: dict[str, Any] = {}
+        """After `finalize`: ``program_s``, ``program_memory_mb`` (resident, all its processes) and ``notes``."""
+
+    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
+        """Begin a new sequence in a new folder."""
+        self.close()
+        self._camera, self._stamps, self.measured = camera, list[float](), {}
+        self._folder = TemporaryFolder()
+        for name in ("sequence/rgb", "sequence/depth", "work"):
+            (self._folder.path / name).mkdir(parents=True)
+
+    def track(self, frame: Frame) -> TrackResult:
+        """Write the frame's images; no pose is known yet.
+
+        Raises:
+            TrackerError: They cannot be written, or `reset` was not called.
+        """
+        name = f"{frame.timestamp:.6f}.png"
+        rgb, depth = (self._open() / "sequence" / kind / name for kind in ("rgb", "depth"))
+        write_images(frame, rgb, None if self._program.sensors == "rgb" else depth, self._camera.depth_factor)
+        self._stamps.append(frame.timestamp)
+        return TrackResult(None, "initialising")
+
+    def finalize(self) -> Trajectory:
+        """Run the program and read what it wrote.
+
+        Raises:
+            TrackerError: It cannot be started, wrote no trajectory, or one that is not of these frames; with its last
+                words.
+            TrackerTimeoutError: It did not end in time.
+        """
+        folder, program = self._open(), self._program
+        output = folder / "work" / program.output
+        settings = folder / "camera.yaml"
+        places = {
+            "sequence": folder / "sequence",
+            "associations": folder / "sequence" / "associations.txt",
+            "camera": settings,
+            "output": output,
+            "threads": self._context.threads,
+        }
+        self._write_lists(folder / "sequence")
+        settings.write_text(camera_yaml(self._camera, self._context.fps))
+        words = program.words(self._place, **{name: str(place) for name, place in places.items()})
+        code = self._run(words, folder)
+        said = _tail(folder / "log.txt")
+        LOGGER.info("[%s] %s", program.name, said)
+        last = next((line.strip()[:300] for line in reversed(said.splitlines()) if line.strip()), "")
+        words_said = f"its last words: '{last}'" if last else "it wrote no message"
+        display = re.search("display|x11|glx|opengl", said, re.IGNORECASE)
+        hint = "does it need a display? switch its viewer off, or put xvfb-run before it" if display else ""
+        if code is None:
+            raise TrackerTimeoutError(
+                f"{program.name}: not done within {self._limit_s:g} s, killed; {words_said}", hint
+            )
+        ended = f"killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+        if not output.is_file():
+            raise TrackerError(f"{program.name}: {ended}, and wrote no {program.output}; {words_said}", hint)
+        self.measured["notes"] = [f"the program {ended}; {words_said}"] if code else []
+        try:
+            return self._read(output)
+        except TrajectoryError as error:
+            text = str(error).replace(str(output), program.output)
+            raise TrackerError(f"{program.name}: {text}; it {ended}; {words_said}") from None
+
+    def close(self) -> None:
+        """Remove the folder; may be called more than once."""
+        if self._folder is not None:
+            self._folder.close()
+            self._folder = None
+
+    def _open(self) -> Path:
+        if self._folder is None:
+            raise TrackerError(f"{self._program.name} was used before reset() or after close()")
+        return self._folder.path
+
+    def _write_lists(self, folder: Path) -> None:
+        kinds = ("rgb",) if self._program.sensors == "rgb" else ("rgb", "depth")
+        rows = [[f"{stamp:.6f} {kind}/{stamp:.6f}.png" for kind in kinds] for stamp in self._stamps]
+        for at, kind in enumerate(kinds):
+            (folder / f"{kind}.txt").write_text("".join(f"{row[at]}\n" for row in rows))
+        (folder / "associations.txt").write_text("".join(f"{' '.join(row)}\n" for row in rows))
+
+    def _run(self, words: list[str], folder: Path) -> int | None:
+        """Run the program to its end; its exit code, or None if it had to be killed."""
+        began, log = time.perf_counter(), folder / "log.txt"
+        with log.open("wb") as out, raising(TrackerError, f"{self._program.name}: cannot start '{words[0]}'"):
+            process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, cwd=folder / "work",
+                env=os.environ | {"OMP_NUM_THREADS": str(self._context.threads)}, start_new_session=True,
+                preexec_fn=end_with_parent(),
+            )  # fmt: skip
+        code, peak = None, 0
+        try:
+            while code is None and time.perf_counter() - began < self._limit_s:
+                peak = max(peak, _resident(process.pid))
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    code = process.wait(_POLL_S)
+        finally:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)  # with what it started
+            process.wait()
+        self.measured["program_s"] = time.perf_counter() - began
+        self.measured["program_memory_mb"] = peak / 1e6
+        return code
+
+    def _read(self, output: Path) -> Trajectory:
+        """The trajectory that the program wrote.
+
+        Raises:
+            TrajectoryError: It is damaged, or of other frames.
+        """
+        stamps = np.array(self._stamps)
+        if self._program.format == "indices":
+            rows = read_table(output, 8, "index tx ty tz qx qy qz qw")
+            index, first = np.unique(rows[:, 0], return_index=True)
+            if not len(index) or not (np.isin(index, np.arange(len(stamps)))).all():
+                raise TrajectoryError(f"{output} does not hold indices of frames 0 to {len(stamps) - 1}")
+            return Trajectory(stamps[index.astype(int)], se3.from_quaternion(rows[first, 1:4], rows[first, 4:]))
+        trajectory = read_tum(output)
+        gap, interval = nearest_gap(trajectory.timestamps, stamps), float(np.median(np.diff(stamps)))
+        if gap.min() > interval / 2:
+            raise TrajectoryError(
+                f"none of the {len(trajectory)} poses in {output} is of a frame: they have stamps from "
+                f"{trajectory.timestamps[0]:.3f} to {trajectory.timestamps[-1]:.3f} s, the frames from "
+                f"{stamps[0]:.3f} to {stamps[-1]:.3f} s",
+                "another clock, or format = 'indices'?",
+            )
+        return trajectory
+
+
+def camera_yaml(camera: Camera, fps: float) -> str:
+    """A settings file for ORB-SLAM3 (format 1.0) with the keys of ORB-SLAM2 beside them, for 16-bit depth images."""
+    names = ("fx", "fy", "cx", "cy"), ("k1", "k2", "p1", "p2", "k3")
+    values = {name: getattr(camera, name) for name in names[0]} | dict(zip(names[1], camera.distortion, strict=True))
+    old = {f"Camera.{name}": value for name, value in values.items()}
+    settings = OrbSlam3Settings()
+    old |= {"Camera.bf": camera.fx * camera.baseline_m, "ThDepth": settings.close_depth_baselines}
+    old |= {"DepthMapFactor": camera.depth_factor}
+    text = settings_yaml(camera, settings, fps, depth_factor=camera.depth_factor)
+    return text + "".join(f"{name}: {float(value)!r}\n" for name, value in old.items())
+
+
+def _resident(pid: int) -> int:
+    """Resident memory in bytes of a process and all that it started, summed; 0 if it has ended."""
+    total = 0
+    with contextlib.suppress(psutil.Error):
+        top = psutil.Process(pid)
+        for process in (top, *top.children(recursive=True)):
+            total += process.memory_info().rss
+    return total
+
+
+def _tail(log: Path) -> str:
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - LONGEST_TAIL))
+        return file.read().decode(errors="replace")
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What the file of a program says of it, as fields of its `TrackerSpec`.
+
+    Raises:
+        SettingsError: It is damaged.
+    """
+    program: BatchProgram = BatchSettings(program=str(path)).read()[0]
+    chosen = {"license": program.license, "citation": program.citation, "sensors": program.sensors}
+    return chosen | {"label": program.name, "version": program.version}
