@@ -23,6 +23,7 @@ build_weights  # segmentation.registry
 build_detect_slam  # trackers.systems
 open_rendered  # sequences.catalogue
 run_loop  # runs.process.child.WORK
+BatchTracker  # trackers.adapters.specs
 ConstantVelocity  # trackers.adapters.specs
 NeverMove  # trackers.adapters.specs
 Open3dOdometry  # trackers.adapters.specs
