@@ -78,7 +78,7 @@ async function startCompare() {
   byId("pair").hidden = true;
   byId("choice").replaceChildren(...(sides
     ? [chooser("Tracker", sides.map(([one, other]) => [`${one}.${other}`, board.trackers[one].label.replace(/^A: /, "")]), `${a}.${b}`, (key) => go(...key.split(".")))]
-    : ["A: ", chooser("A", all, a, (key) => go(key, b)), " B: ", chooser("B", all, b, (key) => go(a, key))]));
+    : [["A", a, (key) => go(key, b)], ["B", b, (key) => go(a, key)]].map(([name, at, to]) => make("label", {}, `${name}: `, chooser(name, all, at, to)))));
   const pairs = board.trackers[b] ? pairsOf(board, a, b) : [];
   byId("sentence").textContent = board.trackers[b] ? sentenceOf(ratios, a, b, names) : "There is only one tracker.";
   const settings = board.trackers[b] ? [...new Set([...Object.keys(board.trackers[a].settings), ...Object.keys(board.trackers[b].settings)])].map((name) => [name, board.trackers[a].settings[name] ?? "default", board.trackers[b].settings[name] ?? "default"]).filter(([, one, other]) => one !== other) : [];

@@ -57,7 +57,7 @@ async function showPair(board, pair, names) {
   const truth = runs.flatMap(({ figures }) => figures.track?.data.filter(({ name }) => name === "true path") ?? []).slice(0, 1);
   const tracks = runs.flatMap(({ figures }, side) => (figures.track?.data ?? []).filter(({ name }) => name === "estimate").map((trace) => ({ ...trace, name: safe(names[side]), showlegend: true, line: { color: SIDES[side], width: 5 } })));
   const layout = runs.map(({ figures }) => figures.track?.layout).find(Boolean);
-  if (layout) await draw(byId("tracks"), { data: [...truth, ...tracks], layout });
+  if (layout) await draw(byId("tracks"), { data: [...truth, ...tracks, ...corners([...truth, ...tracks])], layout });
   const lines = runs.map(({ series }, side) => ({ type: "scatter", mode: "lines", name: safe(names[side]), x: series.track_t, y: series.track_error, line: { color: SIDES[side], dash: ["solid", "dash"][side] } })).filter(({ x }) => x);
   if (lines.length === 2) {
     const [first, second] = runs.map(({ series }) => series), gap = 0.1;
@@ -78,7 +78,7 @@ async function startCompare() {
   byId("pair").hidden = true;
   byId("choice").replaceChildren(...(sides
     ? [chooser("Tracker", sides.map(([one, other]) => [`${one}.${other}`, board.trackers[one].label.replace(/^A: /, "")]), `${a}.${b}`, (key) => go(...key.split(".")))]
-    : ["A: ", chooser("A", all, a, (key) => go(key, b)), " B: ", chooser("B", all, b, (key) => go(a, key))]));
+    : [["A", a, (key) => go(key, b)], ["B", b, (key) => go(a, key)]].map(([name, at, to]) => make("label", {}, `${name}: `, chooser(name, all, at, to)))));
   const pairs = board.trackers[b] ? pairsOf(board, a, b) : [];
   byId("sentence").textContent = board.trackers[b] ? sentenceOf(ratios, a, b, names) : "There is only one tracker.";
   const settings = board.trackers[b] ? [...new Set([...Object.keys(board.trackers[a].settings), ...Object.keys(board.trackers[b].settings)])].map((name) => [name, board.trackers[a].settings[name] ?? "default", board.trackers[b].settings[name] ?? "default"]).filter(([, one, other]) => one !== other) : [];

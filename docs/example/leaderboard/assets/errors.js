@@ -19,7 +19,7 @@ async function startErrors() {
     const doubted = (metric.key.startsWith("ape_rot") && doubt & 1) || doubt & 2;
     const shown = view.scale === "ratio" ? ratio : value * (metric.unit.startsWith("m") ? 1000 : 1);
     const text = shown === null ? "" : shown.toPrecision(3).replace(/e\+?.*/, () => "").replace(/\.$/, "");
-    const still = metric.key === "ate_rmse_m" && value >= data.sequences[sequence].static; // no better than not moving
+    const still = metric.key === "ate_rmse_m" && value >= (data.sequences[sequence].static || Infinity); // no better than not moving
     const shade = ratio === null || failing || doubted ? null : Math.max(still ? 0 : -1, Math.min(1, Math.log(Math.max(ratio, 1e-9)) / Math.log(4)));
     return { text: failing ? `${failed} failed` : (Math.abs(shown) >= 1000 ? Math.round(shown).toString() : text) + (doubt & 2 ? data.seen : ""), value: shown ?? "", link, bad: failing, small: failing ? "" : wrong, shade };
   }

@@ -38,7 +38,7 @@ async function draw(element, figure) {
   drawn.set(element, figure);
   const layout = { ...figure.layout, template: THEMES[scheme()], autosize: true };
   if (element.clientWidth < 500) layout.font = { size: 10 };
-  if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: -0.3, yanchor: "top", ...layout.legend };
+  if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: 1.02, yanchor: "bottom", ...layout.legend };
   const options = { format: "png", scale: 2, filename: element.id };
   await Plotly.react(element, figure.data, layout, { responsive: true, displaylogo: false, toImageButtonOptions: options });
 }
@@ -81,11 +81,23 @@ const last = (way) => (a, b) => (a === "" || b === "" ? (a === "") - (b === "") 
 Object.assign(DataTable.ext.type.order, { "number-asc": last(1), "number-desc": last(-1) });
 const TABLE = { paging: false, info: false, autoWidth: false, order: [], layout: { topStart: null, topEnd: null, bottomStart: null, bottomEnd: null } };
 
+/** Tables that are wider than their place say so. */
+const widths = new ResizeObserver((entries) => entries.forEach(({ target }) => {
+  const whole = target.closest(".scroll"), place = whole?.querySelector(".dt-layout-table > div") ?? whole; // DataTables' own scroller
+  place?.classList.toggle("wide", place.scrollWidth > place.clientWidth + 1);
+}));
+
 function sortable(table, options = {}) {
+  widths.observe(table);
+  if (table.closest(".scroll")) widths.observe(table.closest(".scroll"));
   return new DataTable(table, { ...TABLE, columnDefs: [{ targets: ".n", type: "number", className: "n" }], ...options });
 }
 
 startTheme();
-select("table.sorts").forEach((table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {}));
+const sorts = (table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {});
+for (const table of select("table.sorts")) { // those of closed folds once they are opened: thousands of cells take seconds
+  const fold = table.closest("details:not([open])");
+  fold ? fold.addEventListener("toggle", () => sorts(table), { once: true }) : sorts(table);
+}
 addEventListener("DOMContentLoaded", drawFigures);
 addEventListener("beforeprint", () => select("details").forEach((fold) => { fold.open = true; }));

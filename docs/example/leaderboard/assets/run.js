@@ -29,6 +29,15 @@ function marker(run, t) {
   return { type: "scatter3d", mode: "markers", x: at < 0 ? [] : [x[at]], y: at < 0 ? [] : [y[at]], z: at < 0 ? [] : [z[at]], marker: { size: 6, color: "#e69f00", line: { width: 1, color: "#000" } }, showlegend: false, hoverinfo: "skip" };
 }
 
+/** Two unseen corners around paths: a straight one, too, has a box that fits the view. */
+function corners(paths) {
+  const sides = ["x", "y", "z"].map((axis) => paths.flatMap((path) => [...path[axis]]).filter(Number.isFinite)).map((values) => [Math.min(...values), Math.max(...values)]);
+  const least = 0.4 * Math.max(...sides.map(([low, high]) => high - low));
+  if (!Number.isFinite(least)) return [];
+  const [x, y, z] = sides.map(([low, high]) => [-0.5, 0.5].map((side) => (low + high) / 2 + side * Math.max(high - low, least)));
+  return [{ type: "scatter3d", mode: "markers", x, y, z, marker: { opacity: 0 }, showlegend: false, hoverinfo: "skip" }];
+}
+
 const chooser = (name, options, value, onchange) => {
   const list = make("select", { ariaLabel: name, onchange: ({ target }) => onchange(target.value) }, ...options.map(([key, text]) => make("option", { value: key, textContent: text })));
   list.value = value;
@@ -80,7 +89,7 @@ class RunView {
     const { figures } = this.run;
     if (!figures.track) return;
     const other = this.second?.figures.track?.data.filter(({ name }) => name === "estimate").map((trace) => ({ ...trace, name: this.second.label.replace(/</g, "&lt;"), showlegend: true, line: { color: "#cc79a7", width: 4 } })) ?? [];
-    await draw(byId("track"), { data: [...figures.track.data, ...other, marker(this.run, this.times[this.at] ?? 0)], layout: figures.track.layout });
+    await draw(byId("track"), { data: [...figures.track.data, ...other, ...corners([...figures.track.data, ...other]), marker(this.run, this.times[this.at] ?? 0)], layout: figures.track.layout });
   }
 
   move(at, write = true) {
@@ -124,27 +133,35 @@ function showFolds(run) {
   for (const name of ["poses", "stages"]) byId(name)?.closest("details").addEventListener("toggle", ({ target }) => target.open && draw(byId(name), run.figures[name]), { once: true });
 }
 
+/** What the report's tables know of a run without a page. */
+function showRow(board, [id, tracker, sequence, , ending]) {
+  const cell = board.cells.find((each) => each[6] === id && each[0] === tracker && each[1] === sequence), ate = cell?.[5][0];
+  const verdict = byId("verdict"), words = ending || (ate == null ? `Run ${id}` : `ATE ${(1000 * ate).toPrecision(3)} mm${cell[2] > 1 ? `, the median of ${cell[2]} runs` : ""}`);
+  verdict.className = `verdict ${ending ? "red" : "amber"}`;
+  verdict.textContent = `${words}. ${board.pageless}`;
+}
+
 async function showRun(id) {
   const verdict = byId("verdict");
   try {
     const board = await side("board"), own = board.runs.find((run) => run[0] === id);
     if (!own) throw new Error(board.unlisted ? `Run ${id} has no page here, if it is in this report at all. ${board.pageless}` : id ? `There is no run ${id} in this report.` : "No run is named behind # in the address.");
-    if (!(own[5] & 1)) throw new Error(`Run ${id} has no page here. ${board.pageless}`);
-    const [, tracker, sequence] = own, run = await loadRun(id);
+    const [, tracker, sequence] = own, run = own[5] & 1 ? await loadRun(id) : null;
     const go = (to) => { location.hash = to; };
     const first = (test) => board.runs.find((each) => each[5] & 1 && test(each))?.[0];
-    const options = (at, names, test) => [...new Set(board.runs.filter((each) => each[5] & 1 && test(each)).map((each) => each[at]))].map((key) => [key, names[key]]);
+    const options = (at, names, test) => [...new Set(board.runs.filter((each) => each === own || (each[5] & 1 && test(each))).map((each) => each[at]))].map((key) => [key, names[key]]);
     const labels = board.trackers.map(({ label }) => label), names = board.sequences.map(({ name }) => name);
-    const same = board.runs.filter((each) => each[1] === tracker && each[2] === sequence && each[5] & 1);
+    const same = board.runs.filter((each) => each[1] === tracker && each[2] === sequence && (each[5] & 1 || each === own));
     document.title = `${labels[tracker]} on ${names[sequence]}`;
     byId("run-title").textContent = document.title;
     byId("run-choice").replaceChildren(
       chooser("Tracker", options(1, labels, (each) => each[2] === sequence), tracker, (key) => go(first((each) => each[1] === +key && each[2] === sequence))),
       chooser("Sequence", options(2, names, (each) => each[1] === tracker), sequence, (key) => go(first((each) => each[1] === tracker && each[2] === +key))),
       chooser("Repeat", same.map((each) => [each[0], `${each[3]}${each[4] ? `: ${each[4]}` : ""}`]), id, go));
+    byId("run").hidden = !run;
+    if (!run) return showRow(board, own);
     verdict.className = `verdict ${run.level}`;
     verdict.textContent = run.verdict;
-    byId("run").hidden = false;
     byId("numbers").replaceChildren(...run.numbers.map(([name, value]) => make("div", { className: "card" }, make("b", { textContent: value }), make("span", { textContent: name }))));
     const view = new RunView(run);
     const others = board.cells.filter((cell) => cell[1] === sequence && cell[0] !== tracker && board.runs.some((each) => each[0] === cell[6] && each[5] & 1));
