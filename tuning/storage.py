@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import inspect
-import itertools
 import json
 import math
 import os
@@ -345,6 +344,9 @@ def _machine() -> str:
 
 HEARTBEAT_S, GRACE_S = 20.0, 120.0
 """A worker counts up so often, and is dead elsewhere once it has not for so long."""
+NAMELESS_S = 5.0
+"""A trial gets its worker's name at once."""
+_ALIVE = "alive "
 
 
 class Heartbeats:
@@ -358,36 +360,49 @@ class Heartbeats:
     """
 
     def __init__(self, study: optuna.Study) -> None:
-        self._study, self._seen = study, dict[str, tuple[Any, float]]()
+        self._study, self._name, self._count = study, worker_name(), 0
+        self._seen: dict[str, tuple[int | None, float]] = {}
 
     def is_dead(self, trial: FrozenTrial) -> bool:
-        """Whether the worker of a running trial has ended."""
-        name = trial.user_attrs.get("worker", "")
+        """Whether the worker of a running trial has ended; of a trial that has not been given its name, all others."""
+        if worker := trial.user_attrs.get("worker"):
+            return self._has_ended(worker)
+        alive = [key.removeprefix(_ALIVE) for key in self._study.user_attrs if key.startswith(_ALIVE)]
+        others_ended = all(map(self._has_ended, set(alive) - {self._name}))
+        return self._stands_still(f"trial {trial.number}", None) > NAMELESS_S and others_ended
+
+    def _has_ended(self, name: str) -> bool:
         machine, _, pid = name.rpartition(":")
         if machine == _machine() and pid.isdigit():
             try:
                 return bool(psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE)
             except psutil.NoSuchProcess:
                 return True
-        now, count = time.monotonic(), self._study.user_attrs.get(f"alive {name}")
-        key = name or f"trial {trial.number}"
-        if key not in self._seen or self._seen[key][0] != count:
-            self._seen[key] = count, now
-        return now - self._seen[key][1] > GRACE_S
+        return self._stands_still(name, self._study.user_attrs.get(_ALIVE + name)) > GRACE_S
+
+    def _stands_still(self, name: str, count: int | None) -> float:
+        """Seconds for which a count has been seen to stand still."""
+        now = time.monotonic()
+        if name not in self._seen or self._seen[name][0] != count:
+            self._seen[name] = count, now
+        return now - self._seen[name][1]
+
+    def beat(self) -> None:
+        """Count up once."""
+        self._count += 1
+        self._study.set_user_attr(_ALIVE + self._name, self._count)
 
     @contextmanager
     def beating(self) -> Iterator[None]:
         """Count up while the block lasts."""
         ended = threading.Event()
 
-        def beat() -> None:
-            for count in itertools.count():
+        def keep_beating() -> None:
+            while not ended.wait(HEARTBEAT_S):
                 with suppress(Exception):  # the trials themselves say what is wrong with the storage
-                    self._study.set_user_attr(f"alive {worker_name()}", f"{time.time():.0f} {count}")
-                if ended.wait(HEARTBEAT_S):
-                    return
+                    self.beat()
 
-        thread = threading.Thread(target=beat, name="dynslam-heartbeat", daemon=True)
+        thread = threading.Thread(target=keep_beating, name="dynslam-heartbeat", daemon=True)
         thread.start()
         try:
             yield

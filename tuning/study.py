@@ -349,8 +349,9 @@ class Study(Plan):
         with self._lock:
             if settings is not None:
                 self.study.enqueue_trial(starting_point(settings, self.space, self.base))
+            self._heartbeats.beat()
             trial = self.study.ask(distributions(self.space))
-        trial.set_user_attr("worker", worker_name())
+            trial.set_user_attr("worker", worker_name())
         return trial
 
     def evaluate(self, trial: optuna.Trial) -> Evaluation:

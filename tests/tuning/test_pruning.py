@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ from simulated import SimulatedTuner, make_spec, nothing, valley
 from dynslam_bench.tuning import Verdict, finish
 from dynslam_bench.tuning.objectives import ACCURACY
 from dynslam_bench.tuning.samplers import is_dominated, step_name, steps
-from dynslam_bench.tuning.storage import errors_of
+from dynslam_bench.tuning.storage import errors_of, worker_name
 from dynslam_bench.tuning.study import CRASHED_WORKER, StudyEvent
 
 
@@ -140,7 +139,7 @@ def dead() -> str:
     """The name of a worker that has ended."""
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
-    return f"{socket.gethostname()}:{ended.pid}"
+    return f"{worker_name().rpartition(':')[0]}:{ended.pid}"
 
 
 def test_a_trial_of_a_dead_worker_is_repeated(tmp_path: Path, dead: str) -> None:
