@@ -82,7 +82,7 @@ def spec(objectives: list[str], include: list[str], **changes: object):
 
 
 def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
-    tuner = TimedTuner(spec(["speed"], ["wobble"]), tmp_path)
+    tuner = TimedTuner(spec(["speed"], ["wobble"], pruner="halving"), tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # a constraint is told once, when it is final
         tuner.run()
