@@ -174,12 +174,8 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
     spec, tracker, identity, final = resolved.spec, resolved.tracker, resolved.identity, verdict.final
     total, states = len(resolved.sequence), Counter(row.state for row in frames.rows)
     status, reason, dropped = verdict.status, verdict.reason, states["dropped"]
-    tracked, lost, initialising, lost_at_end = (
-        states["ok"],
-        states["lost"],
-        states["initialising"],
-        frames.lost_streak(),
-    )
+    tracked, lost, initialising = states["ok"], states["lost"], states["initialising"]
+    lost_at_end = frames.lost_streak()
     timings, batch = frames.timings(), not tracker.online
     if batch:
         tracked, lost_at_end = final.get("tracked", 0), final.get("lost_at_end", total)

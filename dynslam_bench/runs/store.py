@@ -325,7 +325,7 @@ class RunStore:
         Raises:
             InfrastructureError: It cannot be written.
         """
-        for file in sorted(other._part(record.sequence.part).iterdir()):
+        for file in sorted(other._part(record.sequence.part).glob("*.txt")):
             target = self._part(record.sequence.part) / file.name
             if not target.is_file():
                 write_atomic(target, file.read_bytes())
@@ -624,8 +624,11 @@ class Merged:
 def merge(sources: Iterable[RunStore], store: RunStore) -> Merged:
     """Copy the runs of stores into one; nothing that it holds is changed.
 
-    A run is left out if its record is damaged, if the store holds another result under its id, or other stamps or
-    another ground truth of its sequence.
+    A run is left out if its record is damaged or its stamps are lost, or if the store holds another result under its
+    id, other stamps or another ground truth of its sequence.
+
+    Raises:
+        DynslamError: The store cannot be written.
     """
     merged = Merged([], [], [])
     store.prepare()
@@ -633,19 +636,31 @@ def merge(sources: Iterable[RunStore], store: RunStore) -> Merged:
         records, unreadable = source.all()
         merged.left_out.extend(unreadable)
         for record in records:
-            folder = source.folder(record.run_id)
-            part, own_part = source._part(record.sequence.part), store._part(record.sequence.part)
-            earlier = store.get(record.run_id)
-            if own_part.is_dir() and not _equal(part, own_part, ("timestamps.txt", "groundtruth.txt")):
-                merged.left_out.append(Unreadable(folder, f"{store.root} holds other stamps or truth of its sequence"))
-            elif earlier is None:
-                store.copy_from(source, record)
-                merged.added.append(record.run_id)
-            elif earlier.status == record.status and _equal(folder, store.folder(record.run_id), (ONLINE, FINAL)):
+            if reason := _why_left_out(source, record, store):
+                merged.left_out.append(Unreadable(source.folder(record.run_id), reason))
+            elif store.get(record.run_id) is not None:
                 merged.stored.append(record.run_id)
             else:
-                merged.left_out.append(Unreadable(folder, f"{store.root} holds another result of this run"))
+                store.copy_from(source, record)
+                merged.added.append(record.run_id)
     return merged
+
+
+def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
+    """Why a run of a store may not be copied into another one; empty if it may, or stands there already."""
+    part, there = (owner._part(record.sequence.part) for owner in (source, store))
+    try:
+        check_plain(part, source.root)
+    except RunError as error:
+        return str(error)
+    if not (part / "timestamps.txt").is_file():
+        return f"{source.root} has lost the stamps of its sequence"
+    if there.is_dir() and not _equal(part, there, ("timestamps.txt", "groundtruth.txt")):
+        return f"{store.root} holds other stamps or truth of its sequence"
+    earlier, folders = store.get(record.run_id), (source.folder(record.run_id), store.folder(record.run_id))
+    if earlier is not None and (earlier.status != record.status or not _equal(*folders, (ONLINE, FINAL))):
+        return f"{store.root} holds another result of this run"
+    return ""
 
 
 def _equal(one: Path, other: Path, names: Iterable[str]) -> bool:

@@ -49,18 +49,19 @@ def test_a_shard_that_is_none_is_refused(text: str) -> None:
 
 
 def test_what_contradicts_the_store_is_named_and_left_out(tmp_path: Path, toy_folder: str) -> None:
-    stores = [RunStore(tmp_path / name) for name in ("one", "other", "damaged", "truth")]
+    stores = [RunStore(tmp_path / name) for name in ("one", "other", "damaged", "truth", "lost")]
     spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8))
     for store in stores:
         (record,) = run_many([spec], results=store)
-    one, other, damaged, truth = (store.folder(record.run_id) for store in stores)
+    one, other, damaged, truth, lost = (store.folder(record.run_id) for store in stores)
     trajectory = other / "trajectory_online.txt"
     trajectory.write_text(trajectory.read_text().replace("0.1", "0.2"))
     (damaged / "run.json").write_text("{")
     (stores[3].root / "sequences" / record.sequence.part / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n")
+    (stores[4].root / "sequences" / record.sequence.part / "timestamps.txt").unlink()
     before = outcomes(stores[0])
     merged = merge(stores[1:], stores[0])
-    assert [entry.path for entry in merged.left_out] == [other, damaged, truth]
+    assert [entry.path for entry in merged.left_out] == [other, damaged, truth, lost]
     assert "another result" in merged.left_out[0].reason and "stamps or truth" in merged.left_out[2].reason
     assert (merged.added, merged.stored, outcomes(stores[0])) == ([], [], before) and one.is_dir()
 
@@ -100,6 +101,16 @@ def test_a_worker_that_is_not_like_this_machine_stops_no_other_run(
     assert seed == 1
     with pytest.raises(RunError, match=reason):
         raise fault
+
+
+def test_a_link_out_of_a_store_is_not_followed(tmp_path: Path, toy_folder: str) -> None:
+    source, secret = RunStore(tmp_path / "source"), tmp_path / "secret.txt"
+    (record,) = run_many([RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8))], results=source)
+    secret.write_text("secret")
+    (source.root / "sequences" / record.sequence.part / "more.txt").symlink_to(secret)
+    merged = merge([source], RunStore(tmp_path / "all"))
+    assert merged.added == [] and "a link that leads out" in merged.left_out[0].reason
+    assert not list((tmp_path / "all").rglob("more.txt"))
 
 
 def test_what_many_runs_share_is_looked_up_once(toy_folder: str) -> None:
