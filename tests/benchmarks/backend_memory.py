@@ -3,7 +3,7 @@
     python tests/benchmarks/backend_memory.py [--tracker orb-slam2 ... | all] [--frames 10000] [--loop 300]
         [--size 640 480] [--sequence synthetic/sitting_xyz]
 
-Each tracker runs whole (features, masks, culling, tracking, mapping) in a process of its own. The sequence's first
+A Markdown table. Each tracker runs whole (features, masks, culling, tracking, mapping) in a process of its own. The sequence's first
 `loop` frames are held in memory and played forwards and backwards in turn, so that nothing but the tracker grows.
 Masks are the exact ones. ``all`` stands for every built-in system that leaderboards rank; with ``--size 160 120
 --loop 60`` a frame costs a tenth, and what is kept of each frame shows just as well.
@@ -16,7 +16,6 @@ import one_thread  # noqa: F401  # before all others
 
 # isort: split
 import argparse
-import json
 import multiprocessing
 import os
 import sys
@@ -79,11 +78,10 @@ def walk(tracker_id: str, sequence: Sequence, frames: int, answer: Any) -> None:
         spent[index] = 1e3 * (time.process_time() - begin)
         if index % step == step - 1:
             marks.append((index + 1, resident_mb()))
-            sys.stdout.write(
+            sys.stderr.write(
                 f"{tracker_id}  frame {index + 1:6d}  {marks[-1][1]:7.1f} MB  {lost} lost  "
                 f"{np.median(spent[index + 1 - step : index + 1]):.1f} ms a frame\n"
             )
-            sys.stdout.flush()
     late = np.array([mark for mark in marks if mark[0] >= frames / 5])
     slope = 1e3 * float(np.polyfit(late[:, 0], late[:, 1], 1)[0])
     early, late_ms = (float(np.median(spent[end - 2 * step : end])) for end in (max(frames // 10, 2 * step), frames))
@@ -110,6 +108,8 @@ def main() -> int:
     smaller = PreprocessingSettings(width=options.size[0], height=options.size[1])
     sequence = open_sequence(options.sequence, frames=(0, options.loop), preprocessing=smaller)
     rows: list[dict[str, Any]] = []
+    head = ("tracker", "frames", "lost", "MB in the end", "MB per 1,000 frames", "ms early", "ms late", "late : early")
+    print(f"| {' | '.join(head)} |\n| ---{' | ---:' * (len(head) - 1)} |")
     for tracker in ranked() if options.tracker == ["all"] else options.tracker:
         ours, theirs = multiprocessing.Pipe()
         process = multiprocessing.get_context("fork").Process(
@@ -119,7 +119,7 @@ def main() -> int:
         theirs.close()
         rows.append(ours.recv())
         process.join()
-        sys.stdout.write(f"{json.dumps(rows[-1])}\n")
+        print(f"| {' | '.join(map(str, rows[-1].values()))} |", flush=True)
     return int(any(row["growth_mb_per_1000"] > BAR_MB or row["slower"] > BAR_SLOWER for row in rows))
 
 

@@ -7,7 +7,6 @@ for machines that are not idle: the ratio to it survives a busy neighbour, the m
 """
 
 import argparse
-import os
 import time
 from collections.abc import Callable
 
@@ -55,7 +54,6 @@ def main() -> None:
     pair = synthetic(("similarity",), 3)[-1]
     first, second = pair.reference, pair.target
     points = a_thousand(first)
-    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, {len(points)} points\n")
     lucas_kanade = FlowSettings(method="lucas-kanade", forward_backward_px=0.0)
     yardstick = timed(one_frame(build_flow(lucas_kanade), first, second, points), repeats)
     print("| method, budget | threads | min ms | median ms | processor ms | ratio to LK | % < 1.5 px |")
@@ -78,12 +76,11 @@ def main() -> None:
             )
             cost = f"{took[2]:.1f} | {took[2] / yardstick[2]:.2f}" if threads == 1 else "- | -"
             print(f"| {note} | {threads} | {took[0]:.1f} | {took[1]:.1f} | {cost} | {good:.1f} |", flush=True)
+    print("\n| dense, both ways | min ms | median ms |\n| --- | --- | --- |")
     for threads in (1, 2):
         dense = DenseDaisyFlow(threads=threads)
         took = timed(lambda dense=dense: dense.flow(dense.prepare(first), dense.prepare(second)), 3)
-        print(
-            f"dense 640x480 both ways, {threads} thread(s): {took[0]:.0f} / {took[1]:.0f} ms (processor {took[2]:.0f})"
-        )
+        print(f"| {threads} thread{'s'[: threads - 1]} | {took[0]:.0f} | {took[1]:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

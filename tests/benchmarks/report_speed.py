@@ -62,7 +62,7 @@ def fill(root: Path, trackers: int, sequences: int, repeats: int, frames: int) -
 
 
 def timed_report(store: RunStore, output: Path) -> str:
-    """One report, in words."""
+    """One report: the cells of a row."""
 
     def spent() -> float:
         return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
@@ -72,13 +72,13 @@ def timed_report(store: RunStore, output: Path) -> str:
     wall, processor = time.perf_counter() - began, spent() - before
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file()) / 1e6
-    return f"{wall:.1f} s ({processor:.1f} s of processors), at most {peak:.0f} MB of memory, {size:.0f} MB written"
+    return f"{wall:.0f} | {processor:.0f} | {peak:.0f} | {size:.0f}"
 
 
 def opened(page: Path, folder: Path) -> str:
     """How fast the page opens, in words: the median of five times, a new address each, and what was loaded."""
     if EXECUTABLE is None:
-        return "no browser is installed"
+        return "No browser is installed."
     browser = Browser(folder)
     times = []
     for _ in range(5):
@@ -89,8 +89,8 @@ def opened(page: Path, folder: Path) -> str:
     size = sum(Path(path).stat().st_size for path in fetched) / 1e6
     browser.close()
     paint, load = np.median(times, axis=0)
-    loaded = f"first paint after {paint:.0f} ms, loaded after {load:.0f} ms, {size:.2f} MB loaded first"
-    return f"{loaded}, faults {browser.faults}"
+    assert not browser.faults, browser.faults
+    return f"Its first page is shown after {paint / 1e3:.1f} s and loaded after {load / 1e3:.1f} s, with {size:.1f} MB."
 
 
 def main() -> None:
@@ -106,13 +106,14 @@ def main() -> None:
         if not store.runs.is_dir():
             fill(root, options.trackers, options.sequences, options.repeats, options.frames)
         store.index.path.unlink(missing_ok=True)
-        print(f"{len(store.ids())} runs", flush=True)
+        print(f"| {len(store.ids())} runs | s | processor s | at most MB of memory | MB written |")
+        print("| --- | ---: | ---: | ---: | ---: |")
         output = Path(folder) / "report"
         for name in ("nothing scored", "nothing changed", "all scored, new report"):
             if name.startswith("all"):
                 shutil.rmtree(output)
-            print(f"{name}: {timed_report(store, output)}", flush=True)
-        print(opened(output / "index.html", Path(folder) / "browser"), flush=True)
+            print(f"| {name} | {timed_report(store, output)} |", flush=True)
+        print("\n" + opened(output / "index.html", Path(folder) / "browser"), flush=True)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ medians; user CPU time stands beside them, because wall times of a busy machine 
 """
 
 import argparse
-import os
 import statistics
 import sys
 import time
@@ -92,10 +91,6 @@ def main() -> None:
     rows.append((f"carry {len(found)} masks, sparse", lambda: carry_sparse(found, *grays)))
     rows.append(("dilation by 15 px", lambda: dynamic_mask(found, SegmentationSettings())))
     rows.append(("depth repair and dilation", lambda: dynamic_mask(found, SegmentationSettings(repair="depth"), depth)))
-    print(
-        f"{os.cpu_count()} cores, {arguments.threads} threads, load {os.getloadavg()[0]:.1f}, "
-        f"torch {torch.__version__}, OpenCV {cv2.__version__}\n"
-    )
     print("| stage | wall ms | CPU ms |\n| --- | --- | --- |")
     for label, work in rows:
         wall, cpu = measure(work, arguments.repeats)
