@@ -19,6 +19,7 @@ import pandas as pd
 import dynslam_bench as db
 from dynslam_bench.api import RunResult, make_specs, run_specs
 from dynslam_bench.core.settings import parse_assignments
+from dynslam_bench.sequences.catalogue import parse_frames
 
 COLUMNS = {
     "ate": ("online ATE mm", "ate_rmse_m", 1e3),
@@ -79,18 +80,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--frames", help="part of each sequence, A:B")
     parser.add_argument("--stride", type=int, default=1)
-    parser.add_argument("--cameras", nargs="+", default=[None], help="camera files, one a sequence")
     parser.add_argument("--protocol", default="tum-rgbd/v1")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--results", default="results/tables")
     chosen = parser.parse_args()
-    cameras = dict(itertools.zip_longest(chosen.sequences, chosen.cameras))
     specs, keys = [], []
     for text, sequence in itertools.product(chosen.trackers, chosen.sequences):
         tracker, *assignments = text.split()
         new = make_specs(
             tracker, [sequence], settings=parse_assignments(assignments), seeds=chosen.seeds, offsets=chosen.offsets,
-            frames=chosen.frames, stride=chosen.stride, camera=cameras[sequence],
+            frames=parse_frames(chosen.frames), stride=chosen.stride,
         )  # fmt: skip
         specs += new
         keys += [(text, sequence)] * len(new)

@@ -3,7 +3,7 @@
     python tests/benchmarks/calibration.py [--scenes 0 1] [--frames 100] [--readouts 0 10 20 26 33]
         [--part fast global real] [--data-root FOLDER]
 
-One line a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies within, the delay
+A Markdown table, one row a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies within, the delay
 of depth, the depth factor, processor time. Then how often the truth lies within the interval, and how often a global
 shutter was taken for a rolling one. `--readouts` renders the `fast_*` families with other readout times than their
 26 ms, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there is named.
@@ -50,7 +50,7 @@ def recordings(options: argparse.Namespace) -> Iterator[tuple[str, float | None,
         if (SHARED / folder).is_dir():
             yield folder, None, open_sequence(SHARED / folder)
         else:
-            sys.stdout.write(f"{folder}: not measured, nothing under {SHARED}\n")
+            print(f"{folder}: not measured, nothing under {SHARED}", file=sys.stderr)
 
 
 def text(quantity: Quantity, scale: float) -> str:
@@ -71,13 +71,14 @@ def main() -> None:
     parser.add_argument("--data-root", type=Path)
     options = parser.parse_args()
     rolling, still, observable = [], [], 0
-    sys.stdout.write("recording | true ms | readout ms | truth within | delay ms | depth factor | processor s\n")
+    head = ("recording", "true ms", "readout ms", "truth within", "delay of depth ms", "depth factor", "processor s")
+    print(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}")
     for name, truth, sequence in recordings(options):
         began = time.process_time()
         try:
             result = calibrate(sequence)
         except SequenceError as error:
-            sys.stdout.write(f"{name} | {error}\n")
+            print(f"| {name} | | {error} | | | | |")
             continue
         readout, delay, factor = result.quantities
         within = None
@@ -85,12 +86,13 @@ def main() -> None:
             within = 1e3 * readout.low <= truth <= 1e3 * readout.high
             (rolling if truth else still).append(within)
             observable += readout.observable
-        row = (name, truth, text(readout, 1e3), within, text(delay, 1e3), text(factor, 1))
-        sys.stdout.write(" | ".join(map(str, row)) + f" | {time.process_time() - began:.1f}\n")
-        sys.stdout.flush()
-    sys.stdout.write(
-        f"truth within the interval: {sum(rolling)} of {len(rolling)} rolling shutters, "
-        f"0 within: {sum(still)} of {len(still)} global ones; {observable} observable\n"
+        known = ("", "") if truth is None else (f"{truth:g}", {True: "yes", False: "no", None: "-"}[within])
+        row = (name.rpartition("/")[2], known[0], text(readout, 1e3), known[1], text(delay, 1e3), text(factor, 1))
+        print(f"| {' | '.join(row)} | {time.process_time() - began:.1f} |", flush=True)
+    print(
+        f"\nThe truth lies within the interval of {sum(rolling)} of {len(rolling)} rolling shutters, and zero within that "
+        f"of {sum(still)} of {len(still)} global ones. {observable} readout times of {len(rolling) + len(still)} are "
+        "observable."
     )
 
 
