@@ -19,7 +19,6 @@ import pandas as pd
 import dynslam_bench as db
 from dynslam_bench.api import RunResult, make_specs, run_specs
 from dynslam_bench.core.settings import parse_assignments
-from dynslam_bench.sequences.catalogue import parse_frames
 
 COLUMNS = {
     "ate": ("online ATE mm", "ate_rmse_m", 1e3),
@@ -89,7 +88,7 @@ def main() -> None:
         tracker, *assignments = text.split()
         new = make_specs(
             tracker, [sequence], settings=parse_assignments(assignments), seeds=chosen.seeds, offsets=chosen.offsets,
-            frames=parse_frames(chosen.frames), stride=chosen.stride,
+            frames=chosen.frames, stride=chosen.stride,
         )  # fmt: skip
         specs += new
         keys += [(text, sequence)] * len(new)

@@ -3,8 +3,8 @@
     python tests/benchmarks/calibration.py [--scenes 0 1] [--frames 100] [--readouts 0 10 20 26 33]
         [--part fast global real] [--data-root FOLDER]
 
-A Markdown table, one row a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies within, the delay
-of depth, the depth factor, processor time. Then how often the truth lies within the interval, and how often a global
+A Markdown table, one row a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies
+within, the delay of depth, the depth factor, processor time. Then how often the truth lies within the interval, and how often a global
 shutter was taken for a rolling one. `--readouts` renders the `fast_*` families with other readout times than their
 26 ms, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there is named.
 """
@@ -90,9 +90,9 @@ def main() -> None:
         row = (name.rpartition("/")[2], known[0], text(readout, 1e3), known[1], text(delay, 1e3), text(factor, 1))
         print(f"| {' | '.join(row)} | {time.process_time() - began:.1f} |", flush=True)
     print(
-        f"\nThe truth lies within the interval of {sum(rolling)} of {len(rolling)} rolling shutters, and zero within that "
-        f"of {sum(still)} of {len(still)} global ones. {observable} readout times of {len(rolling) + len(still)} are "
-        "observable."
+        f"\nThe truth lies within the interval of {sum(rolling)} of {len(rolling)} rolling shutters, and zero within "
+        f"that of {sum(still)} of {len(still)} global ones. {observable} readout times of {len(rolling) + len(still)} "
+        "are observable."
     )
 
 

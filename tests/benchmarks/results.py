@@ -56,14 +56,15 @@ def remade(section: str, data: str = "") -> str:
     block = COMMANDS.search(section)
     if block is None:
         raise SystemExit(f"error: '{section.splitlines()[0]}' has no block of commands")
-    made = MADE.search(section)
-    data = data or (made["data"] if made else "")
+    before = MADE.search(section)
+    data = data or (before["data"] if before else "")
     if not data:
         raise SystemExit("error: --data says what a new table is made of")
+    made = made_at()
     printed = _run(block[1]).strip()
     if not re.search(r"^\|", printed, re.MULTILINE):
         printed = f"```text\n{printed}\n```"
-    return f"{section[: block.end()]}\n{made_at()}{data}.*\n\n{printed}\n\n"
+    return f"{section[: block.end()]}\n{made}{data}.*\n\n{printed}\n\n"
 
 
 def _run(command: str) -> str:
