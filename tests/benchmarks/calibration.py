@@ -4,9 +4,10 @@
         [--part fast global real] [--data-root FOLDER]
 
 A Markdown table, one row a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies
-within, the delay of depth, the depth factor, processor time. Then how often the truth lies within the interval, and how often a global
-shutter was taken for a rolling one. `--readouts` renders the `fast_*` families with other readout times than their
-26 ms, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there is named.
+within, the delay of depth, the depth factor, processor time. Then how often the truth lies within the interval, and
+how often a global shutter was taken for a rolling one. `--readouts` renders the `fast_*` families with other readout
+times than their 26 ms, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there
+is named.
 """
 
 import argparse
