@@ -1,7 +1,7 @@
 """Culling quality of `emfoa-oft`, its ablations and other systems, per feature, against exact masks.
 
     python tests/benchmarks/culling_quality.py [--sequences "synthetic/walking_xyz?scene=100&frames=300" ...]
-        [--frames 60:160] [--only emfoa-oft yolo-slam] [--masks oracle] [--cache DIR] [--jobs N]
+        [--frames 60:160] [--trackers emfoa-oft yolo-slam] [--masks oracle] [--cache DIR] [--jobs N]
 
 Every feature of every frame lies on one of three things, by the renderer's exact masks:
 
@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 
 from dynslam_bench.contracts.sequence import FrameMasks
+from dynslam_bench.core.settings import parse_assignments
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -42,34 +43,11 @@ SEQUENCES = [
     for number, motion in enumerate(("xyz", "static", "halfsphere", "rpy"))
 ]
 """Held out, those of the suite `dynamic`: on instances 0-99 the embedded network was trained."""
-GUARDED = {"epipolar.min_parallax_px": 1.0, "epipolar.homography_share": 0.8}
-"""Where F means nothing the test is skipped, as in our own system; the paper's asks on every frame."""
-ROWS: dict[str, tuple[str, dict[str, object]]] = {
-    "emfoa-oft": ("emfoa-oft", {}),
-    "emfoa-oft?flow=none": ("emfoa-oft?flow=none", {}),
-    "emfoa-oft-paper": ("emfoa-oft-paper", {}),
-    "emfoa-oft-paper?flow=sparse": ("emfoa-oft-paper?flow=sparse", {}),
-    "emfoa-oft-paper?flow=sparse with the guard": ("emfoa-oft-paper?flow=sparse", GUARDED),
-    "emfoa-oft?depth=none": ("emfoa-oft?depth=none", {}),
-    "emfoa-oft?flow=lucas-kanade": ("emfoa-oft?flow=lucas-kanade", {}),
-    "emfoa-oft?search=patchmatch": ("emfoa-oft?search=patchmatch", {}),
-    "emfoa-oft?search=emfoa-literal": ("emfoa-oft?search=emfoa-literal", {}),
-    "emfoa-oft?masks=vote&depth=none": ("emfoa-oft?masks=vote&depth=none", {}),
-    "emfoa-oft?masks=vote": ("emfoa-oft?masks=vote", {}),
-    "emfoa-oft?masks=none": ("emfoa-oft?masks=none", {}),
-    "emfoa-oft?masks=none, Lucas-Kanade": ("emfoa-oft?masks=none", {"flow.method": "lucas-kanade"}),
-    "emfoa-oft?masks=none, PatchMatch": ("emfoa-oft?masks=none", {"flow.search": "patchmatch"}),
-    "emfoa-oft?masks=none, literal EMFOA": ("emfoa-oft?masks=none", {"flow.search": "emfoa-literal"}),
-    "emfoa-oft?masks=none without motion test": ("emfoa-oft?masks=none", {"motion.enabled": False}),
-    "emfoa-oft?masks=none without free space": ("emfoa-oft?masks=none", {"free_space.enabled": False}),
-    "emfoa-oft?masks=none&depth=none": ("emfoa-oft?masks=none&depth=none", {}),
-    "emfoa-oft-paper?masks=none": ("emfoa-oft-paper?masks=none", {}),
-    "emfoa-oft-paper?masks=none with the guard and sparse flow": (
-        "emfoa-oft?masks=none&depth=none",
-        {"epipolar.parallax_share": 0.0, "epipolar.min_share": 0.0, "epipolar.max_contradiction": 1.0},
-    ),
-    "orb-slam2": ("orb-slam2", {}),
-}
+TRACKERS_AND_SETTINGS = (
+    "emfoa-oft", "emfoa-oft?flow=none", "emfoa-oft-paper?flow=sparse", "emfoa-oft?masks=vote&depth=none",
+    "emfoa-oft?masks=vote", "emfoa-oft?masks=none", "emfoa-oft?masks=none motion.enabled=false",
+    "emfoa-oft?masks=none free_space.enabled=false", "emfoa-oft?masks=none&depth=none", "orb-slam2",
+)  # fmt: skip
 
 
 def kinds(masks: FrameMasks, xy: np.ndarray) -> np.ndarray:
@@ -113,7 +91,8 @@ def measure(
 def row(label: str, names: list[str], part: tuple[int, int | None], masks: str | None, cache: Path) -> str:
     """One system's row of the table."""
     cv2.setNumThreads(1)
-    tracker_id, settings = ROWS.get(label, (label, {}))
+    tracker_id, *assignments = label.split()
+    settings = parse_assignments(assignments)
     default = getattr(TRACKERS.get(tracker_id).settings(), "segmentation", None)
     if masks is not None and default is not None and default.source != "none":
         settings = settings | {"segmentation.source": masks}
@@ -123,8 +102,9 @@ def row(label: str, names: list[str], part: tuple[int, int | None], masks: str |
     precision = culled[2] / (culled[0] + culled[2]) if culled[[0, 2]].any() else np.nan
     background, still, recall = 100 * culled / np.maximum(seen, 1)
     idle = 100 * np.mean(by_frame[:, 1].sum(axis=1) == 0)
+    name = f"`{tracker_id}`" + "".join(f", {each}" for each in assignments)
     return (
-        f"| {label} | {100 * precision:.1f} % | {recall:.1f} % | {background:.1f} % | {still:.1f} % | {idle:.0f} % "
+        f"| {name} | {100 * precision:.1f} % | {recall:.1f} % | {background:.1f} % | {still:.1f} % | {idle:.0f} % "
         f"| {1e3 * np.mean(ates):.1f} ({' '.join(f'{1e3 * ate:.1f}' for ate in ates)}) | {100 * min(coverages):.0f} % |"
     )
 
@@ -134,7 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sequences", nargs="+", default=SEQUENCES)
     parser.add_argument("--frames", default="0:", help="part of each sequence, A:B")
-    parser.add_argument("--only", nargs="+", default=list(ROWS), metavar="ROW", help="rows of the table, or trackers")
+    parser.add_argument("--trackers", nargs="+", default=TRACKERS_AND_SETTINGS, metavar="'TRACKER [NAME=VALUE ...]'")
     parser.add_argument("--masks", metavar="SOURCE", help="where systems with masks have them from, e.g. oracle")
     parser.add_argument("--cache", type=Path, help="folder of the stage cache; default: a temporary one")
     parser.add_argument("--jobs", type=int, default=1)
@@ -148,7 +128,7 @@ def main() -> None:
         )
         print("| --- | --- | --- | --- | --- | --- | --- | --- |")
         shared = (chosen.sequences, part, chosen.masks, chosen.cache or Path(scratch))
-        for line in pool.map(row, chosen.only, *([value] * len(chosen.only) for value in shared)):
+        for line in pool.map(row, chosen.trackers, *([value] * len(chosen.trackers) for value in shared)):
             print(line, flush=True)
     print("\nATE in brackets: " + ", ".join(chosen.sequences))
 
