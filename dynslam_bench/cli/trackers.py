@@ -64,10 +64,10 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     """Show a tracker's description and its tunable settings; --json has all settings and the published numbers."""
     from dynslam_bench.core.settings import flatten, parameters
     from dynslam_bench.core.toml import assignments
-    from dynslam_bench.trackers.registry import TRACKERS, epipolar_skipped
+    from dynslam_bench.trackers.registry import TRACKERS
 
     spec = TRACKERS.get(tracker)
-    reported, skipped = _published(spec), epipolar_skipped(spec.id)
+    reported = _published(spec)
     facts: dict[str, Any] = {
         "id": spec.id,
         "label": spec.label,
@@ -86,7 +86,6 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
         "presets": spec.presets,
         "assumptions": spec.assumptions,
         "remarks": spec.remarks,
-        "epipolar_skipped": skipped,
         "settings": flatten(spec.settings()),
         "parameters": parameter_facts(spec.settings),
         "reported": reported,
@@ -97,11 +96,7 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in tunable]
     present(
         facts | details,
-        fields(
-            facts
-            | {f"preset {name}": ", ".join(assignments(values)) for name, values in spec.presets.items()}
-            | {"epipolar skipped": [f"{100 * share:.0f} % of {sequence}" for sequence, share in skipped.items()]}
-        ),
+        fields(facts | {f"preset {name}": ", ".join(assignments(values)) for name, values in spec.presets.items()}),
         *([table(("setting", "default", "range", "unit", "online", "meaning"), rows)] if rows else []),
         *([f"and {fixed} settings that no study tunes: see --json"] if fixed else []),
         *([wrapped(f"numbers reported in: {', '.join(sources)}; --json lists them")] if sources else []),

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from hashlib import sha256
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -121,13 +119,3 @@ def build_tracker(
         return build(settings, context=context or TrackerContext()) if takes_context else build(settings)
 
     return build_plugin("tracker", spec, Tracker, TrackerError, construct)  # type: ignore[type-abstract]
-
-
-def epipolar_skipped(tracker: str) -> dict[str, float]:
-    """Share of the tracked frames on which no fundamental matrix was used, by sequence, with the default settings.
-
-    Empty where nothing was measured. Written by ``tests/benchmarks/epipolar_share.py --write``; a run's own share is
-    `RunRecord.epipolar_skipped`.
-    """
-    text = (files("dynslam_bench.trackers") / "epipolar_skipped.json").read_text(encoding="utf-8")
-    return {sequence: float(share) for sequence, share in json.loads(text).get(tracker, {}).items()}
