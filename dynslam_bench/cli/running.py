@@ -335,6 +335,7 @@ class WatchedRuns:
     def make(self, make: Callable[..., list[RunResult]]) -> list[runs.RunRecord]:
         """Call a function of `api` that makes runs, with a progress bar."""
         with progress("runs") as self._advance:
+            self._advance(0, None, "opening sequences")
             runs = make(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
         return [run.record for run in runs]
 

@@ -180,7 +180,7 @@ class StudyBar:
     def run(self, event: RunEvent) -> None:
         """A run has started, progressed or finished."""
         self._runs += event.kind == "finished"
-        self._advance(*self._at, f"{self._part}, {self._runs} runs made: {event_text(event)}")
+        self._advance(*self._at, f"{self._part}, {self._runs} run{'s' * (self._runs != 1)} made: {event_text(event)}")
 
     def _begin(self, part: str, done: float, total: Any) -> None:
         self._part, self._at = part, (done, total)

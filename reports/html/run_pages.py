@@ -251,7 +251,8 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
         if not row.n_tracked and row.status == "lost":
             return "red", f"Never tracked: not one of {row.n_frames} frames"
         if row.status == "lost":
-            return "red", f"{_loss(frames, length) or 'Lost'}. {row.ending.capitalize()}{reason}"
+            why = row.reason or row.ending
+            return "red", f"{_loss(frames, length) or 'Lost'}. {why[0].upper()}{why[1:]}"
         return "red", f"{row.ending.capitalize()} frames{reason}" if row.status != "ok" else f"Not evaluated{reason}"
     score, static = row.score_m, row.static_camera_ate_rmse_m
     error = "No ground truth" if score is None else f"ATE {mm(score)} mm"

@@ -110,19 +110,14 @@ def test_the_board_fits_four_screens(browser, report):
     assert browser.run("document.documentElement.scrollHeight") <= 4 * 900
 
 
-def test_the_theme_can_be_chosen_and_stays(browser, report):
-    browser.open(report.html)
-    ground = "getComputedStyle(document.body).backgroundColor"
-    light = browser.run(ground)
-    for label in ("Light", "Dark"):
-        browser.run("byId('theme').click()")
-        assert label in browser.run("byId('theme').textContent")
-    dark = browser.run(ground)
-    assert dark != light
-    browser.open(report.run)
-    assert browser.run(ground) == dark
-    browser.run("byId('theme').click()")
-    assert browser.run(ground) == light
+def test_a_page_follows_the_theme_of_the_system(browser, report):
+    open_page(browser, report, "run")
+    colours = ["getComputedStyle(document.body).backgroundColor", "byId('time')._fullLayout.font.color"]
+    light = [browser.run(colour) for colour in colours]
+    browser.prefer("dark")
+    for colour, before in zip(colours, light, strict=True):
+        browser.until(f"{colour} !== {before!r}")
+    browser.prefer("light")
 
 
 # -- the board
@@ -204,10 +199,8 @@ def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
     assert "scale=ratio" in browser.run("location.hash")
     choose(browser, "kind", "static")
     assert browser.run("select('#explore-table thead th').length") == 2
-    browser.run("byId('ranked').click()")
-    ranked = browser.run("select('#explore-table tbody tr').length")
-    browser.run("byId('reset').click()")
-    assert ranked < browser.run("select('#explore-table tbody tr').length") == 7
+    choose(browser, "kind", "all")
+    assert browser.run("select('#explore-table tbody tr').length") == 7
     failed = browser.run("select('#explore-table small').map((each) => each.textContent.trim())")
     assert failed == ["✕1"]
 

@@ -47,11 +47,11 @@ const rowsOf = (heads, rows) => make("div", { className: "scroll" }, make("table
 const fold = (title, ...parts) => make("details", { className: "fold" }, make("summary", { textContent: title }), ...parts);
 
 class RunView {
+  second = null; // the run of another tracker
   constructor(run) {
     this.run = run;
     this.frames = run.series.index ?? run.series.track_t ?? [];
     this.times = run.series.t ?? run.series.track_t ?? [];
-    this.second = null;
   }
 
   async show() {
@@ -69,7 +69,9 @@ class RunView {
     this.at = wanted ? nearest(this.frames, +wanted) : run.worst.length ? nearest(this.frames, run.worst[0][0]) : 0;
     await this.drawTrack();
     if (run.figures.time) {
-      await draw(byId("time"), { ...run.figures.time, layout: { ...run.figures.time.layout, shapes: [...run.figures.time.layout.shapes, this.cursor()] } });
+      const t = this.times[this.at] ?? 0;
+      const cursor = { type: "line", x0: t, x1: t, y0: 0, y1: 1, yref: "paper", line: { color: "#e69f00", width: 3 }, editable: true };
+      await draw(byId("time"), { ...run.figures.time, layout: { ...run.figures.time.layout, shapes: [...run.figures.time.layout.shapes, cursor] } });
       byId("time").removeAllListeners?.("plotly_click");
       byId("time").on("plotly_click", ({ points }) => this.move(nearest(this.times, points[0].x)));
       byId("time").on("plotly_relayout", (change) => {
@@ -78,11 +80,6 @@ class RunView {
       });
     }
     this.move(this.at, false);
-  }
-
-  cursor() {
-    const t = this.times[this.at] ?? 0;
-    return { type: "line", x0: t, x1: t, y0: 0, y1: 1, yref: "paper", line: { color: "#e69f00", width: 3 }, editable: true };
   }
 
   async drawTrack() {
@@ -105,8 +102,8 @@ class RunView {
       document.querySelector("#picture figcaption").textContent = `Frame ${frame} at ${t.toFixed(2)} s${shown === frame ? "" : `; the nearest picture is of frame ${shown}`}`;
     }
     if (run.figures.time && byId("time").layout) {
-      const place = `shapes[${run.figures.time.layout.shapes.length}]`;
-      if (byId("time").layout.shapes[run.figures.time.layout.shapes.length].x0 !== t) Plotly.relayout(byId("time"), { [`${place}.x0`]: t, [`${place}.x1`]: t });
+      const cursor = run.figures.time.layout.shapes.length, place = `shapes[${cursor}]`;
+      if (byId("time").layout.shapes[cursor].x0 !== t) Plotly.relayout(byId("time"), { [`${place}.x0`]: t, [`${place}.x1`]: t });
     }
     if (run.figures.track) {
       const last = byId("track").data.length - 1, { x, y, z } = marker(run, t);
