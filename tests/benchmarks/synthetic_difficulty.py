@@ -1,18 +1,13 @@
 """How hard rendered sequences are for a reference system: ORB-SLAM3, repeated, with controls.
 
-Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--controls moving none frozen masked persons]
-           [--runs 5] [--cache DIR] [--out FILE.jsonl] [--table]
+Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--controls moving frozen masked] [--runs 3]
 
-Each line of the output file is one run; a run that is in the file already is not repeated; the runs of one row go in
-step. `--table` only prints the Markdown table of the file. Controls: `none` renders the room without people, `frozen`
-with people and chairs frozen at their first pose, `masked` takes the moving sequence, removes the depth of people (and
-of everything while it moves) and fills their pixels smoothly from outside, so that no feature is left on them;
-`persons` does so with people alone, which is what a class label gives.
+Prints a Markdown table. Controls: `frozen` renders people and things frozen at their first pose; `masked` takes the
+moving sequence, removes the depth of people (and of everything while it moves) and fills their pixels smoothly from
+outside, so that no feature is left on them.
 """
 
 import argparse
-import json
-import sys
 import tempfile
 from pathlib import Path
 
@@ -26,13 +21,17 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.geometry.association import associate
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 
 VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
-CONTROLS = ("moving", "none", "frozen", "masked", "persons")
+CONTROLS = ("moving", "frozen", "masked")
+FAMILIES = (
+    "sitting_xyz", "walking_xyz", "walking_static", "walking_rpy", "crowd_xyz", "objects_box_obstructing",
+    "objects_trolley", "synchronous", "tracking", "fast_walking", "dark_walking", "blank_walking",
+)  # fmt: skip
 
 
 def without(frame: Frame, hidden: np.ndarray) -> Frame:
@@ -111,27 +110,23 @@ class SideBySide:
         return rows
 
 
-def settings_of(control: str) -> RenderSettings:
-    """The renderer's settings of a control."""
-    return RenderSettings(people=control if control in ("none", "frozen") else "moving")
-
-
 def measure(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str, object]]:
     """Several runs of ORB-SLAM3 on one control of one sequence."""
-    sequence = open_synthetic(id, cache, settings=settings_of(control))
+    people = "frozen" if control == "frozen" else "moving"
+    sequence = open_synthetic(id, cache, settings=RenderSettings(people=people))
     sequence.render()
     together = SideBySide(sequence, runs, sequence.fps)
     for index in range(len(sequence)):
         frame = sequence[index]
-        if control in ("masked", "persons"):
+        if control == "masked":
             masks = sequence.masks[index]
             names = masks.class_names
-            ids = [k for k in names if names[k] == "person" or (control == "masked" and k in masks.moving)]
+            ids = [k for k in names if names[k] == "person" or k in masks.moving]
             frame = without(frame, np.isin(masks.instances, ids))
         together.track(frame)
     truth = sequence.ground_truth
     never = float(np.sqrt(((truth.positions - truth.positions.mean(0)) ** 2).sum(1).mean()))
-    about = {"id": id, "control": control, "digest": sequence.digest(), "frames": len(sequence)}
+    about = {"id": id, "control": control}
     return [about | row | {"never": round(never, 4)} for row in together.results()]
 
 
@@ -156,25 +151,17 @@ def cell(runs: pd.DataFrame) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ids", nargs="*", default=list(REPLICA_IDS))
-    parser.add_argument("--controls", nargs="+", default=list(CONTROLS[:4]), choices=CONTROLS)
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "synthetic_difficulty")
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".jsonl"))
-    parser.add_argument("--table", action="store_true")
+    parser.add_argument("ids", nargs="*", default=[f"synthetic/{name}?scene=100&frames=120" for name in FAMILIES])
+    parser.add_argument("--controls", nargs="+", default=list(CONTROLS), choices=CONTROLS)
+    parser.add_argument("--runs", type=int, default=3)
     arguments = parser.parse_args()
-    rows = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.is_file() else []
-    if not arguments.table:
-        for id in arguments.ids:
-            for control in arguments.controls:
-                digest = open_synthetic(id, None, settings=settings_of(control)).digest()
-                done = {r["run"] for r in rows if (r["id"], r["control"], r["digest"]) == (id, control, digest)}
-                todo = sorted(set(range(arguments.runs)) - done)
-                new = measure(id, control, todo, arguments.cache) if todo else []
-                rows += new
-                with arguments.out.open("a") as file:
-                    file.writelines(json.dumps(row) + "\n" for row in new)
-                print(*new, sep="\n", file=sys.stderr, flush=True)
+    with tempfile.TemporaryDirectory() as cache:
+        rows = [
+            row
+            for id in arguments.ids
+            for control in arguments.controls
+            for row in measure(id, control, list(range(arguments.runs)), Path(cache))
+        ]
     print(table(rows))
 
 
