@@ -1,4 +1,4 @@
-"""``sequences list|info|fetch|verify|doctor|calibrate|unpack|render``."""
+"""``sequences list|info|fetch|verify|doctor|calibrate|unpack|render|compose``."""
 
 from __future__ import annotations
 
@@ -187,6 +187,29 @@ def render(
             folder = render_synthetic(name, find_data_root(data_root), threads=threads, progress=advance)
         note(f"{name} is in")
         write(str(folder))
+
+
+@app.command()
+def compose(
+    host: Name,
+    folder: Annotated[Path, typer.Argument(help="The folder to make, in TUM layout.")],
+    people: Annotated[str, typer.Option("--with", help="Recording of people by a camera that does not move.")],
+    instance: Annotated[int, typer.Option(min=0, help="Which placement of one to three people.")] = 0,
+    frames: Frames = None,
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Paste real people into a recording that has a truth: exact masks, the host's poses."""
+    from dynslam_bench.sequences.catalogue import open_sequence
+    from dynslam_bench.sequences.compose import compose as paste
+
+    opened = open_sequence(host, data_root=data_root, frames=frames), open_sequence(people, data_root=data_root)
+    with progress(str(folder)) as advance:
+        made = paste(*opened, folder, instance, progress=advance)
+    share = (
+        f"people fill {100 * made.share:.0f} % of the pixels on average and {100 * made.largest_share:.0f} % at most"
+    )
+    present(made, f"{made.folder}: {made.frames} frames, {share}")
 
 
 @app.command()

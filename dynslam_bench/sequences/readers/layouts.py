@@ -49,6 +49,8 @@ from dynslam_bench.sequences.readers.tables import (
     section,
 )
 
+PEOPLE_LIST = "people.txt"
+"""List of exact masks, 8-bit images of the colour images' size and stamps: 0 is the scene, k > 0 is person k."""
 MILLIMETRES = 1000.0
 """Units a metre."""
 
@@ -67,7 +69,9 @@ def read_tum(folder: Path, fps: float | None) -> Contents:
             if (folder / name).is_file():
                 colour, depth = read_associations(folder / name)
                 return Contents(colour, depth, paired=True, truth=truth, truth_dropped=dropped)
-    return Contents(_tum_list(folder, "rgb", fps), _tum_list(folder, "depth", fps), False, truth, dropped)
+    people = read_image_list(folder / PEOPLE_LIST) if (folder / PEOPLE_LIST).is_file() else None
+    colour, depth = _tum_list(folder, "rgb", fps), _tum_list(folder, "depth", fps)
+    return Contents(colour, depth, False, truth, dropped, people=people)
 
 
 def _tum_list(folder: Path, name: str, fps: float | None) -> ImageList:

@@ -176,6 +176,7 @@ class Contents:
         fps: Nominal frame rate in Hz that the folder or the layout states; None where neither does.
         missing_depth: Raw value beside 0 that stands for a missing depth; None for none.
         furthest_m: Depth beyond this, in metres, is no measurement (a rendered sky); None for no limit.
+        people: Exact masks of people, with the stamps of the colour images; None where there are none.
     """
 
     colour: ImageList
@@ -187,6 +188,7 @@ class Contents:
     fps: float | None = None
     missing_depth: int | None = None
     furthest_m: float | None = None
+    people: ImageList | None = None
 
 
 # Entries of list files that did not become frames, and why.

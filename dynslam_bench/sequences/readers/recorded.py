@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import Frame, MaskSource
+from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
@@ -20,6 +20,7 @@ from dynslam_bench.core.sanitise import inside
 from dynslam_bench.geometry import Camera, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
 from dynslam_bench.sequences.readers.lists import Contents, Dropped, ImageList
+from dynslam_bench.sequences.view import Masks
 
 GROUND_TRUTH_DT_S = 0.02
 SLOWEST_S = 5.0
@@ -55,7 +56,7 @@ class RecordedSequence:
         timestamps_ns: The same in nanoseconds, int64 ``[N]``.
         depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's `depth_delay_s` added.
         ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps; None without any.
-        masks: None: recorded sequences come without exact masks.
+        masks: Exact masks of people where the folder lists them (`PEOPLE_LIST`), else None.
         fps: Nominal frame rate in Hz; where none is stated, the inverse of the median interval (30 for one frame).
         dropped: What was not used, and why.
 
@@ -81,12 +82,12 @@ class RecordedSequence:
     ) -> None:
         self.folder, self.id, self.camera = folder, id, camera
         self.license, self.citation, self.tags, self.split = license, citation, tags, split
-        self.masks: MaskSource | None = None
         self._any_depth_size = any_depth_size
         self._missing_depth, self._furthest_m = contents.missing_depth, contents.furthest_m
         delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
         colour, depth = contents.colour, replace(contents.depth, stamps_ns=delayed)
-        for file in (*colour.files, *depth.files):
+        people = contents.people
+        for file in (*colour.files, *depth.files, *(people.files if people else ())):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
         listed = len(colour) + len(depth)
         paired = contents.paired and not camera.depth_delay_s
@@ -110,6 +111,15 @@ class RecordedSequence:
         self.depth_timestamps = depth.stamps[index[1]]
         self._colour = [colour.files[i] for i in index[0]]
         self._depth = [depth.files[i] for i in index[1]]
+        self._people: list[str] = []
+        if people is not None:
+            people = _existing(folder, people, "mask", tolerated=0.0)
+            at = np.searchsorted(people.stamps_ns, self.timestamps_ns).clip(max=len(people) - 1)
+            unmasked = int(np.count_nonzero(people.stamps_ns[at] != self.timestamps_ns))
+            if unmasked:
+                raise SequenceError(f"{unmasked} of {len(self)} frames of {folder} have no mask of their stamp")
+            self._people = [people.files[i] for i in at]
+        self.masks: MaskSource | None = Masks(self._masks_of) if self._people else None
         self.ground_truth = contents.truth
         if contents.truth is not None and R_body_cam is not None:
             poses = in_camera_axes(contents.truth.T_world_cam, R_body_cam)
@@ -159,7 +169,8 @@ class RecordedSequence:
         poses = None if truth is None else [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
         try:
             # Text, not paths: joining those takes longer than asking for the files' times.
-            images = contents_digest(f"{self.folder}{os.sep}{file}" for file in (*self._colour, *self._depth))
+            files = (*self._colour, *self._depth, *self._people)
+            images = contents_digest(f"{self.folder}{os.sep}{file}" for file in files)
         except OSError as error:
             raise SequenceError(
                 f"cannot read {error.filename}: {error.strerror}", "fetch the sequence again"
@@ -187,6 +198,14 @@ class RecordedSequence:
             furthest_m=self._furthest_m,
         )
         return Frame(index, float(self.timestamps[index]), rgb, depth)
+
+    def _masks_of(self, index: int) -> FrameMasks:
+        path, size = self.folder / self._people[index], (self.camera.width, self.camera.height)
+        people = read_image(path, size=size, mismatch="unlike its colour image", kind=SequenceError)
+        if people.dtype != np.uint8 or people.ndim != 2:
+            raise SequenceError(f"mask {path} has another form than 8 bits in one channel")
+        ids = frozenset(np.unique(people[people > 0]).tolist())
+        return FrameMasks(people, dict.fromkeys(ids, "person"), ids)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"

@@ -1,0 +1,380 @@
+"""Composites: people of a recording by a fixed camera, pasted in depth order into a recording that has a truth.
+
+The person is cut out where depth is nearer than the background, which the fixed camera sees uncovered in other frames,
+and moved as a whole to a place before the host's camera. It is drawn from the host's true poses, so that it stands in
+the host's world, hides what is behind it, is hidden by what is before it, and casts the depth camera's shadow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from dynslam_bench.contracts import Sequence
+from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core.files import atomic_folder, write_atomic
+from dynslam_bench.geometry import Array, Camera, Trajectory, se3, write_tum
+from dynslam_bench.sequences.cameras import write_camera
+from dynslam_bench.sequences.readers.layouts import PEOPLE_LIST
+
+_NEARER_M, _NEARER_SHARE = 0.08, 0.04
+"""A pixel shows a person if its depth is less than the background's by this and by this share of it."""
+_LEAST_PX = 0.01
+"""Smallest share of the image that a person fills; less is noise, or a person who has just begun to enter."""
+_BORDER_PX = 2
+"""A person who reaches the left, right or upper border so closely is partly outside."""
+_UPSAMPLED = 4
+_SQUARE, _DISC = np.ones((3, 3), np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+_LEAST_DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
+"""What is seen of a person and is smaller is left out: points that were drawn without neighbours."""
+_PLACES, _SAMPLED, _REDUCED = 12, 6, 4
+"""Places that are tried, frames on which each is tried, and by how much their images are reduced."""
+_MOST_PEOPLE = 3
+_DISTANCES_M = 0.8, 1.5
+_SCALES = 1.0, 0.75, 0.6, 0.45
+_SHARES = 0.1, 0.35
+"""Share of the image that the person fills on average."""
+_GAP_M = 0.05
+"""A person less than this before a surface is taken to stand in it."""
+_NEAREST_M = 0.5
+"""Nearer surfaces are not measured by a Kinect, and too little is known of the person to draw them."""
+_EDGE_M = 0.1
+"""Neighbouring pixels of a person whose depths differ by more are parts of the body before each other."""
+_SHADOW_BASELINE_M = 0.075
+"""Distance between a Kinect's projector and its infrared camera."""
+_FURTHEST_SHADOW_PX = 40
+
+
+@dataclass(frozen=True)
+class Cutout:
+    """A person in one frame of a fixed camera.
+
+    Attributes:
+        rgb: uint8 ``[H, W, 3]``.
+        depth: The person's, float32 ``[H, W]`` in metres, continued around the mask.
+        mask: bool ``[H, W]``, the person.
+        centre: Median of the person's points in the camera's frame, metres ``[3]``.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    centre: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Composed:
+    """What `compose` wrote.
+
+    Attributes:
+        folder: The sequence, in TUM layout with ``people.txt``.
+        frames: Number of frames.
+        share: Mean share of the pixels that show the person, 0 to 1.
+        largest_share: The largest share of a frame.
+    """
+
+    folder: Path
+    frames: int
+    share: float
+    largest_share: float
+
+
+def compose(
+    host: Sequence,
+    people: Sequence,
+    folder: str | Path,
+    instance: int = 0,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Composed:
+    """Paste the people of one recording into another one, and write the result as a folder in TUM layout.
+
+    Args:
+        host: A recording with depth and ground truth; its colour, depth and poses are kept.
+        people: A recording by a camera that does not move.
+        folder: The folder to make.
+        instance: Which placement: one to three people, each with a distance, side, turn, mirroring and first frame that
+            are drawn from it.
+        progress: Called with frames done and frames in all.
+
+    Raises:
+        SequenceError: The host has no ground truth, the people's camera moves, or nobody is seen.
+        DynslamError: A frame cannot be read, or the folder not be written.
+    """
+    if host.ground_truth is None:
+        raise SequenceError(f"'{host.id}' has no ground truth, so nobody can be placed in its world")
+    if people.ground_truth is not None and not se3.stands_still(people.ground_truth.T_world_cam):
+        raise SequenceError(f"the camera of '{people.id}' moves", "people are cut out of recordings by a fixed camera")
+    cutouts, tone = cut_out(people)
+    rng = np.random.default_rng(instance)
+    T_world_cam = _poses(host.ground_truth, host.timestamps)
+    actors = [_Actor(cutouts, people, host, T_world_cam, rng) for _ in range(1 + instance % _MOST_PEOPLE)]
+    shares = []
+    with atomic_folder(Path(folder).expanduser().absolute()) as work:
+        for kind in ("rgb", "depth", "people"):
+            (work / kind).mkdir()
+        for i in range(len(host)):
+            frame = host[i]
+            gain = np.clip(frame.rgb.reshape(-1, 3).mean(axis=0) / tone, 0.4, 1.6)
+            colour, z, ids = _nearest([actor.draw(i, host.camera) for actor in actors])
+            rgb, depth, shown = paste(frame.rgb, frame.depth, colour * gain.astype(np.float32), z, host.camera)
+            name = f"{frame.timestamp:.6f}.png"
+            raw = np.rint(depth * host.camera.depth_factor).clip(0, 65535).astype(np.uint16)
+            for kind, image in (
+                ("rgb", rgb[..., ::-1]),
+                ("depth", raw),
+                ("people", np.where(shown, ids, 0).astype(np.uint8)),
+            ):
+                write_atomic(work / kind / name, cv2.imencode(".png", image)[1].tobytes())
+            shares.append(shown.mean())
+            progress(i + 1, len(host))
+        for kind in ("rgb", "depth", "people"):
+            lines = [f"{stamp:.6f} {kind}/{stamp:.6f}.png\n" for stamp in host.timestamps.tolist()]
+            write_atomic(work / (PEOPLE_LIST if kind == "people" else f"{kind}.txt"), "".join(lines))
+        write_tum(work / "groundtruth.txt", host.ground_truth, comment=f"of {host.id}")
+        write_camera(work / "camera.toml", host.camera, fps=host.fps)
+    return Composed(Path(folder), len(host), float(np.mean(shares)), float(np.max(shares)))
+
+
+def cut_out(people: Sequence) -> tuple[list[Cutout], NDArray[np.float64]]:
+    """The person in every frame of a fixed camera in which one is seen, in order.
+
+    The background's depth is the median of what is as far as the farthest tenth of a pixel's measurements.
+
+    Returns:
+        The cutouts, and the mean colour of the recording ``[3]``.
+
+    Raises:
+        SequenceError: Nobody is seen.
+    """
+    frames = [people[i] for i in range(len(people))]
+    depths = np.stack([frame.depth for frame in frames])
+    measured = np.where(depths > 0, depths, np.nan)
+    measured[:, ~(depths > 0).any(axis=0)] = 0  # never measured: nobody is told from what is behind
+    farthest = np.nanquantile(measured, 0.9, axis=0)
+    background = np.nanmedian(np.where(measured >= 0.97 * farthest, measured, np.nan), axis=0)
+    tone = np.mean([frame.rgb.reshape(-1, 3).mean(axis=0) for frame in frames], axis=0)
+    cutouts = []
+    for frame in frames:
+        nearer = (frame.depth > 0) & (frame.depth < background - np.maximum(_NEARER_M, _NEARER_SHARE * background))
+        mask = _person(nearer, frame.rgb)
+        border = mask[:, :_BORDER_PX].any() or mask[:, -_BORDER_PX:].any() or mask[:_BORDER_PX].any()
+        if mask.mean() < _LEAST_PX or border:
+            continue
+        measured_there = np.where(nearer & mask, frame.depth, 0).astype(np.float32)
+        depth = cv2.medianBlur(_filled(measured_there), 5)
+        rows, columns = np.nonzero(mask)
+        points = people.camera.unproject(np.stack([columns, rows], axis=1), depth[mask])
+        cutouts.append(Cutout(frame.rgb, depth, mask, np.median(points, axis=0)))
+    if not cutouts:
+        raise SequenceError(f"nobody walks through '{people.id}'", "nothing comes nearer than its background")
+    return cutouts, tone
+
+
+def _person(nearer: NDArray[np.bool_], rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """The largest region that is nearer than the background, its outline moved to the edges of the colour image."""
+    opened = cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _DISC, iterations=2)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
+    if len(stats) < 2 or stats[1:, cv2.CC_STAT_AREA].max() < _LEAST_PX * nearer.size:
+        return np.zeros_like(nearer)
+    region = (labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())).astype(np.uint8)
+    trimap = np.full(region.shape, cv2.GC_BGD, np.uint8)
+    trimap[cv2.dilate(region, _DISC) > 0] = cv2.GC_PR_BGD
+    trimap[region > 0] = cv2.GC_PR_FGD
+    trimap[cv2.erode(region, _DISC, iterations=2) > 0] = cv2.GC_FGD
+    cv2.setRNGSeed(0)
+    cv2.grabCut(np.ascontiguousarray(rgb[..., ::-1]), trimap, None, np.zeros((1, 65)), np.zeros((1, 65)), 2)
+    return (trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)
+
+
+def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth everywhere: where it is 0, that of the nearest pixel that has one; 0 where none has."""
+    empty, by_pixel = (depth == 0).astype(np.uint8), cv2.DIST_LABEL_PIXEL
+    _, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=by_pixel)
+    values = np.zeros(labels.max() + 1, np.float32)
+    values[labels[depth > 0]] = depth[depth > 0]
+    return values[labels]
+
+
+def _poses(truth: Trajectory, stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Interpolated poses ``[N, 4, 4]`` at stamps; beyond its ends those of the ends."""
+    times = truth.timestamps
+    at = np.clip(stamps, times[0], times[-1])
+    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+    poses[:, :3, :3] = Slerp(times, Rotation.from_matrix(truth.T_world_cam[:, :3, :3]))(at).as_matrix()
+    poses[:, :3, 3] = np.stack([np.interp(at, times, axis) for axis in truth.T_world_cam[:, :3, 3].T], axis=1)
+    return poses
+
+
+class _Actor:
+    """A person at a drawn place in the host's world.
+
+    Args:
+        cutouts: The person, frame by frame.
+        people: Where they are cut out of.
+        host: The recording that the person is drawn into.
+        T_world_cam: The host's poses ``[N, 4, 4]``.
+        rng: Draws place and time.
+    """
+
+    def __init__(
+        self, cutouts: list[Cutout], people: Sequence, host: Sequence, T_world_cam: Array, rng: np.random.Generator
+    ) -> None:
+        self.cutouts, self.camera, self.T_world_cam = cutouts, people.camera, T_world_cam
+        seconds, last = host.timestamps - host.timestamps[0], len(cutouts) - 1
+        place = np.mod(rng.uniform(0, last) + people.fps * seconds, 2 * max(last, 1))
+        self.played = np.minimum(place, np.maximum(2 * last - place, 0))  # forth and back; between two cutouts, too
+        turn = Rotation.from_rotvec([0, np.deg2rad(rng.uniform(-15, 15)), 0]).as_matrix()
+        self.turned = turn @ np.diag([rng.choice([-1.0, 1.0]), 1.0, 1.0])
+        self.T_world_people = np.eye(4)
+        self._place(host, rng)
+
+    def _place(self, host: Sequence, rng: np.random.Generator) -> None:
+        """Choose the best of some drawn places.
+
+        A person is upright in the host's first image and has the size there of one at the drawn distance. Where this
+        place lies behind or in the host's surfaces, the person is brought nearer and made smaller in proportion.
+        """
+        small = host.camera.resized(host.camera.width // _REDUCED, host.camera.height // _REDUCED)
+        sampled = np.linspace(0, len(host) - 1, _SAMPLED).astype(int).tolist()
+        behind = [_filled(host[i].depth[::_REDUCED, ::_REDUCED][: small.height, : small.width]) for i in sampled]
+        centres = np.stack([cutout.centre for cutout in self.cutouts])[self.played.astype(int)]
+        best, least = self.T_world_people, np.inf
+        for _ in range(_PLACES):
+            distance_m = rng.uniform(*_DISTANCES_M)
+            target = distance_m * np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.1, 0.2), 1.0])
+            for scale in _SCALES:
+                T_start_people = np.eye(4)
+                T_start_people[:3, :3] = scale * self.turned
+                T_start_people[:3, 3] = scale * (target - self.turned @ np.median(centres, axis=0))
+                self.T_world_people = self.T_world_cam[0] @ T_start_people
+                shares, hidden = [], []
+                for i, depth in zip(sampled, behind, strict=True):
+                    _, z = self.draw(i, small, upsampled=1)
+                    shares.append(((z > 0) & (z < depth)).mean())
+                    hidden.append(((z > 0) & ((z > depth - _GAP_M) | (z < _NEAREST_M))).mean())
+                share, lost = float(np.mean(shares)), float(np.mean(hidden))
+                cost = 10 * max(_SHARES[0] - share, share - _SHARES[1], 0.0) + lost / max(share, 1e-3) - 0.05 * scale
+                best, least = (self.T_world_people, cost) if cost < least else (best, least)
+        self.T_world_people = best
+
+    def draw(
+        self, index: int, camera: Camera, upsampled: int = _UPSAMPLED
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The person in a frame of the host: colour float32 ``[H, W, 3]``, depth float32 ``[H, W]``, 0 where it is not.
+
+        Between two cutouts the earlier one is moved by a part of the step of its centre.
+
+        Args:
+            index: The frame.
+            camera: Of the image.
+            upsampled: By how much the cutout's resolution is increased.
+        """
+        at = self.played[index]
+        cutout, after = (self.cutouts[min(int(at) + step, len(self.cutouts) - 1)] for step in (0, 1))
+        rgb, pixels, depth = _upsampled(cutout, upsampled)
+        moved = self.camera.unproject(pixels, depth) + (at - int(at)) * (after.centre - cutout.centre)
+        points = se3.transform(se3.inverse(self.T_world_cam[index]) @ self.T_world_people, moved)
+        uv, visible = camera.view(points)
+        at_pixels = np.rint(camera.distort_points(uv)).astype(int)
+        visible &= (
+            (points[:, 2] > 0.8 * _NEAREST_M)
+            & (at_pixels >= 0).all(axis=1)
+            & (at_pixels < (camera.width, camera.height)).all(axis=1)
+        )
+        order = np.flatnonzero(visible)[np.argsort(-points[visible, 2])]  # the nearest is written last
+        columns, rows = at_pixels[order].T
+        z = np.zeros((camera.height, camera.width), np.float32)
+        colour = np.zeros((*z.shape, 3), np.float32)
+        colour[rows, columns], z[rows, columns] = rgb[order], points[order, 2]
+        return _closed(colour, z)
+
+
+def _nearest(
+    drawn: list[tuple[NDArray[np.float32], NDArray[np.float32]]],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.intp]]:
+    """Colour and depth of the nearest of several people at each pixel, and who that is, counted from 1."""
+    depths = np.stack([np.where(z > 0, z, np.inf) for _, z in drawn])
+    who = depths.argmin(axis=0)[None]
+    z = np.take_along_axis(depths, who, axis=0)[0]
+    colour = np.take_along_axis(np.stack([colours for colours, _ in drawn]), who[..., None], axis=0)[0]
+    return colour, np.where(np.isfinite(z), z, 0).astype(np.float32), who[0] + 1
+
+
+def _upsampled(cutout: Cutout, times: int) -> tuple[NDArray[np.float32], Array, NDArray[np.float32]]:
+    """Colours ``[N, 3]``, pixels ``[N, 2]`` and depths ``[N]`` of a cutout at several times its resolution."""
+    rows, columns = np.nonzero(cutout.mask)
+    top, left = max(rows.min() - 1, 0), max(columns.min() - 1, 0)
+    part = np.s_[top : rows.max() + 2, left : columns.max() + 2]
+    mask, depth = cutout.mask[part].astype(np.float32), cutout.depth[part]
+    size = (times * mask.shape[1], times * mask.shape[0])
+    weight = cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR)
+    smooth, nearest = (cv2.resize(depth, size, interpolation=way) for way in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
+    edge = (cv2.dilate(depth, _SQUARE) - cv2.erode(depth, _SQUARE) > _EDGE_M).astype(np.uint8)
+    stepped = cv2.resize(edge, size, interpolation=cv2.INTER_NEAREST) > 0
+    rgb = cv2.resize(cutout.rgb[part].astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
+    inside = np.nonzero(weight > 0.5)
+    pixels = (np.stack(inside[::-1], axis=1) + 0.5) / times - 0.5 + (left, top)
+    return rgb[inside].clip(0, 255), pixels, np.where(stepped, nearest, smooth)[inside]
+
+
+def _closed(colour: NDArray[np.float32], z: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The same without the small holes between drawn points, which get the mean of their neighbours."""
+    drawn = (z > 0).astype(np.float32)
+    whole = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+    count = cv2.blur(drawn, (5, 5))
+    hole = whole & (drawn == 0) & (count > 0)
+    colour[hole] = cv2.blur(colour, (5, 5))[hole] / count[hole, None]
+    z[hole] = cv2.blur(z, (5, 5))[hole] / count[hole]
+    return colour, z
+
+
+def paste(
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    colour: NDArray[np.float32],
+    z: NDArray[np.float32],
+    camera: Camera,
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+    """Put drawn people into a frame: in front of what is farther, with blended edges and a depth camera's shadow.
+
+    Args:
+        rgb: The host's colours, uint8 ``[H, W, 3]``.
+        depth: Its depth in metres ``[H, W]``, 0 where there is none: it is taken for that of the nearest measurement.
+        colour: The people's colours ``[H, W, 3]``.
+        z: Their depth in metres ``[H, W]``, 0 where nobody is.
+        camera: The host's.
+
+    Returns:
+        Colour, depth, and where people are seen, bool ``[H, W]``.
+    """
+    everywhere = cv2.medianBlur(_filled(depth), 5)
+    in_front = ((z > 0) & (cv2.medianBlur(z, 5) < everywhere)).astype(np.uint8)
+    shown = cv2.morphologyEx(in_front, cv2.MORPH_OPEN, _LEAST_DISC) > 0
+    alpha = cv2.GaussianBlur(shown.astype(np.float32), (3, 3), 0.6)[..., None]
+    spread = cv2.blur(shown.astype(np.float32), (3, 3))[..., None]
+    near = cv2.blur(np.where(shown[..., None], colour, 0), (3, 3)) / np.maximum(spread, 1e-6)
+    person = np.where(shown[..., None], colour, near)
+    mixed = np.where(alpha > 0, alpha * person + (1 - alpha) * rgb, rgb)
+    composed = np.where(shown, z, depth)
+    composed[_shadow(shown, z, everywhere, camera) & ~shown] = 0
+    return np.rint(mixed).clip(0, 255).astype(np.uint8), composed.astype(np.float32), shown
+
+
+def _shadow(
+    shown: NDArray[np.bool_], z: NDArray[np.float32], behind: NDArray[np.float32], camera: Camera
+) -> NDArray[np.bool_]:
+    """What a projector to the right of the depth camera does not light, because the person stands in its way."""
+    scale = camera.fx * _SHADOW_BASELINE_M
+    ahead, back = np.where(shown, scale / np.maximum(z, 0.1), 0), scale / np.maximum(behind, 0.1)
+    dark = np.zeros_like(shown)
+    for shift in range(1, _FURTHEST_SHADOW_PX):
+        dark[:, :-shift] |= ahead[:, shift:] - back[:, :-shift] > shift
+    return dark
