@@ -29,8 +29,7 @@ from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 VOCABULARY = Path(__file__).resolve().parents[3] / "shared" / "weights" / "orb_vocabulary_small.txt.xz"
 CONTROLS = ("moving", "frozen", "masked")
 FAMILIES = (
-    "sitting_xyz", "walking_xyz", "walking_static", "walking_rpy", "crowd_xyz", "objects_box_obstructing",
-    "objects_trolley", "synchronous", "tracking", "fast_walking", "dark_walking", "blank_walking",
+    "sitting_xyz", "walking_xyz", "crowd_xyz", "objects_box_obstructing", "objects_trolley", "synchronous", "tracking",
 )  # fmt: skip
 
 
