@@ -33,7 +33,6 @@ from dynslam_bench.tuning.objectives import (
     scenes_needed,
     spread_test,
     together,
-    upper,
     violations,
 )
 from dynslam_bench.tuning.plan import Plan
@@ -46,8 +45,8 @@ _LARGEST_LOG = 700.0
 """Larger logarithms overflow."""
 NEGLIGIBLE = 0.05
 """A gain that is surely smaller than this share does not matter."""
-FALSE_CHOICES = 0.05
-"""At most this share of the studies in which nothing is better may choose something."""
+ERROR = 0.05
+"""Of an interval: 2.5 % above and 2.5 % below. So at most 2.5 % of the studies without anything better choose something."""
 
 
 class Ratio(Record):
@@ -60,14 +59,14 @@ class Ratio(Record):
         high: Upper end.
         n: Paired runs.
         sequences: How many scenes they come from.
-        bound: One-sided upper bound, wide enough for the number of candidates compared; None for a single run.
+        bound: Upper end of an interval that is wide enough for the number of candidates compared; None for a single run.
         spread: Standard deviation of the logarithm over what the interval is over; None for a single run.
         what: What the ratio is one of.
     """
 
     ratio: float
-    low: float | None
-    high: float | None
+    low: float | None = None
+    high: float | None = None
     n: int
     sequences: int
     bound: float | None = None
@@ -110,17 +109,12 @@ def compared(outcomes: Outcomes, baseline: Outcomes, *, objective: Objective = A
     scenes = objective.ratios(outcomes, baseline)
     sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, baseline)
     sample = objective.counted(sample)
-    interval = bounds(sample)
-    return Ratio(
-        ratio=_ratio(centre(sample)),
-        low=None if interval is None else _ratio(interval[0]),
-        high=None if interval is None else _ratio(interval[1]),
-        bound=None if interval is None else _ratio(upper(sample, 1 - FALSE_CHOICES / candidates)),
-        spread=None if interval is None else float(np.std(sample, ddof=1)),
-        n=len(outcomes),
-        sequences=len(scenes),
-        what=objective.what,
-    )
+    known = {"ratio": _ratio(centre(sample)), "n": len(outcomes), "sequences": len(scenes), "what": objective.what}
+    if len(sample) < 2:
+        return Ratio(**known)
+    low, high = map(_ratio, bounds(sample))
+    bound = _ratio(bounds(sample, 1 - ERROR / candidates)[1])
+    return Ratio(**known, low=low, high=high, bound=bound, spread=float(np.std(sample, ddof=1)))
 
 
 def _ratio(logarithm: float) -> float:
@@ -210,7 +204,7 @@ class StudySummary(Record):
         trials: Trials by state.
         candidates: The best configurations, judged again; the best one, whose settings became the preset, first.
         verdict: What the study says of the best candidate.
-        conclusion: One sentence, see `judge`.
+        conclusion: A few short sentences, see `judge`.
         p_value: Of the test whether the settings matter at all (`objectives.spread_test`); None without a test.
         shipped: The default settings, where the baseline is something else, on ``confirm`` and ``held_out``.
         importances: Optuna's importances of the parameters, see `storage.importances`.
@@ -259,13 +253,13 @@ def judge(
     split_notes: Sequence[str] = (),
     failures: Sequence[str] = (),
 ) -> tuple[Verdict, str]:
-    """The verdict on the first, best candidate, and one sentence with its numbers.
+    """The verdict on the first, best candidate, and a few short sentences with its numbers.
 
     *Proven*: it was chosen, the whole interval on held-out scenes lies below 1, nothing is lost of accuracy where that
     is asked, recordings are not worse and the splits are apart. *Worse*: an interval lies above 1, a constraint fails,
     or the settings matter and the estimate is not below 1. *Does not matter here*: the trials differ by no more than
-    chance (`objectives.spread_test`), or the whole interval lies above 1 - `NEGLIGIBLE`.
-    *Promising* is what is left.
+    chance (`objectives.spread_test`), or the whole interval lies above 1 - `NEGLIGIBLE`, or the estimate does and
+    nothing was chosen. *Promising* is what is left.
 
     Args:
         candidates: The best one first.
@@ -298,28 +292,39 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
         return Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"
     if ratio.shows_loss:
         return Verdict.WORSE, f"{name} has {100 * (ratio.ratio - 1):.1f} % more {ratio.what}: {numbers}"
-    gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}"
+    gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}: {numbers}"
     unsettled = _unsettled(best, split_notes)
     if not unsettled:
-        return Verdict.PROVEN, f"{name} has {gain}: {numbers}"
+        return Verdict.PROVEN, f"{name} has {gain}"
     luck = not best.chosen or ratio.ratio >= 1
     if p_value is not None and p_value > MATTER_LEVEL and luck and not ratio.shows_gain:
         return Verdict.NO_MATTER, (
             f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}, level "
-            f"{MATTER_LEVEL}); the best, {name}, has {numbers}"
+            f"{MATTER_LEVEL}). The best, {name}, has {numbers}"
         )
     if ratio.low is not None and 1 - NEGLIGIBLE < ratio.low and ratio.ratio < 1:
         return Verdict.NO_MATTER, f"the best, {name}, gains at most {100 * (1 - ratio.low):.1f} %: {numbers}"
     if ratio.ratio >= 1:
         text = f"the best, {name}, is not better than the baseline: {numbers}"
         if p_value is None:
-            return Verdict.NOT_JUDGED, f"{text}; one trial or one scene cannot tell whether settings matter"
+            return Verdict.NOT_JUDGED, f"{text}. One trial or one scene cannot tell whether settings matter"
         return Verdict.WORSE, f"the settings matter, but {text}"
+    if ratio.ratio > 1 - NEGLIGIBLE and not best.chosen and not ratio.shows_gain:
+        return Verdict.NO_MATTER, f"the best, {name}, has perhaps {gain}. {_NOT_WORTH}"
+    return Verdict.PROMISING, f"{name} has perhaps {gain}. It is not proven: {unsettled}. {_more_scenes(best, ratio)}"
+
+
+_NOT_WORTH = f"A gain below {100 * NEGLIGIBLE:.0f} % is not worth more scenes"
+
+
+def _more_scenes(best: Candidate, ratio: Ratio) -> str:
+    """How many more scenes would settle a promising candidate."""
+    if best.confirm is None or best.confirm.ratio >= 1:
+        return f"As it has {best.confirm} where it was chosen, nobody can tell how many more scenes would settle it"
+    if ratio.ratio > 1 - NEGLIGIBLE:
+        return _NOT_WORTH
     missing = max(part.missing for part in ([ratio] if best.chosen else [ratio, best.confirm]))
-    more = f"about {missing} more scene{'s' * (missing != 1)} would settle it"
-    if best.confirm.ratio >= 1:
-        more = f"and as it has {best.confirm} there, nobody can tell how many more scenes would settle it"
-    return Verdict.PROMISING, f"{name} has perhaps {gain}: {numbers}; {unsettled}, {more}"
+    return f"About {missing} more scene{'s' * (missing != 1)} would settle it"
 
 
 def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate | None) -> str:

@@ -2,7 +2,7 @@
 
 A configuration runs on each instance in its own process; the run store makes no run twice. All objectives are natural
 logarithms of ratios to the baseline: less is better, 0 is the baseline's own. Below them the statistics of such ratios:
-interval, bound, power, and the test of whether settings matter at all.
+interval, power, and the test of whether settings matter at all.
 """
 
 from __future__ import annotations
@@ -372,38 +372,24 @@ def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
 
 def centre(values: Iterable[float]) -> float:
     """Trimmed mean; the mean of fewer than ten."""
-    sample = np.sort(np.fromiter(values, np.float64))
-    cut = int(TRIMMED * len(sample))
-    return float(sample[cut : len(sample) - cut].mean())
+    return float(stats.trim_mean(list(values), TRIMMED))
 
 
-def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, float] | None:
+def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, float]:
     """Confidence interval of the centre: Student's, of the trimmed mean (Tukey and McLaughlin 1963) from ten on.
 
     Args:
-        values: One a scene, taken as independent.
-        confidence: Of both sides together; a one-sided bound of confidence c is the end of the interval of 2 c - 1.
-
-    Returns:
-        Lower and upper end; None for fewer than two values.
+        values: One a scene, two or more, taken as independent.
+        confidence: Of both sides together.
     """
-    sample = np.sort(np.fromiter(values, np.float64))
-    count = len(sample)
-    if count < 2:
-        return None
-    cut = int(TRIMMED * count)
+    sample = np.sort(list(values))
+    cut, count = int(TRIMMED * len(sample)), len(sample)
     kept = count - 2 * cut
-    winsorised = np.clip(sample, sample[cut], sample[count - 1 - cut])
+    winsorised = np.clip(sample, sample[cut], sample[-1 - cut])
     error = float(winsorised.std(ddof=1)) * math.sqrt(count) / kept
     half = float(stats.t.ppf(0.5 + confidence / 2, kept - 1)) * error
     middle = centre(sample)
     return middle - half, middle + half
-
-
-def upper(values: Iterable[float], confidence: float) -> float:
-    """One-sided upper confidence bound of the centre; infinite for fewer than two values."""
-    interval = bounds(values, 2 * confidence - 1)
-    return math.inf if interval is None else interval[1]
 
 
 # What scenes can show.

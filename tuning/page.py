@@ -344,12 +344,12 @@ def _candidates(summary: StudySummary, links: Mapping[int, str]) -> Table:
         f"judge it. Frame times without the stage cache.{_cautions(summary)}"
     )
     optimistic = "the trial's own value, optimistic: the trial was selected for it"
-    one_sided = "one-sided upper bound for the choice; allows for the number of candidates"
+    widened = "upper end of an interval that is wider than 95 % for the number of candidates (Bonferroni)"
     tune, confirm, held_out = _marked(
         summary, ("in the trial", "tune"), ("unseen instances", "confirm"), ("held-out", "held_out")
     )
     columns = [Column("trial"), Column(tune, meaning=optimistic), *numbers(confirm)]
-    columns += [Column("upper bound", meaning=one_sided), *numbers(held_out, "recorded", "frame ms")]
+    columns += [Column("upper bound", meaning=widened), *numbers(held_out, "recorded", "frame ms")]
     columns += [Column("constraints hold", numeric=False)]
     return Table("candidates", "The best trials, judged again", caption, columns, rows)
 

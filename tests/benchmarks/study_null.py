@@ -124,7 +124,7 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
 
 
 def best_power(design: Any, gain: float) -> float:
-    """How often a z-test of known variances tells a gain from nothing, with a false claim in 800 (5 % x 2.5 %)."""
+    """How often a z-test of known variances tells a gain from nothing, with a false claim in 1600 (2.5 % x 2.5 %)."""
     import simulated
 
     from dynslam_bench.tuning.study_file import scenes
@@ -135,7 +135,7 @@ def best_power(design: Any, gain: float) -> float:
         starts = stats.norm.rvs(size=(20_000, len(split) // len(groups)), random_state=0)
         start_variance = np.median(starts, axis=1).var() * simulated.STARTS_SD**2
         information += len(groups) / (start_variance + simulated.SCENES_SD**2)
-    return float(stats.norm.sf(stats.norm.isf(0.05 * 0.025) - gain * math.sqrt(information)))
+    return float(stats.norm.sf(stats.norm.isf(0.025 * 0.025) - gain * math.sqrt(information)))
 
 
 def regret(studies: int, folder: Path) -> Iterable[str]:
