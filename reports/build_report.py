@@ -597,7 +597,7 @@ def publish(
     output = output.expanduser().absolute()
     for study in studies:
         if not (study / STUDY_PAGE).is_file():
-            raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune report STUDY.toml")
+            raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune run STUDY.toml")
     for part in ("leaderboard/data", "leaderboard/csv", "leaderboard/frames", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(

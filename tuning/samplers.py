@@ -2,17 +2,13 @@
 
 Each trial draws from a stream of its own, and all trials meet the same growing sets of instances, on which Optuna's
 pruners end the worse ones early: asynchronous successive halving (Li et al. 2020) or Wilcoxon's signed-rank test
-against the best trial. Optuna prunes no trials of several objectives; there a trial ends once other trials dominate it
-at the same step.
+against the best trial. Optuna prunes no trials of several objectives.
 """
 
 from __future__ import annotations
 
-import io
-import pickle
 import warnings
-from collections.abc import Callable, Sequence
-from importlib.util import find_spec
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,7 +20,7 @@ from optuna.search_space import IntersectionSearchSpace
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from dynslam_bench.core.errors import StudyError, raising
+from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.flow.moth_flame import EMFOA, flames_left, flight, moth_positions, opposites
 from dynslam_bench.tuning.study_file import PrunerName, SamplerName, StudySpec
@@ -85,20 +81,13 @@ _SAMPLERS: dict[SamplerName, Callable[[StudySpec, int], optuna.samplers.BaseSamp
     ),
     "nsga2": lambda spec, seed: optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed),
     "gp": lambda spec, seed: optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed),
-    "cmaes": lambda spec, seed: RestrictedCmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS),
     "emfoa": lambda spec, seed: EmfoaSampler(seed=seed, n_trials=spec.trials),
 }
-_OF_ONE_OBJECTIVE = ("cmaes", "emfoa")
 
 
 def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
-    if spec.sampler in _OF_ONE_OBJECTIVE and len(spec.objectives) > 1:
-        raise StudyError(
-            f"sampler '{spec.sampler}' takes one objective, the study has {len(spec.objectives)}",
-            "use tpe, nsga2, gp or random",
-        )
-    if spec.sampler == "cmaes" and find_spec("cmaes") is None:
-        raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
+    if spec.sampler == "emfoa" and len(spec.objectives) > 1:
+        raise StudyError("sampler 'emfoa' takes one objective", "use tpe, nsga2, gp or random")
     with warnings.catch_warnings():  # TPE's `constant_liar` counts as experimental
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return _SAMPLERS[spec.sampler](spec, seed)
@@ -107,51 +96,6 @@ def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
 def is_feasible(trial: FrozenTrial) -> bool:
     """Whether a trial fulfils all constraints."""
     return all(value <= 0 for value in trial.constraints.values())
-
-
-# CMA-ES: Optuna keeps its state in the storage as a pickle, which anybody who writes to the storage could replace.
-
-_NUMPY = ("numpy._core", "numpy.core")
-_CMA_CLASSES = {
-    ("cmaes._cma", "CMA"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    *((f"{core}.multiarray", name) for core in _NUMPY for name in ("_reconstruct", "scalar")),
-    *((f"{core}.numeric", "_frombuffer") for core in _NUMPY),
-}
-
-
-class _CmaUnpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _CMA_CLASSES:
-            raise pickle.UnpicklingError(f"it names {module}.{name}")
-        return super().find_class(module, name)
-
-
-def restore_cma(data: bytes) -> Any:
-    """A state of CMA-ES from its pickle, made of nothing but the classes that such a state has.
-
-    Raises:
-        StudyError: It is something else.
-    """
-    with raising(
-        StudyError,
-        "the study's storage holds no state of CMA-ES but something else",
-        "it was tampered with or is damaged; use another sampler, or a storage of your own",
-        of=Exception,
-    ):  # a forged pickle raises anything
-        return _CmaUnpickler(io.BytesIO(data)).load()
-
-
-class RestrictedCmaEsSampler(optuna.samplers.CmaEsSampler):
-    """Optuna's CMA-ES, which restores nothing but its own state (`restore_cma`)."""
-
-    def _restore_optimizer(self, completed_trials: list[FrozenTrial]) -> Any:
-        for trial in reversed(completed_trials):
-            parts = {key: part for key, part in trial.system_attrs.items() if key.startswith(self._attr_key_optimizer)}
-            if parts:
-                return restore_cma(bytes.fromhex(self._concat_optimizer_attrs(parts)))
-        return None
 
 
 # The elite moth-flame algorithm as an Optuna sampler: one trial is one flight of one moth.
@@ -239,9 +183,7 @@ class EmfoaSampler(optuna.samplers.BaseSampler):
 
 
 FIRST_STEP = 3
-"""Instances that every trial runs on before it is compared."""
-DOMINATED_SHARE = 0.1
-"""With several objectives a trial ends once this share of the trials, at least two, beats it in all of them."""
+"""Instances that every trial runs on before it may be pruned."""
 WILCOXON_LEVEL = 0.1
 
 
@@ -257,32 +199,3 @@ def build_pruner(name: PrunerName) -> optuna.pruners.BasePruner:
     with warnings.catch_warnings():  # the Wilcoxon pruner counts as experimental
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return _PRUNERS[name]()
-
-
-def steps(name: PrunerName, count: int) -> list[int]:
-    """After how many of `count` instances a trial may be pruned; the last one is the whole set.
-
-    ``halving`` doubles the set (the rungs of successive halving), ``wilcoxon`` tests after every instance.
-    """
-    if name == "none" or count <= FIRST_STEP:
-        return [count]
-    if name == "wilcoxon":
-        return list(range(FIRST_STEP, count + 1))
-    rungs = [FIRST_STEP]
-    while rungs[-1] * 2 < count:
-        rungs.append(rungs[-1] * 2)
-    return [*rungs, count]
-
-
-def is_dominated(trials: Sequence[FrozenTrial], number: int, step: int) -> bool:
-    """Whether enough of the trials that came as far beat a trial in every objective at the same step."""
-    name = step_name(step)
-    reported = {trial.number: trial.user_attrs[name] for trial in trials if name in trial.user_attrs}
-    rivals, own = np.array(list(reported.values())), reported[number]
-    better = ((rivals <= own).all(axis=1) & (rivals != own).any(axis=1)).sum()
-    return bool(better >= max(2, DOMINATED_SHARE * len(rivals)))
-
-
-def step_name(step: int) -> str:
-    """User attribute that holds a trial's values after so many instances; Optuna has none for several objectives."""
-    return f"values_after_{step}_instances"

@@ -37,7 +37,7 @@ from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.sanitise import HIDDEN, without_passwords
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.samplers import is_feasible
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, parse_instances
+from dynslam_bench.tuning.study_file import StudySpec
 
 EARLIER = "earlier"
 """User attribute of trials that an earlier study made: which, and whether by other code. They are no candidates."""
@@ -70,9 +70,9 @@ def count_states(study: optuna.Study) -> dict[str, int]:
     return dict(Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False)))
 
 
-def errors_of(trial: FrozenTrial) -> dict[ProblemInstance, float]:
-    """ATE in metres on each instance that a trial ran on."""
-    return {parse_instances(text)[0]: float(ate) for text, _, ate, *_ in trial.user_attrs.get("instances", [])}
+def extension_of(study: optuna.Study) -> dict[str, int]:
+    """Scenes and trials by which a study was extended."""
+    return {"scenes": 0, "trials": 0, **study.user_attrs.get("extension", {})}
 
 
 # A study's trials as a pandas frame: one row a trial.
@@ -236,13 +236,12 @@ def read_stored(folder: Path) -> tuple[StudySpec, Path]:
     ]
 
 
-def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:
+def load_study(results: Path, spec: StudySpec) -> optuna.Study:
     """Load a stored study.
 
     Args:
         results: The results folder.
         spec: The study.
-        **how: Further arguments of ``optuna.load_study``.
 
     Raises:
         StudyError: There is none; nothing is made then.
@@ -251,7 +250,7 @@ def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:
     if not spec.storage and not study_folder(results, spec).is_dir():
         raise absent
     try:
-        return optuna.load_study(study_name=spec.name, storage=open_storage(results, spec), **how)
+        return optuna.load_study(study_name=spec.name, storage=open_storage(results, spec))
     except KeyError as error:
         raise absent from error
 

@@ -27,6 +27,7 @@ from dynslam_bench.tuning import (
     Verdict,
     distributions,
     finish,
+    read_preset_text,
     read_study,
     run_study,
     search_space,
@@ -203,7 +204,7 @@ def test_a_study_does_not_go_on_after_its_data_changed(tmp_path: Path) -> None:
     truth.write_text("\n".join([*lines[:-1], lines[-1].replace(" 0.0", " 0.1", 1).replace(" 0 ", " 0.1 ", 1)]) + "\n")
     with pytest.raises(StudyError, match=r"stored with other content of \S*s1"):
         run_study(make(folders, trials=3), results=tmp_path / "r")
-    assert len(Study(spec, tmp_path / "r", reading=True).study.get_trials()) == 2
+    assert len(Study.open(spec, tmp_path / "r").study.get_trials()) == 2
 
 
 def test_a_study_of_older_code_can_be_read_but_not_continued(
@@ -214,12 +215,10 @@ def test_a_study_of_older_code_can_be_read_but_not_continued(
     monkeypatch.setattr("dynslam_bench.runs.identity.source_fingerprint", lambda *_: "newer")
     with pytest.raises(StudyError, match="stored with other code"):
         Study(spec, tmp_path)
-    reader = Study(spec, tmp_path, reading=True)
-    assert len(reader.study.get_trials()) == 2
-    with pytest.raises(StudyError, match="seeds"):
-        Study(make(sequences, seeds=[5]), tmp_path, reading=True)
+    assert len(Study.open(spec, tmp_path).study.get_trials()) == 2
+    assert 'status = "not judged"' in read_preset_text(spec, tmp_path)
     with pytest.raises(StudyError, match="there is no study 'toy'"):
-        Study(spec, tmp_path / "elsewhere", reading=True)
+        Study.open(spec, tmp_path / "elsewhere")
     assert not (tmp_path / "elsewhere" / "studies").exists(), "looking creates nothing"
 
 

@@ -115,40 +115,39 @@ def test_the_verdict_names_a_baseline_that_is_not_the_default_and_what_the_defau
 
 
 @pytest.mark.parametrize(
-    ("changes", "p_value", "notes", "verdict", "named"),
+    ("changes", "p_value", "verdict", "named"),
     [
-        ({}, 0.5, [], Verdict.PROVEN, "25.0 % less ATE: ATE x 0.750 [0.600, 0.900] on 6 scenes"),
-        ({}, 0.5, ["same"], Verdict.PROMISING, "not apart"),
-        ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "upper bound 1.200"),
-        ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "About 62 more scenes would settle it"),
-        ({"confirm": LUCKY.model_copy(update={"ratio": 1.07})}, 0.5, [], Verdict.PROMISING, "nobody can tell how many"),
-        ({"held_out": WIDE}, 0.5, [], Verdict.PROMISING, "About 60 more scenes would settle it"),
-        ({"held_out": None}, 0.5, [], Verdict.PROMISING, "fewer than 3 held-out scenes"),
-        ({"confirm": LUCKY, "held_out": WIDE}, 0.5, [], Verdict.NO_MATTER, "p = 0.50"),
-        ({"confirm": LUCKY, "held_out": WIDE}, 0.001, [], Verdict.PROMISING, "perhaps 10.0 % less"),
-        ({"confirm": LUCKY, "held_out": WIDE}, None, [], Verdict.PROMISING, "perhaps"),
-        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.001, [], Verdict.WORSE, "is not better"),
-        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.24, [], Verdict.NO_MATTER, "p = 0.24"),
-        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, None, [], Verdict.NOT_JUDGED, "cannot tell"),
-        ({"held_out": Ratio(ratio=1.5, low=1.1, high=2, n=8, sequences=4)}, 0.5, [], Verdict.WORSE, "50.0 % more ATE"),
-        ({"recorded": Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)}, 0.5, [], Verdict.WORSE, "recordings"),
-        ({"held_out": Ratio(ratio=0.98, low=0.96, high=1.001, n=8, sequences=4)}, 0.001, [], Verdict.NO_MATTER,
+        ({}, 0.5, Verdict.PROVEN, "25.0 % less ATE: ATE x 0.750 [0.600, 0.900] on 6 scenes"),
+        ({"confirm": LUCKY}, 0.5, Verdict.PROMISING, "upper bound 1.200"),
+        ({"confirm": LUCKY}, 0.5, Verdict.PROMISING, "About 62 more scenes would settle it"),
+        ({"confirm": LUCKY.model_copy(update={"ratio": 1.07})}, 0.5, Verdict.PROMISING, "nobody can tell how many"),
+        ({"held_out": WIDE}, 0.5, Verdict.PROMISING, "About 60 more scenes would settle it"),
+        ({"held_out": None}, 0.5, Verdict.PROMISING, "fewer than 3 held-out scenes"),
+        ({"confirm": LUCKY, "held_out": WIDE}, 0.5, Verdict.NO_MATTER, "p = 0.50"),
+        ({"confirm": LUCKY, "held_out": WIDE}, 0.001, Verdict.PROMISING, "perhaps 10.0 % less"),
+        ({"confirm": LUCKY, "held_out": WIDE}, None, Verdict.PROMISING, "perhaps"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.001, Verdict.WORSE, "is not better"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.24, Verdict.NO_MATTER, "p = 0.24"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, None, Verdict.NOT_JUDGED, "cannot tell"),
+        ({"held_out": Ratio(ratio=1.5, low=1.1, high=2, n=8, sequences=4)}, 0.5, Verdict.WORSE, "50.0 % more ATE"),
+        ({"recorded": Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)}, 0.5, Verdict.WORSE, "recordings"),
+        ({"held_out": Ratio(ratio=0.98, low=0.96, high=1.001, n=8, sequences=4)}, 0.001, Verdict.NO_MATTER,
          "gains at most 4.0 %"),
-        ({"confirm": LUCKY, "held_out": TINY}, 0.001, [], Verdict.NO_MATTER, "below 5 % is not worth more scenes"),
-        ({"held_out": TINY}, 0.001, [], Verdict.PROMISING, "below 5 % is not worth more scenes"),
-        ({"feasible": False}, 0.5, [], Verdict.WORSE, "constraint"),
-        ({**SPEED, "on_confirm": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
-        ({**SPEED, "on_confirm": accuracy(1), "on_held_out": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
-        ({"confirm": None}, 0.5, [], Verdict.NOT_JUDGED, "no frames are left"),
-        ({"confirm": CONFIRM.model_copy(update={"sequences": 2}), "held_out": None}, 0.5, [], Verdict.NOT_JUDGED,
+        ({"confirm": LUCKY, "held_out": TINY}, 0.001, Verdict.NO_MATTER, "below 5 % is not worth more scenes"),
+        ({"held_out": TINY}, 0.001, Verdict.PROMISING, "below 5 % is not worth more scenes"),
+        ({"feasible": False}, 0.5, Verdict.WORSE, "constraint"),
+        ({**SPEED, "on_confirm": accuracy(1.1)}, 0.5, Verdict.PROMISING, "below 1.05"),
+        ({**SPEED, "on_confirm": accuracy(1), "on_held_out": accuracy(1.1)}, 0.5, Verdict.PROMISING, "below 1.05"),
+        ({"confirm": None}, 0.5, Verdict.NOT_JUDGED, "no frames are left"),
+        ({"confirm": CONFIRM.model_copy(update={"sequences": 2}), "held_out": None}, 0.5, Verdict.NOT_JUDGED,
          "2 scenes only"),
-        ({"failed": "it broke"}, 0.5, [], Verdict.NOT_JUDGED, "it broke"),
+        ({"failed": "it broke"}, 0.5, Verdict.NOT_JUDGED, "it broke"),
     ],
 )  # fmt: skip
 def test_the_verdict_is_one_of_five_with_the_numbers(
-    changes: dict[str, object], p_value: float | None, notes: list[str], verdict: Verdict, named: str
+    changes: dict[str, object], p_value: float | None, verdict: Verdict, named: str
 ) -> None:
-    given, text = judge([candidate(0.6, 0.75, 0.9, **changes)], p_value, notes)
+    given, text = judge([candidate(0.6, 0.75, 0.9, **changes)], p_value)
     assert (given, text.startswith(verdict.value.capitalize())) == (verdict, True) and named in text
     assert max(len(sentence.split()) for sentence in text.split(". ")) <= 34
     assert judge([])[0] == Verdict.NOT_JUDGED
@@ -202,9 +201,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return [str(toy_tracker.make_sequence(root / f"s{i}", 0.8 * i)) for i in range(5)]
 
 
-def test_a_study_is_a_frame(
-    folders: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_is_a_frame(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = StudySpec.model_validate({
         "name": "toy", "tracker": TRACKER, "tune": folders[:1], "held_out": folders[1:], "trials": 5, "top": 1,
         "sampler": "random", "sampler_seed": 3, "pruner": "none", "min_coverage": 0.5, "recorded": [],
@@ -217,8 +214,7 @@ def test_a_study_is_a_frame(
     assert summary.conclusion in page and "dynslam-bench tune run 'my study.toml'" in page
     assert ("Use them" in page) == (summary.verdict == Verdict.PROVEN)
     assert StudySummary.read(tuner.folder / "summary.json").conclusion == summary.conclusion
-    monkeypatch.setattr("dynslam_bench.tuning.read_study", lambda path: spec)
-    status(Path("toy.toml"), tmp_path)
+    status(tuner.folder)
     shown = capsys.readouterr().out
     assert summary.best is not None and summary.conclusion in shown, "status names the trial of best.toml"
     assert re.search(rf"best_trial +{summary.best.trial}\n", shown)
