@@ -109,12 +109,12 @@ def compared(outcomes: Outcomes, baseline: Outcomes, *, objective: Objective = A
     scenes = objective.ratios(outcomes, baseline)
     sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, baseline)
     sample = objective.counted(sample)
-    known = {"ratio": _ratio(centre(sample)), "n": len(outcomes), "sequences": len(scenes), "what": objective.what}
+    ratio = Ratio(ratio=_ratio(centre(sample)), n=len(outcomes), sequences=len(scenes), what=objective.what)
     if len(sample) < 2:
-        return Ratio(**known)
+        return ratio
     low, high = map(_ratio, bounds(sample))
     bound = _ratio(bounds(sample, 1 - ERROR / candidates)[1])
-    return Ratio(**known, low=low, high=high, bound=bound, spread=float(np.std(sample, ddof=1)))
+    return ratio.model_copy(update={"low": low, "high": high, "bound": bound, "spread": float(np.std(sample, ddof=1))})
 
 
 def _ratio(logarithm: float) -> float:
