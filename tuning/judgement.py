@@ -147,8 +147,6 @@ class Candidate(Record):
         on_confirm: ATE and processor time on the instances for the choice, by objective.
         on_held_out: The same on the held-out split.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of errors.
-        frame_ms: Mean milliseconds a frame, timed without the stage cache.
-        baseline_frame_ms: The same of the baseline.
         feasible: Whether the constraints hold in the new runs.
         failed: Why it could not be run again; empty if it could.
     """
@@ -162,8 +160,6 @@ class Candidate(Record):
     on_confirm: dict[str, Ratio] = Field(default_factory=dict)
     on_held_out: dict[str, Ratio] = Field(default_factory=dict)
     ate_margin: float | None = None
-    frame_ms: float | None = None
-    baseline_frame_ms: float | None = None
     feasible: bool = True
     failed: str = ""
 
@@ -455,14 +451,9 @@ def _judge(
                 both = (ACCURACY, SPEED)
                 update[f"on_{split}"] = {one.name: compared(outcomes, baseline, objective=one) for one in both}
             if split == "confirm":
-                update |= {"frame_ms": _frame_ms(outcomes), "baseline_frame_ms": _frame_ms(baseline)}
                 update["feasible"] = all(value <= 0 for value in violations(tuner.spec, outcomes).values())
         judged.append(candidate.model_copy(update=update))
     return judged
-
-
-def _frame_ms(outcomes: Outcomes) -> float:
-    return 1e3 * float(np.mean([outcome.frame_s for outcome in outcomes.values()]))
 
 
 def read_preset_text(spec: StudySpec, results: Path | str = "results", trial: int | None = None) -> str:

@@ -83,16 +83,11 @@ def outcome(
         raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
     evaluation = score(store, record, protocol).online
     ate = static_camera_m(instance, data_root) if evaluation is None else float(evaluation.metrics["ate_rmse_m"])
-    total = record.timings["total"].mean_s
+    total, elsewhere = record.timings["total"], record.device.startswith("cuda") or FOREIGN in record.timings
+    processor = total if elsewhere else record.timings.get("processor", total)
     period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
-    return Outcome(instance, record.run_id, ate, record.coverage, total, processor_seconds(record), period / total)
-
-
-def processor_seconds(record: RunRecord) -> float:
-    """Mean processor seconds a frame of a run; its frame time where the work is not that of its own process."""
-    own = record.timings.get("processor")
-    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
-    return record.timings["total"].mean_s if own is None or elsewhere else own.mean_s
+    times = (total.mean_s, processor.mean_s, period / total.mean_s)
+    return Outcome(instance, record.run_id, ate, record.coverage, *times)
 
 
 def held_protocol(protocol: Protocol | str) -> Protocol:

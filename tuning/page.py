@@ -244,11 +244,6 @@ def _candidates(summary: StudySummary) -> Table:
             return TableCell()
         return TableCell(f"{value.ratio:.3f}", f"{value.interval} n={value.n}".strip(), value.ratio)
 
-    def time(candidate: Candidate) -> TableCell:
-        if candidate.frame_ms is None:
-            return TableCell()
-        return TableCell(f"{candidate.frame_ms:.1f}", f"baseline {candidate.baseline_frame_ms:.1f}", candidate.frame_ms)
-
     rows = [
         [
             TableCell(
@@ -261,7 +256,7 @@ def _candidates(summary: StudySummary) -> Table:
             number(candidate.bound if math.isfinite(candidate.bound) else None, ".3f"),
             ratio(candidate.held_out),
             ratio(candidate.recorded),
-            time(candidate),
+            ratio(candidate.on_confirm.get("speed")),
             TableCell(candidate.failed or ("yes" if candidate.feasible else "no")),
         ]
         for candidate in summary.candidates
@@ -270,7 +265,7 @@ def _candidates(summary: StudySummary) -> Table:
         "Ratios to the baseline on the same instances: the median of a scene's starts, the mean over scenes (trimmed "
         "from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on instances "
         "that no trial saw is the best, chosen where that bound lies below 1; held-out instances and recordings "
-        f"judge it. Frame times without the stage cache. {seen_note(summary.seen)}"
+        f"judge it. Processor times are on unseen instances, without the stage cache. {seen_note(summary.seen)}"
     )
     optimistic = "the trial's own value, optimistic: the trial was selected for it"
     widened = "upper end of an interval that is wider than 95 % for the number of candidates (Bonferroni)"
@@ -278,7 +273,7 @@ def _candidates(summary: StudySummary) -> Table:
         summary, ("in the trial", "tune"), ("unseen instances", "confirm"), ("held-out", "held_out")
     )
     columns = [Column("trial"), Column(tune, meaning=optimistic), *numbers(confirm)]
-    columns += [Column("upper bound", meaning=widened), *numbers(held_out, "recorded", "frame ms")]
+    columns += [Column("upper bound", meaning=widened), *numbers(held_out, "recorded", "processor time")]
     columns += [Column("constraints hold", numeric=False)]
     return Table("candidates", "The best trials, judged again", caption, columns, rows)
 

@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, wraps
-from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -46,20 +45,17 @@ EARLIER = "earlier"
 def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     """The best complete trials that fulfil the constraints, without repeats of the same settings.
 
-    With several objectives the front: the best in the first one, the best in the second, and so on in turn. If no trial
-    is feasible, the least bad ones. Where they are too few, pruned ones follow, those that came furthest first.
+    Several objectives count together (geometric mean of their ratios). If no trial is feasible, the least bad ones.
+    Where they are too few, pruned ones follow, those that came furthest first.
     """
     trials = [trial for trial in study.get_trials(deepcopy=False) if EARLIER not in trial.user_attrs]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     candidates = [trial for trial in complete if is_feasible(trial)] or complete
-    if len(study.directions) > 1:
-        front = {trial.number for trial in study.best_trials}
-        candidates = [trial for trial in candidates if trial.number in front] or candidates
-    orders = [sorted(candidates, key=lambda trial: trial.values[at]) for at in range(len(study.directions))]
     pruned = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.user_attrs.get("scenes")]
+    candidates.sort(key=lambda trial: sum(trial.values))
     pruned.sort(key=lambda trial: (-len(trial.user_attrs["instances"]), centre(trial.user_attrs["scenes"].values())))
     distinct: list[FrozenTrial] = []
-    for trial in chain(chain.from_iterable(zip(*orders, strict=True)), pruned):
+    for trial in [*candidates, *pruned]:
         if all(trial.params != other.params for other in distinct):
             distinct.append(trial)
     return distinct[:count]

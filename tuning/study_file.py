@@ -269,7 +269,7 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
     return tuple(given)
 
 
-SamplerName = Literal["tpe", "random", "nsga2", "gp", "emfoa"]
+SamplerName = Literal["tpe", "random", "nsga2", "gp"]
 PrunerName = Literal["halving", "wilcoxon", "none"]
 EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
 """Objectives that hold the error themselves."""
