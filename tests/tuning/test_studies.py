@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -71,9 +70,6 @@ def test_a_study_finds_the_known_optimum(sequences: list[str], tmp_path: Path) -
     page = write_page(tuner, summary).read_text()
     assert "Use them" not in page and "not recommended: not judged" in page and "https://" not in page
     assert 'class="verdict amber"' in page and "<h3>History</h3>" in page
-    linked = set(re.findall(r'"run\.html#(\w+)"', page))
-    assert len(linked) > 5 and (tuner.folder / "run.html").is_file(), "trials lead to their runs"
-    assert all((tuner.folder / "data" / f"run-{run_id}.js").is_file() for run_id in linked)
     preset = read_settings(tuner.folder / "best.toml")
     assert set(preset) == {"gain", "wobble"} and abs(math.log(preset["gain"])) < math.log(1.3)
 
