@@ -10,7 +10,8 @@ rtf  # on Outcome, for objectives of one's own (docs/how-to/study.md)
 compile_kernels  # cli.demo: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 
-_restore_optimizer  # tuning.samplers: Optuna calls it, in place of its own
+moth_positions  # flow.moth_flame: the equations as they read, beside the kernel that a test compares with them
+opposites  # flow.moth_flame: the same
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry

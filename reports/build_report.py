@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -500,9 +501,11 @@ def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
     )
     if missing := missing_commands(board):
         section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(missing)))
-    notes = [
-        f"{board.labels[r.variant_key]} on {board.sequence(r)}, {r.repeat}: {n}" for r in board.rows for n in r.notes
-    ]
+    places = defaultdict[str, list[str]](list)
+    for row in board.rows:
+        for text in row.notes:
+            places[text].append(f"{board.labels[row.variant_key]} on {board.sequence(row)}, {row.repeat}")
+    notes = [f"{text}: {'; '.join(first_of(runs, 2, 'and {} more'))}" for text, runs in places.items()]
     for title, entries, others in (
         ("Left out: no valid record", loaded.unreadable, "... and {} more, which `runs list` names"),
         ("Diagnostics", notes, "... and {} more on the pages of the runs"),
@@ -594,7 +597,7 @@ def publish(
     output = output.expanduser().absolute()
     for study in studies:
         if not (study / STUDY_PAGE).is_file():
-            raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune report STUDY.toml")
+            raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune run STUDY.toml")
     for part in ("leaderboard/data", "leaderboard/csv", "leaderboard/frames", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(

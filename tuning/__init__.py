@@ -14,22 +14,32 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.objectives import Outcome
     from dynslam_bench.tuning.page import write_page
     from dynslam_bench.tuning.plan import Plan, Preview, distributions, search_space
-    from dynslam_bench.tuning.samplers import EmfoaSampler
     from dynslam_bench.tuning.study import Evaluation, Study, StudyEvent, run_study
     from dynslam_bench.tuning.study_file import ProblemInstance, SpaceSpec, StudySpec, parse_instances, read_study
 
 _HOMES = {
-    "judgement": ("StudySummary", "Verdict", "finish", "read_preset_text"),
-    "objectives": ("Outcome",),
-    "page": ("write_page",),
-    "plan": ("Plan", "Preview", "distributions", "search_space"),
-    "samplers": ("EmfoaSampler",),
-    "study": ("Evaluation", "Study", "StudyEvent", "run_study"),
-    "study_file": ("ProblemInstance", "SpaceSpec", "StudySpec", "parse_instances", "read_study"),
+    "Evaluation": "study",
+    "Outcome": "objectives",
+    "Plan": "plan",
+    "Preview": "plan",
+    "ProblemInstance": "study_file",
+    "SpaceSpec": "study_file",
+    "Study": "study",
+    "StudyEvent": "study",
+    "StudySpec": "study_file",
+    "StudySummary": "judgement",
+    "Verdict": "judgement",
+    "distributions": "plan",
+    "finish": "judgement",
+    "parse_instances": "study_file",
+    "read_preset_text": "judgement",
+    "read_study": "study_file",
+    "run_study": "study",
+    "search_space": "plan",
+    "write_page": "page",
 }
 
 __all__ = [
-    "EmfoaSampler",
     "Evaluation",
     "Outcome",
     "Plan",
@@ -54,9 +64,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for; Optuna takes its time."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    for home, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{home}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -9,13 +9,13 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from optuna.trial import TrialState
 from pydantic import Field
 
-from dynslam_bench.core.errors import StudyError, did_you_mean
+from dynslam_bench.core.errors import StudyError
 from dynslam_bench.core.reading import read_text
 from dynslam_bench.core.records import Record, write_atomic
 from dynslam_bench.tuning.objectives import (
@@ -33,21 +33,20 @@ from dynslam_bench.tuning.objectives import (
     scenes_needed,
     spread_test,
     together,
-    upper,
     violations,
 )
-from dynslam_bench.tuning.plan import Plan
+from dynslam_bench.tuning.plan import held_settings
 from dynslam_bench.tuning.splits import seen_note, splits_seen
-from dynslam_bench.tuning.storage import Importance, best_trials, count_states, importances, scene_ratios, study_folder
-from dynslam_bench.tuning.study import Study
+from dynslam_bench.tuning.storage import Importance, best_trials, count_states, importances, scene_ratios
+from dynslam_bench.tuning.study import StoredStudy, Study
 from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec
 
 _LARGEST_LOG = 700.0
 """Larger logarithms overflow."""
 NEGLIGIBLE = 0.05
 """A gain that is surely smaller than this share does not matter."""
-FALSE_CHOICES = 0.05
-"""At most this share of the studies in which nothing is better may choose something."""
+ERROR = 0.05
+"""Of an interval, half of it at either end: at most 2.5 % of the studies without anything better choose something."""
 
 
 class Ratio(Record):
@@ -60,14 +59,14 @@ class Ratio(Record):
         high: Upper end.
         n: Paired runs.
         sequences: How many scenes they come from.
-        bound: One-sided upper bound, wide enough for the number of candidates compared; None for a single run.
+        bound: Upper end of an interval that is wide enough for all candidates compared; None for a single run.
         spread: Standard deviation of the logarithm over what the interval is over; None for a single run.
         what: What the ratio is one of.
     """
 
     ratio: float
-    low: float | None
-    high: float | None
+    low: float | None = None
+    high: float | None = None
     n: int
     sequences: int
     bound: float | None = None
@@ -110,17 +109,12 @@ def compared(outcomes: Outcomes, baseline: Outcomes, *, objective: Objective = A
     scenes = objective.ratios(outcomes, baseline)
     sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, baseline)
     sample = objective.counted(sample)
-    interval = bounds(sample)
-    return Ratio(
-        ratio=_ratio(centre(sample)),
-        low=None if interval is None else _ratio(interval[0]),
-        high=None if interval is None else _ratio(interval[1]),
-        bound=None if interval is None else _ratio(upper(sample, 1 - FALSE_CHOICES / candidates)),
-        spread=None if interval is None else float(np.std(sample, ddof=1)),
-        n=len(outcomes),
-        sequences=len(scenes),
-        what=objective.what,
-    )
+    ratio = Ratio(ratio=_ratio(centre(sample)), n=len(outcomes), sequences=len(scenes), what=objective.what)
+    if len(sample) < 2:
+        return ratio
+    low, high = map(_ratio, bounds(sample))
+    bound = _ratio(bounds(sample, 1 - ERROR / candidates)[1])
+    return ratio.model_copy(update={"low": low, "high": high, "bound": bound, "spread": float(np.std(sample, ddof=1))})
 
 
 def _ratio(logarithm: float) -> float:
@@ -148,13 +142,11 @@ class Candidate(Record):
         params: The tuned settings.
         values: What its trial had been worth.
         confirm: On the instances for the choice, which no trial had seen.
-        held_out: On the held-out split; None without one, or if it is neither the best nor a pick.
-        recorded: ATE on recordings; None without any, or if it is neither the best nor a pick.
+        held_out: On the held-out split; None without one, or if it is not the best.
+        recorded: ATE on recordings; None without any, or if it is not the best.
         on_confirm: ATE and processor time on the instances for the choice, by objective.
         on_held_out: The same on the held-out split.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of errors.
-        frame_ms: Mean milliseconds a frame, timed without the stage cache.
-        baseline_frame_ms: The same of the baseline.
         feasible: Whether the constraints hold in the new runs.
         failed: Why it could not be run again; empty if it could.
     """
@@ -168,8 +160,6 @@ class Candidate(Record):
     on_confirm: dict[str, Ratio] = Field(default_factory=dict)
     on_held_out: dict[str, Ratio] = Field(default_factory=dict)
     ate_margin: float | None = None
-    frame_ms: float | None = None
-    baseline_frame_ms: float | None = None
     feasible: bool = True
     failed: str = ""
 
@@ -210,7 +200,7 @@ class StudySummary(Record):
         trials: Trials by state.
         candidates: The best configurations, judged again; the best one, whose settings became the preset, first.
         verdict: What the study says of the best candidate.
-        conclusion: One sentence, see `judge`.
+        conclusion: A few short sentences, see `judge`.
         p_value: Of the test whether the settings matter at all (`objectives.spread_test`); None without a test.
         shipped: The default settings, where the baseline is something else, on ``confirm`` and ``held_out``.
         importances: Optuna's importances of the parameters, see `storage.importances`.
@@ -218,8 +208,6 @@ class StudySummary(Record):
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
-        picks: Presets of the study by name, and the trial of each; None where the baseline is the pick.
-        split_notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
         seen: Splits with scenes that the network behind the masks was trained on, see `splits.seen_note`.
     """
 
@@ -238,8 +226,6 @@ class StudySummary(Record):
     confirm: list[str] = Field(default_factory=list)
     held_out: list[str] = Field(default_factory=list)
     recorded: list[str] = Field(default_factory=list)
-    picks: dict[str, int | None] = Field(default_factory=dict)
-    split_notes: list[str] = Field(default_factory=list)
     seen: list[str] = Field(default_factory=list)
 
     @property
@@ -256,30 +242,28 @@ class StudySummary(Record):
 def judge(
     candidates: Sequence[Candidate],
     p_value: float | None = None,
-    split_notes: Sequence[str] = (),
     failures: Sequence[str] = (),
 ) -> tuple[Verdict, str]:
-    """The verdict on the first, best candidate, and one sentence with its numbers.
+    """The verdict on the first, best candidate, and a few short sentences with its numbers.
 
     *Proven*: it was chosen, the whole interval on held-out scenes lies below 1, nothing is lost of accuracy where that
-    is asked, recordings are not worse and the splits are apart. *Worse*: an interval lies above 1, a constraint fails,
+    is asked, and recordings are not worse. *Worse*: an interval lies above 1, a constraint fails,
     or the settings matter and the estimate is not below 1. *Does not matter here*: the trials differ by no more than
-    chance (`objectives.spread_test`), or the whole interval lies above 1 - `NEGLIGIBLE`.
-    *Promising* is what is left.
+    chance (`objectives.spread_test`), or the whole interval lies above 1 - `NEGLIGIBLE`, or the estimate does and
+    nothing was chosen. *Promising* is what is left.
 
     Args:
         candidates: The best one first.
         p_value: Of `objectives.spread_test`.
-        split_notes: How the splits are not apart, where the study accepts that.
         failures: Why trials failed, said where no trial did better.
     """
-    verdict, text = _judged(candidates, p_value, split_notes)
+    verdict, text = _judged(candidates, p_value)
     if not candidates and failures:
         text += f"; {len(failures)} failed, the first one as {failures[0]}"
-    return verdict, f"{verdict.value.capitalize()}: {text}.{_apart(split_notes)}"
+    return verdict, f"{verdict.value.capitalize()}: {text}."
 
 
-def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes: Sequence[str]) -> tuple[Verdict, str]:
+def _judged(candidates: Sequence[Candidate], p_value: float | None) -> tuple[Verdict, str]:
     if not candidates:
         return Verdict.NOT_JUDGED, "no trial with other settings came to its end"
     best = candidates[0]
@@ -298,28 +282,39 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None, split_notes:
         return Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"
     if ratio.shows_loss:
         return Verdict.WORSE, f"{name} has {100 * (ratio.ratio - 1):.1f} % more {ratio.what}: {numbers}"
-    gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}"
-    unsettled = _unsettled(best, split_notes)
+    gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}: {numbers}"
+    unsettled = _unsettled(best)
     if not unsettled:
-        return Verdict.PROVEN, f"{name} has {gain}: {numbers}"
+        return Verdict.PROVEN, f"{name} has {gain}"
     luck = not best.chosen or ratio.ratio >= 1
     if p_value is not None and p_value > MATTER_LEVEL and luck and not ratio.shows_gain:
         return Verdict.NO_MATTER, (
             f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}, level "
-            f"{MATTER_LEVEL}); the best, {name}, has {numbers}"
+            f"{MATTER_LEVEL}). The best, {name}, has {numbers}"
         )
     if ratio.low is not None and 1 - NEGLIGIBLE < ratio.low and ratio.ratio < 1:
         return Verdict.NO_MATTER, f"the best, {name}, gains at most {100 * (1 - ratio.low):.1f} %: {numbers}"
     if ratio.ratio >= 1:
         text = f"the best, {name}, is not better than the baseline: {numbers}"
         if p_value is None:
-            return Verdict.NOT_JUDGED, f"{text}; one trial or one scene cannot tell whether settings matter"
+            return Verdict.NOT_JUDGED, f"{text}. One trial or one scene cannot tell whether settings matter"
         return Verdict.WORSE, f"the settings matter, but {text}"
+    if ratio.ratio > 1 - NEGLIGIBLE and not best.chosen and not ratio.shows_gain:
+        return Verdict.NO_MATTER, f"the best, {name}, has perhaps {gain}. {_NOT_WORTH}"
+    return Verdict.PROMISING, f"{name} has perhaps {gain}. It is not proven: {unsettled}. {_more_scenes(best, ratio)}"
+
+
+_NOT_WORTH = f"A gain below {100 * NEGLIGIBLE:.0f} % is not worth more scenes"
+
+
+def _more_scenes(best: Candidate, ratio: Ratio) -> str:
+    """How many more scenes would settle a promising candidate."""
+    if best.confirm is None or best.confirm.ratio >= 1:
+        return f"As it has {best.confirm} where it was chosen, nobody can tell how many more scenes would settle it"
+    if ratio.ratio > 1 - NEGLIGIBLE:
+        return _NOT_WORTH
     missing = max(part.missing for part in ([ratio] if best.chosen else [ratio, best.confirm]))
-    more = f"about {missing} more scene{'s' * (missing != 1)} would settle it"
-    if best.confirm.ratio >= 1:
-        more = f"and as it has {best.confirm} there, nobody can tell how many more scenes would settle it"
-    return Verdict.PROMISING, f"{name} has perhaps {gain}: {numbers}; {unsettled}, {more}"
+    return f"About {missing} more scene{'s' * (missing != 1)} would settle it"
 
 
 def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate | None) -> str:
@@ -338,10 +333,8 @@ def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate 
     return f" Ratios are to {baseline}; the default settings have {shipped[split]} there{keep}."
 
 
-def _unsettled(best: Candidate, split_notes: Sequence[str]) -> str:
+def _unsettled(best: Candidate) -> str:
     """Why the best candidate is not proven; empty if it is."""
-    if split_notes:
-        return "the splits are not apart"
     if not best.nothing_lost(best.on_confirm) or not best.nothing_lost(best.on_held_out or best.on_confirm):
         return f"it is not shown to be as accurate (the bound has to lie below {1 + (best.ate_margin or 0.0):.2f})"
     if not best.chosen:
@@ -355,64 +348,12 @@ def _scenes(ratio: Ratio) -> str:
     return f"{ratio.sequences} scene{'s' * (ratio.sequences != 1)}"
 
 
-def worth(name: str, candidate: Candidate | None, split_notes: Sequence[str]) -> str:
-    """The value of a preset, in one sentence.
-
-    Args:
-        name: Of the preset.
-        candidate: Whose settings it holds, judged; None for the baseline's.
-        split_notes: How the splits are not apart, where the study accepts that.
-    """
-    if candidate is None:
-        return f"The '{name}' pick is the baseline: no trial was surely better than it."
-    parts = [
-        f"{split}: {ratios['accuracy']}, {ratios['speed']}"
-        for split, ratios in (("where it was chosen", candidate.on_confirm), ("held out", candidate.on_held_out))
-        if ratios
-    ]
-    if candidate.recorded is not None:
-        parts.append(f"recorded: {candidate.recorded}")
-    if candidate.failed:
-        parts.append(f"failed when it was judged: {candidate.failed}")
-    return f"The '{name}' pick is trial {candidate.trial} ({'; '.join(parts)}).{_apart(split_notes)}"
-
-
-def _apart(split_notes: Sequence[str]) -> str:
-    return f" THE SPLITS ARE NOT APART: {'; '.join(split_notes)}." if split_notes else ""
-
-
-# Picks: the fast, the balanced and the accurate one of a study's best trials.
-
-PickName = Literal["fast", "balanced", "accurate"]
-PICKS: tuple[PickName, ...] = get_args(PickName)
-
-
-def pick(name: PickName, candidates: Sequence[Candidate], margin: float) -> Candidate | None:
-    """A study's pick; None stands for the baseline.
-
-    Args:
-        name: ``fast``: the least processor time at (nearly) the baseline's accuracy; ``accurate``: the least ATE;
-            ``balanced``: the least of the study's objectives together, at (nearly) the baseline's accuracy.
-        candidates: The trials to choose from, feasible ones.
-        margin: What may be lost of accuracy, as a share.
-    """
-    asked = 1 + margin if name != "accurate" else math.inf
-    accurate = [candidate for candidate in candidates if _bound(candidate.on_confirm["accuracy"]) < asked]
-    objective = {"fast": "speed", "accurate": "accuracy"}.get(name)
-
-    def bound(candidate: Candidate) -> float:
-        return _bound(candidate.confirm if objective is None else candidate.on_confirm[objective])
-
-    best = min(accurate, key=bound, default=None)
-    return best if best is not None and bound(best) < 1 else None
-
-
 def _bound(ratio: Ratio | None) -> float:
     return math.inf if ratio is None or ratio.bound is None else ratio.bound
 
 
 def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1) -> StudySummary:
-    """Judge the best trials on the `confirm` instances and the best of them on the others, write preset and summary.
+    """Judge the best trials on the `confirm` instances and the best of them on the others; write preset and summary.
 
     The best has the smallest upper confidence bound of its ratio to the baseline on `confirm`, allowing for the number
     of candidates; where that bound lies below 1 it is the choice. The held-out split and the recordings only judge.
@@ -441,23 +382,17 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
         for trial in best
     ]
     if best and design.confirm:
-        numbers = " and ".join(str(trial.number) for trial in best)
-        note(
-            f"the baseline and trial{'s' * (len(best) > 1)} {numbers} on {len(design.confirm)} instances that no trial "
-            "has seen"
-        )
+        note(f"the baseline and {len(best)} trials on {len(design.confirm)} instances that no trial has seen")
     candidates = _judge(tuner, "confirm", candidates, jobs, shipped)
     candidates.sort(key=lambda candidate: (candidate.bound, bool(candidate.failed), not candidate.feasible))
-    picks = _picks(spec, candidates)
-    for place, candidate in enumerate(candidates):
-        if design.confirm and not candidate.failed and (place == 0 or candidate.trial in picks.values()):
-            note(f"trial {candidate.trial} on the held-out instances")
-            for split in ("held_out", "recorded"):
-                (candidates[place],) = _judge(tuner, split, [candidates[place]], jobs, shipped)
+    if candidates and design.confirm and not candidates[0].failed:
+        note(f"trial {candidates[0].trial} on the held-out instances")
+        for split in ("held_out", "recorded"):
+            candidates[:1] = _judge(tuner, split, candidates[:1], jobs, shipped)
     ratios = scene_ratios(tuner.study)
-    p_value, notes = spread_test(list(ratios.values())), list(design.notes)
+    p_value = spread_test(list(ratios.values()))
     reasons = [trial.user_attrs.get("reason", "") for trial in tuner.study.get_trials(states=(TrialState.FAIL,))]
-    verdict, conclusion = judge(candidates, p_value, notes, reasons)
+    verdict, conclusion = judge(candidates, p_value, reasons)
     conclusion += beside_default(spec.baseline, shipped, candidates[0] if candidates else None)
     summary = StudySummary(
         name=spec.name,
@@ -470,17 +405,22 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
         conclusion=conclusion,
         p_value=p_value,
         shipped=shipped,
-        split_notes=notes,
         importances=importances(tuner.study),
         confirm=list(map(str, design.confirm)),
         held_out=list(map(str, design.held_out)),
         recorded=list(map(str, design.recorded)),
         tune=list(map(str, design.tune)),
-        picks=picks,
         seen=splits_seen(tuner.defaults, design),
     )
-    for name, number in picks.items():
-        write_atomic(tuner.folder / f"{name}.toml", _preset_of(tuner, summary, name, number))
+    text = preset_text(
+        spec,
+        summary.best.params if summary.best else {},
+        " ".join(filter(None, (conclusion, seen_note(summary.seen)))),
+        status=verdict.value,
+        tuned_on=[*summary.tune, *summary.confirm],
+        judged_on=[*summary.held_out, *summary.recorded],
+    )
+    write_atomic(tuner.folder / "best.toml", text)
     write_atomic(tuner.folder / "summary.json", summary.to_json())
     return summary
 
@@ -499,9 +439,7 @@ def _judge(
     objective = ACCURACY if split == "recorded" else together(tuner.objectives)
     tuned = [Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params}) for candidate in candidates]
     default = [] if tuner.shipped is None else [tuner.shipped]
-    baseline, *runs = tuner.evaluate_beside([tuner.baseline, *tuned, *default], instances, jobs=jobs)
-    if isinstance(baseline, InstanceFailedError):
-        raise StudyError(f"the baseline fails: {baseline.args[0]}", "a study needs one that runs")
+    baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
         shipped[split] = compared(outcomes, baseline, objective=objective)
     judged = []
@@ -513,78 +451,40 @@ def _judge(
                 both = (ACCURACY, SPEED)
                 update[f"on_{split}"] = {one.name: compared(outcomes, baseline, objective=one) for one in both}
             if split == "confirm":
-                update |= {"frame_ms": _frame_ms(outcomes), "baseline_frame_ms": _frame_ms(baseline)}
                 update["feasible"] = all(value <= 0 for value in violations(tuner.spec, outcomes).values())
         judged.append(candidate.model_copy(update=update))
     return judged
 
 
-def _picks(spec: StudySpec, candidates: Sequence[Candidate]) -> dict[str, int | None]:
-    """Which trial is which preset: of a study of several objectives four, else the best alone."""
-    picks = {"best": candidates[0] if candidates else None}
-    if len(spec.objectives) > 1:
-        feasible = [candidate for candidate in candidates if candidate.feasible and candidate.confirm is not None]
-        picks |= {name: pick(name, feasible, spec.ate_margin) for name in PICKS}
-    return {name: None if candidate is None else candidate.trial for name, candidate in picks.items()}
-
-
-def _frame_ms(outcomes: Outcomes) -> float:
-    return 1e3 * float(np.mean([outcome.frame_s for outcome in outcomes.values()]))
-
-
-def _preset_of(tuner: Study, summary: StudySummary, name: str, number: int | None) -> str:
-    """A pick as a preset: tuned settings with what they are worth and where that was seen."""
-    candidate = next((one for one in summary.candidates if one.trial == number), None)
-    remark = summary.conclusion if name == "best" else worth(name, candidate, summary.split_notes)
-    return preset_text(
-        tuner,
-        {} if candidate is None else candidate.params,
-        " ".join(filter(None, (remark, seen_note(summary.seen)))),
-        status=summary.verdict.value if candidate is summary.best else Verdict.NOT_JUDGED.value,
-        tuned_on=[*summary.tune, *summary.confirm],
-        judged_on=[*summary.held_out, *summary.recorded] if candidate is not None else (),
-    )
-
-
-def read_preset_text(
-    spec: StudySpec, results: Path | str = "results", pick: str = "best", trial: int | None = None
-) -> str:
-    """A preset of a study, as text; of one that is not finished the best trial so far.
+def read_preset_text(spec: StudySpec, results: Path | str = "results", trial: int | None = None) -> str:
+    """The preset of a study, as text; of one that is not finished the best trial so far.
 
     Args:
         spec: The study.
         results: The results folder.
-        pick: ``best``; of a study of several objectives ``fast``, ``balanced`` and ``accurate``, too.
         trial: The number of a trial whose settings are asked for instead.
 
     Raises:
-        StudyError: There is no such study, preset or trial.
+        StudyError: There is no such study or trial.
     """
-    folder = study_folder(Path(results), spec)
-    if trial is None and (folder / "summary.json").is_file():
-        picks = list(StudySummary.read(folder / "summary.json").picks)
-        if pick not in picks:
-            hint = did_you_mean(pick, picks) if len(picks) > 1 else 'objectives = ["accuracy", "speed"] make three'
-            raise StudyError(f"study '{spec.name}' has no preset '{pick}'", hint)
-        return read_text(folder / f"{pick}.toml", kind=StudyError)
-    if pick != "best":
-        raise StudyError(f"study '{spec.name}' is not finished: no presets yet", "dynslam-bench tune run STUDY.toml")
-    tuner = Study(spec, results, reading=True)
-    trials = best_trials(tuner.study, 1)
+    stored = StoredStudy(spec, results)
+    preset, trials = stored.folder / "best.toml", best_trials(stored.study, 1)
+    if trial is None and preset.is_file():
+        return read_text(preset, kind=StudyError)
     if trial is not None:
-        trials = [one for one in tuner.study.get_trials(deepcopy=False) if one.number == trial]
+        trials = [one for one in stored.study.get_trials(deepcopy=False) if one.number == trial]
     if not trials:
         what = "finished trial" if trial is None else f"trial {trial}"
         raise StudyError(f"study '{spec.name}' has no {what}", "dynslam-bench tune status STUDY.toml")
     remark = f"Trial {trials[0].number}{', the best so far' * (trial is None)}; not judged on scenes that no trial saw."
-    return preset_text(tuner, trials[0].params, remark)
+    return preset_text(spec, trials[0].params, remark)
 
 
 # The text of a preset.
 
 
 def preset_text(
-    plan: Plan,
+    spec: StudySpec,
     tuned: Mapping[str, Any],
     remark: str,
     *,
@@ -598,14 +498,14 @@ def preset_text(
     masks, is only a comment, so that the preset runs wherever the tracker does.
 
     Args:
-        plan: The study.
+        spec: The study.
         tuned: The tuned settings; empty for the baseline's.
         remark: A line on what they are worth.
         status: The verdict on them.
         tuned_on: Instances that trials and choice saw.
         judged_on: Instances that judged.
     """
-    fixed = plan.spec.space.fixed
+    fixed = spec.space.fixed
     remarks = [remark]
     if tuned_on:
         remarks.append(f"Tuned on {_listed(tuned_on)}.")
@@ -613,8 +513,8 @@ def preset_text(
         remarks.append(f"Judged on {_listed(judged_on)}.")
     if fixed:
         remarks.append(f"Fixed in that study, not part of these settings: {', '.join(_lines(fixed))}.")
-    head = [f"settings of {plan.spec.tracker}", *(line for text in remarks for line in textwrap.wrap(text, 100))]
-    settings = {name: value for name, value in {**plan.held, **tuned}.items() if name not in fixed}
+    head = [f"settings of {spec.tracker}", *(line for text in remarks for line in textwrap.wrap(text, 100))]
+    settings = {name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed}
     return "\n".join(
         [*(f"# {line}" for line in head), "", f"status = {json.dumps(status)}", "", "[settings]", *_lines(settings), ""]
     )

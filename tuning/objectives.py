@@ -2,7 +2,7 @@
 
 A configuration runs on each instance in its own process; the run store makes no run twice. All objectives are natural
 logarithms of ratios to the baseline: less is better, 0 is the baseline's own. Below them the statistics of such ratios:
-interval, bound, power, and the test of whether settings matter at all.
+interval, power, and the test of whether settings matter at all.
 """
 
 from __future__ import annotations
@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +21,7 @@ from scipy import stats
 from dynslam_bench.core.errors import StudyError, did_you_mean
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.row import grouped
-from dynslam_bench.runs import RunEvent, RunRecord, RunStore, run_many, score
-from dynslam_bench.trackers.registry import TRACKERS
+from dynslam_bench.runs import RunRecord, RunStore, score
 from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
 
 
@@ -66,70 +64,8 @@ class InstanceFailedError(StudyError):
     """A run did not come to its end; carries the instance, the run's status and the reason."""
 
 
-class CancelledError(Exception):
-    """The caller cancelled the evaluation."""
-
-
-def evaluate(
-    tracker: str,
-    settings: Mapping[str, Any],
-    instances: Iterable[ProblemInstance],
-    *,
-    results: RunStore | str | Path = "results",
-    jobs: int = 1,
-    protocol: Protocol | str = "tum-rgbd/v1",
-    threads: int = 1,
-    cache: bool = False,
-    data_root: str | None = None,
-    study: str = "",
-    cancelled: Callable[[], bool] | None = None,
-    on_run: Callable[[RunEvent], None] | None = None,
-) -> dict[ProblemInstance, Outcome]:
-    """Run a configuration on instances; runs that are stored are taken from there.
-
-    Args:
-        tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        settings: Overrides of its settings, dotted name to value.
-        instances: Where; in the order in which they are begun.
-        results: The results folder, or a store.
-        jobs: Runs at a time.
-        protocol: Protocol of the errors; lost frames are always held at the last pose.
-        threads: Threads of a run.
-        cache: Whether runs use the stage cache; times are then those of when its entries were made.
-        data_root: Folder of the recorded sequences.
-        study: Name of the study that the runs are made for, which is in their records.
-        cancelled: Called many times a second; True ends the runs at once.
-        on_run: Called with every event of every run, by several threads where `jobs` is more than 1.
-
-    Returns:
-        The outcome on each instance, in their order.
-
-    Raises:
-        InstanceFailedError: A run crashed, timed out, ran out of memory or was invalid; the others are not waited for.
-        CancelledError: `cancelled` said so.
-        DynslamError: Tracker, settings or an instance are unknown or unfit; nothing ran.
-    """
-    store = results if isinstance(results, RunStore) else RunStore(results)
-    held, instances, stop = held_protocol(protocol), list(instances), [False]
-    held.check_scale(tracker, TRACKERS.get(tracker).sensors)
-
-    def ended() -> bool:
-        return stop[0] or (cancelled is not None and cancelled())
-
-    def one(instance: ProblemInstance) -> Outcome:
-        how = {"threads": threads, "cache": cache, "data_root": data_root, "study": study}
-        spec = instance.run_spec(tracker, settings=dict(settings), **how)
-        if ended():
-            raise CancelledError(str(instance))
-        (record,) = run_many([spec], results=store, protocol=held, cancelled=ended, on_event=on_run)
-        return outcome(store, record, instance, held, data_root)
-
-    with ThreadPoolExecutor(max(1, min(jobs, len(instances))), thread_name_prefix="dynslam-instance") as pool:
-        try:
-            return dict(zip(instances, pool.map(one, instances), strict=True))
-        except BaseException:
-            stop[0] = True
-            raise
+class CancelledError(StudyError):
+    """The study was interrupted."""
 
 
 def outcome(
@@ -142,21 +78,16 @@ def outcome(
         CancelledError: It was stopped.
     """
     if record.status == "stopped":
-        raise CancelledError(str(instance))
+        raise CancelledError(f"interrupted on {instance}")
     if record.failed:
         raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
     evaluation = score(store, record, protocol).online
     ate = static_camera_m(instance, data_root) if evaluation is None else float(evaluation.metrics["ate_rmse_m"])
-    total = record.timings["total"].mean_s
+    total, elsewhere = record.timings["total"], record.device.startswith("cuda") or FOREIGN in record.timings
+    processor = total if elsewhere else record.timings.get("processor", total)
     period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
-    return Outcome(instance, record.run_id, ate, record.coverage, total, processor_seconds(record), period / total)
-
-
-def processor_seconds(record: RunRecord) -> float:
-    """Mean processor seconds a frame of a run; its frame time where the work is not that of its own process."""
-    own = record.timings.get("processor")
-    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
-    return record.timings["total"].mean_s if own is None or elsewhere else own.mean_s
+    times = (total.mean_s, processor.mean_s, period / total.mean_s)
+    return Outcome(instance, record.run_id, ate, record.coverage, *times)
 
 
 def held_protocol(protocol: Protocol | str) -> Protocol:
@@ -372,38 +303,26 @@ def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
 
 def centre(values: Iterable[float]) -> float:
     """Trimmed mean; the mean of fewer than ten."""
-    sample = np.sort(np.fromiter(values, np.float64))
-    cut = int(TRIMMED * len(sample))
-    return float(sample[cut : len(sample) - cut].mean())
+    ranked = sorted(values)
+    cut = int(TRIMMED * len(ranked))
+    return fmean(ranked[cut : len(ranked) - cut])
 
 
-def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, float] | None:
+def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, float]:
     """Confidence interval of the centre: Student's, of the trimmed mean (Tukey and McLaughlin 1963) from ten on.
 
     Args:
-        values: One a scene, taken as independent.
-        confidence: Of both sides together; a one-sided bound of confidence c is the end of the interval of 2 c - 1.
-
-    Returns:
-        Lower and upper end; None for fewer than two values.
+        values: One a scene, two or more, taken as independent.
+        confidence: Of both sides together.
     """
-    sample = np.sort(np.fromiter(values, np.float64))
-    count = len(sample)
-    if count < 2:
-        return None
-    cut = int(TRIMMED * count)
+    sample = np.sort(list(values))
+    cut, count = int(TRIMMED * len(sample)), len(sample)
     kept = count - 2 * cut
-    winsorised = np.clip(sample, sample[cut], sample[count - 1 - cut])
+    winsorised = np.clip(sample, sample[cut], sample[-1 - cut])
     error = float(winsorised.std(ddof=1)) * math.sqrt(count) / kept
     half = float(stats.t.ppf(0.5 + confidence / 2, kept - 1)) * error
     middle = centre(sample)
     return middle - half, middle + half
-
-
-def upper(values: Iterable[float], confidence: float) -> float:
-    """One-sided upper confidence bound of the centre; infinite for fewer than two values."""
-    interval = bounds(values, 2 * confidence - 1)
-    return math.inf if interval is None else interval[1]
 
 
 # What scenes can show.
@@ -430,9 +349,9 @@ def scenes_needed(gain: float, spread: float) -> int:
     return 2 + bisect_left(range(2, _MOST_SCENES), True, key=lambda count: detectable(spread, count) <= gain)
 
 
-MATTER_LEVEL = 0.02
-"""Level of `spread_test`; pruning, which depends on the values, makes it find a difference where there is none in 3 to
-8 % of the studies (`tests/benchmarks/study_null.py`)."""
+MATTER_LEVEL = 0.01
+"""Level of `spread_test`. Pruning depends on the values, so the test finds a difference where there is none more often
+(`tests/benchmarks/study_null.py`)."""
 
 
 def spread_test(trials: Sequence[Mapping[str, float]]) -> float | None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +20,17 @@ from dynslam_bench.core.toml import setting_text
 from dynslam_bench.reports.build_report import sections_page
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, figure_of, guide
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
-from dynslam_bench.reports.html.run_sets import write_runs
-from dynslam_bench.reports.model.board import Cell, make_cell
-from dynslam_bench.reports.model.load import Loaded, rows_of
-from dynslam_bench.reports.model.names import name_columns
-from dynslam_bench.reports.model.row import SEEN, command_line, grouped
-from dynslam_bench.reports.tables.leaderboard import run_link
+from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
-from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict, worth
-from dynslam_bench.tuning.objectives import held_protocol
+from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict
 from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
-from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, errors_of
+from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS
 from dynslam_bench.tuning.study import Study
 from dynslam_bench.tuning.study_file import ProblemInstance, scenes
 
 _LEVELS = {Verdict.PROVEN: "green", Verdict.WORSE: "red"}
 """Colour of the verdict; all others are amber."""
-_MOST_RUNS = 300
-"""Runs of trials that have a page beside the study's."""
 _CONTOURS = 4
 """Contours of so many parameters are drawn, the most important ones."""
 
@@ -55,8 +46,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
     spec = tuner.spec
-    links = _write_runs(tuner, summary)
-    candidates, trials = _candidates(summary, links), _trials(tuner, summary, links)
+    candidates, trials = _candidates(summary), _trials(tuner, summary)
     proven = summary.verdict == Verdict.PROVEN
     settings = settings_table(tuner.space, tuner.base, summary.best.params if summary.best else {}, proven)
     for table in (candidates, trials, settings):
@@ -66,13 +56,12 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         "ones on scenes that no trial had seen (confirm); and of the choice on held-out scenes and on recordings. "
         "Bars: 95 % intervals over scenes. The star is the choice, if one was confirmed."
     )
-    remarks = [*filter(None, [_shipped(summary), seen_note(summary.seen)])]
     sections = [
         Section(
-            "result", "Tried, confirmed, held out", remarks,
+            "result", "Tried, confirmed, held out", [note] if (note := seen_note(summary.seen)) else [],
             [*figure_blocks(_funnel_figure(tuner, summary), caption), Block("table", table=candidates)],
         ),
-        Section("preset", "Settings: baseline, best trial, range", _picks(summary), _preset(tuner, summary, settings)),
+        Section("preset", "Settings: baseline, best trial, range", [], _preset(tuner, summary, settings)),
         Section("course", "How it went", [*warnings_of(tuner), _importance_note(summary)], _plots(tuner, summary)),
         Section("trials", "All trials", [], [Block("table", "All trials", trials, folded=True)]),
     ]  # fmt: skip
@@ -83,8 +72,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         level=_LEVELS.get(summary.verdict, "amber"),
         protocol=f"{_asked(tuner, summary)} {summary.protocol}.",
         evaluates=True,
-        links=[("index.html", "Study"), *([(next(iter(links.values())), "Runs")] if links else [])],
-        here="index.html",
+        links=[],
         footer=f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}. "
         f"Reproduce: {command_line(tuner.study.user_attrs.get('command', []))}",
     )
@@ -92,33 +80,6 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     write_assets(tuner.folder)
     write_atomic(path, html)
     return path
-
-
-def _write_runs(tuner: Study, summary: StudySummary) -> dict[int, str]:
-    """Write the pages of the runs of trials; returns a trial's link to its run with the median error.
-
-    The baseline and the candidates come first: of more than `_MOST_RUNS` runs the others have no page.
-    """
-    first, stored = [0, *(candidate.trial for candidate in summary.candidates)], set(tuner.store.ids())
-    runs = {
-        trial.number: [run_id for _, run_id, *_ in trial.user_attrs.get("instances", ()) if run_id in stored]
-        for trial in sorted(tuner.study.get_trials(deepcopy=False), key=lambda trial: trial.number not in first)
-    }
-    paged = list(dict.fromkeys(run_id for ids in runs.values() for run_id in ids))[:_MOST_RUNS]
-    protocol = held_protocol(tuner.spec.protocol)
-    rows = {row.run_id: row for row in rows_of(tuner.store, paged, protocol, Loaded())}
-    if not rows:
-        return {}
-    columns, links = name_columns([*rows.values()]), {}
-    cells: dict[str, dict[str, Cell]] = {}
-    for trial, ids in sorted(runs.items()):
-        own = sorted((rows[run_id] for run_id in ids if run_id in rows), key=lambda row: row.score_m or 0.0)
-        if own:
-            links[trial] = run_link(own[len(own) // 2])
-            by_sequence = grouped(own, lambda row: columns[row.column_id])
-            cells[f"trial {trial}"] = {name: make_cell(some) for name, some in by_sequence.items()}
-    write_runs(tuner.folder, cells, [*rows.values()], protocol, "Study")
-    return links
 
 
 def _asked(tuner: Study, summary: StudySummary) -> str:
@@ -193,22 +154,6 @@ def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]
     return [shown, Block("code", text=text), Block("code", title="Use them", text=command)]
 
 
-def _shipped(summary: StudySummary) -> str:
-    """The default settings beside a baseline that is something else; empty if it is not."""
-    ratios = "; ".join(f"{split.replace('_', '-')}: {ratio}" for split, ratio in summary.shipped.items())
-    return f"Ratios are to {summary.baseline}. The default settings of {summary.tracker}: {ratios}." if ratios else ""
-
-
-def _picks(summary: StudySummary) -> list[str]:
-    """What the presets of a study of several objectives are worth."""
-    by_trial = {candidate.trial: candidate for candidate in summary.candidates}
-    return [
-        worth(name, None if trial is None else by_trial[trial], summary.split_notes)
-        for name, trial in summary.picks.items()
-        if name != "best"
-    ]
-
-
 def _importance_note(summary: StudySummary) -> str:
     if not summary.importances:
         return f"No importances: they need {FEWEST_TRIALS} complete or pruned trials that differ."
@@ -277,11 +222,6 @@ def fewer_starts(design: Design) -> str:
 def warnings_of(tuner: Study) -> list[str]:
     """What a reader of the course should know, in sentences."""
     notes = []
-    if _seeds_change_nothing(tuner):
-        notes.append(
-            "The seeds changed nothing: all runs that differ in the seed alone are equal, so they count as copies and "
-            "not as repeats. Name start offsets in place of seeds."
-        )
     complete = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     if len(complete) < 20:
         notes.append(f"Only {len(complete)} trials were finished: the best value is partly luck.")
@@ -298,33 +238,17 @@ def warnings_of(tuner: Study) -> list[str]:
     return notes
 
 
-def _seeds_change_nothing(tuner: Study) -> bool:
-    """Whether there are runs of one trial that differ in the seed alone, and all of them are equal to the bit."""
-    errors: dict[tuple[int, ProblemInstance], list[float]] = {}
-    for trial in tuner.study.get_trials(deepcopy=False):
-        for instance, ate in errors_of(trial).items():
-            errors.setdefault((trial.number, replace(instance, seed=0)), []).append(ate)
-    repeats = [values for values in errors.values() if len(values) > 1]
-    return bool(repeats) and all(len(set(values)) == 1 for values in repeats)
-
-
-def _candidates(summary: StudySummary, links: Mapping[int, str]) -> Table:
+def _candidates(summary: StudySummary) -> Table:
     def ratio(value: Ratio | None) -> TableCell:
         if value is None:
             return TableCell()
         return TableCell(f"{value.ratio:.3f}", f"{value.interval} n={value.n}".strip(), value.ratio)
-
-    def time(candidate: Candidate) -> TableCell:
-        if candidate.frame_ms is None:
-            return TableCell()
-        return TableCell(f"{candidate.frame_ms:.1f}", f"baseline {candidate.baseline_frame_ms:.1f}", candidate.frame_ms)
 
     rows = [
         [
             TableCell(
                 str(candidate.trial),
                 value=candidate.trial,
-                link=links.get(candidate.trial, ""),
                 emphasis="best" if candidate is summary.best else "",
             ),
             number(math.exp(candidate.values[0]) if candidate.values else None, ".3f"),
@@ -332,7 +256,7 @@ def _candidates(summary: StudySummary, links: Mapping[int, str]) -> Table:
             number(candidate.bound if math.isfinite(candidate.bound) else None, ".3f"),
             ratio(candidate.held_out),
             ratio(candidate.recorded),
-            time(candidate),
+            ratio(candidate.on_confirm.get("speed")),
             TableCell(candidate.failed or ("yes" if candidate.feasible else "no")),
         ]
         for candidate in summary.candidates
@@ -341,23 +265,17 @@ def _candidates(summary: StudySummary, links: Mapping[int, str]) -> Table:
         "Ratios to the baseline on the same instances: the median of a scene's starts, the mean over scenes (trimmed "
         "from ten on), and the 95 % interval over scenes. The candidate with the smallest upper bound on instances "
         "that no trial saw is the best, chosen where that bound lies below 1; held-out instances and recordings "
-        f"judge it. Frame times without the stage cache.{_cautions(summary)}"
+        f"judge it. Processor times are on unseen instances, without the stage cache. {seen_note(summary.seen)}"
     )
     optimistic = "the trial's own value, optimistic: the trial was selected for it"
-    one_sided = "one-sided upper bound for the choice; allows for the number of candidates"
+    widened = "upper end of an interval that is wider than 95 % for the number of candidates (Bonferroni)"
     tune, confirm, held_out = _marked(
         summary, ("in the trial", "tune"), ("unseen instances", "confirm"), ("held-out", "held_out")
     )
     columns = [Column("trial"), Column(tune, meaning=optimistic), *numbers(confirm)]
-    columns += [Column("upper bound", meaning=one_sided), *numbers(held_out, "recorded", "frame ms")]
+    columns += [Column("upper bound", meaning=widened), *numbers(held_out, "recorded", "processor time")]
     columns += [Column("constraints hold", numeric=False)]
     return Table("candidates", "The best trials, judged again", caption, columns, rows)
-
-
-def _cautions(summary: StudySummary) -> str:
-    """What every table says of a study whose splits are not apart, or whose masks were trained on its scenes."""
-    apart = f"The splits are NOT apart: {'; '.join(summary.split_notes)}." if summary.split_notes else ""
-    return "".join(f" {text}" for text in (apart, seen_note(summary.seen)) if text)
 
 
 def _marked(summary: StudySummary, *headings: tuple[str, str]) -> list[str]:
@@ -365,11 +283,11 @@ def _marked(summary: StudySummary, *headings: tuple[str, str]) -> list[str]:
     return [f"{heading} {SEEN}" if split in summary.seen else heading for heading, split in headings]
 
 
-def _trials(tuner: Study, summary: StudySummary, links: Mapping[int, str]) -> Table:
+def _trials(tuner: Study, summary: StudySummary) -> Table:
     names = [parameter.name for parameter in tuner.space]
     rows = [
         [
-            TableCell(str(trial.number), value=trial.number, link=links.get(trial.number, "")),
+            TableCell(str(trial.number), value=trial.number),
             TableCell(trial.state.name.lower(), trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, "")),
             *(number(math.exp(value), ".3f") for value in trial.values or ()),
             *(TableCell() for _ in tuner.objectives if not trial.values),
@@ -381,8 +299,8 @@ def _trials(tuner: Study, summary: StudySummary, links: Mapping[int, str]) -> Ta
     ]
     headings = _marked(summary, *((f"ratio of {objective.what}", "tune") for objective in tuner.objectives))
     columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings, "coverage", "fps", *names)]
-    caption = f"A trial's number leads to its runs; of more than {_MOST_RUNS} runs the first ones have pages."
-    return Table("trials", "All trials", caption + fewer_starts(tuner.design) + _cautions(summary), columns, rows)
+    caption = f"Pages of its runs: dynslam-bench report --trials.{fewer_starts(tuner.design)} {seen_note(summary.seen)}"
+    return Table("trials", "All trials", caption, columns, rows)
 
 
 def settings_table(space: Sequence[Parameter], baseline: dict[str, Any], best: dict[str, Any], proven: bool) -> Table:

@@ -25,7 +25,6 @@ from dynslam_bench.core.settings import (
     why_unused,
 )
 from dynslam_bench.core.toml import read_settings
-from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.runs import RunRecord, RunStore, load_frames
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.trackers import TRACKERS
@@ -133,6 +132,12 @@ def _fits(parameter: Parameter, value: Any) -> bool:
         return False
 
 
+def held_settings(spec: StudySpec) -> dict[str, Any]:
+    """What every trial has beside the tuned settings: the baseline's, where that is a preset, and the fixed ones."""
+    preset = read_settings(Path(spec.baseline)) if spec.baseline.endswith(".toml") else {}
+    return {**preset, **spec.space.fixed}
+
+
 GAIN = 0.10
 """The gain of which a preview says how many scenes would show it."""
 SPREAD = 0.31
@@ -201,10 +206,9 @@ class Plan:
         spec: The study.
         results: The results folder.
         objectives: In place of those that the study names, in their order.
-        accept: Whether splits that are not apart are only noted.
 
     Attributes:
-        held: What every trial has beside the tuned settings: the baseline's, where that is a preset, and the fixed.
+        held: See `held_settings`.
         baseline: What ratios are to.
         shipped: The tracker's default settings, where the baseline is something else.
         defaults: The settings of trial 0.
@@ -222,24 +226,23 @@ class Plan:
         results: str | Path = "results",
         *,
         objectives: Sequence[Objective] | None = None,
-        accept: bool = False,
     ) -> None:
         self.spec, self.results, self.store = spec, Path(results), RunStore(results)
         self.objectives = [find_objective(name) for name in spec.objectives] if objectives is None else list(objectives)
         fixed, settings = spec.space.fixed, TRACKERS.get(spec.tracker).settings
-        preset = read_settings(Path(spec.baseline)) if spec.baseline.endswith(".toml") else {}
-        self.held = {**preset, **fixed}
+        self.held = held_settings(spec)
         self.baseline = Configuration(spec.tracker, self.held)
-        if spec.baseline and not preset:
+        if spec.baseline and not spec.baseline.endswith(".toml"):
             names = field_names(TRACKERS.get(spec.baseline).settings)
             self.baseline = Configuration(spec.baseline, {name: fixed[name] for name in fixed if name in names})
+        held_protocol(spec.protocol).check_scale(spec.tracker, TRACKERS.get(spec.tracker).sensors)
         self.shipped = Configuration(spec.tracker, fixed) if spec.baseline else None
         self.defaults: Settings = apply_overrides(settings(), self.held)
         self.base = flatten(self.defaults)
         sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
         self.space = search_space(self.defaults, spec.space, sequences)
         starting_point({}, self.space, self.base)
-        self.design = design_of(spec, accept=accept)
+        self.design = design_of(spec)
 
     def preview(self, jobs: int = 1) -> Preview:
         """What the study could show, from the baseline's stored runs where there are some."""
@@ -269,7 +272,7 @@ class Plan:
 
     def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:
         """Standard deviation between starts of the log ratio of two runs; 0 where no scene has two stored runs."""
-        protocol, root = held_protocol(get_protocol(self.spec.protocol)), self.spec.data_root
+        protocol, root = held_protocol(self.spec.protocol), self.spec.data_root
         runs = {at: outcome(self.store, record, at, protocol, root) for at, record in records.items()}
         logs = log_errors({at: run.ate_m for at, run in runs.items()})
         free = sum(len(values) - 1 for values in logs.values())

@@ -2,43 +2,27 @@
 
 Each trial draws from a stream of its own, and all trials meet the same growing sets of instances, on which Optuna's
 pruners end the worse ones early: asynchronous successive halving (Li et al. 2020) or Wilcoxon's signed-rank test
-against the best trial. Optuna prunes no trials of several objectives; there a trial ends once other trials dominate it
-at the same step.
+against the best trial. Optuna prunes no trials of several objectives.
 """
 
 from __future__ import annotations
 
-import io
-import pickle
 import warnings
-from collections.abc import Callable, Sequence
-from importlib.util import find_spec
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import optuna
-from numpy.typing import NDArray
-from optuna._transform import _SearchSpaceTransform
 from optuna.distributions import BaseDistribution
-from optuna.search_space import IntersectionSearchSpace
-from optuna.study import Study, StudyDirection
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial
 
-from dynslam_bench.core.errors import StudyError, raising
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.flow.moth_flame import EMFOA, flames_left, flight, moth_positions, opposites
 from dynslam_bench.tuning.study_file import PrunerName, SamplerName, StudySpec
 
 _STARTUP_TRIALS = 8
 
 
 def build_sampler(spec: StudySpec) -> StreamedSampler:
-    """The sampler of a study.
-
-    Raises:
-        StudyError: It needs a package that is not installed, or cannot do what the study asks for.
-    """
-    _build(spec, 0)  # what is missing shows now
+    """The sampler of a study."""
     return StreamedSampler(lambda seed: _build(spec, seed), spec.sampler_seed)
 
 
@@ -85,20 +69,10 @@ _SAMPLERS: dict[SamplerName, Callable[[StudySpec, int], optuna.samplers.BaseSamp
     ),
     "nsga2": lambda spec, seed: optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed),
     "gp": lambda spec, seed: optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed),
-    "cmaes": lambda spec, seed: RestrictedCmaEsSampler(seed=seed, n_startup_trials=_STARTUP_TRIALS),
-    "emfoa": lambda spec, seed: EmfoaSampler(seed=seed, n_trials=spec.trials),
 }
-_OF_ONE_OBJECTIVE = ("cmaes", "emfoa")
 
 
 def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
-    if spec.sampler in _OF_ONE_OBJECTIVE and len(spec.objectives) > 1:
-        raise StudyError(
-            f"sampler '{spec.sampler}' takes one objective, the study has {len(spec.objectives)}",
-            "use tpe, nsga2, gp or random",
-        )
-    if spec.sampler == "cmaes" and find_spec("cmaes") is None:
-        raise StudyError("sampler 'cmaes' needs a package that is not installed", "pip install cmaes")
     with warnings.catch_warnings():  # TPE's `constant_liar` counts as experimental
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return _SAMPLERS[spec.sampler](spec, seed)
@@ -109,139 +83,8 @@ def is_feasible(trial: FrozenTrial) -> bool:
     return all(value <= 0 for value in trial.constraints.values())
 
 
-# CMA-ES: Optuna keeps its state in the storage as a pickle, which anybody who writes to the storage could replace.
-
-_NUMPY = ("numpy._core", "numpy.core")
-_CMA_CLASSES = {
-    ("cmaes._cma", "CMA"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    *((f"{core}.multiarray", name) for core in _NUMPY for name in ("_reconstruct", "scalar")),
-    *((f"{core}.numeric", "_frombuffer") for core in _NUMPY),
-}
-
-
-class _CmaUnpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _CMA_CLASSES:
-            raise pickle.UnpicklingError(f"it names {module}.{name}")
-        return super().find_class(module, name)
-
-
-def restore_cma(data: bytes) -> Any:
-    """A state of CMA-ES from its pickle, made of nothing but the classes that such a state has.
-
-    Raises:
-        StudyError: It is something else.
-    """
-    with raising(
-        StudyError,
-        "the study's storage holds no state of CMA-ES but something else",
-        "it was tampered with or is damaged; use another sampler, or a storage of your own",
-        of=Exception,
-    ):  # a forged pickle raises anything
-        return _CmaUnpickler(io.BytesIO(data)).load()
-
-
-class RestrictedCmaEsSampler(optuna.samplers.CmaEsSampler):
-    """Optuna's CMA-ES, which restores nothing but its own state (`restore_cma`)."""
-
-    def _restore_optimizer(self, completed_trials: list[FrozenTrial]) -> Any:
-        for trial in reversed(completed_trials):
-            parts = {key: part for key, part in trial.system_attrs.items() if key.startswith(self._attr_key_optimizer)}
-            if parts:
-                return restore_cma(bytes.fromhex(self._concat_optimizer_attrs(parts)))
-        return None
-
-
-# The elite moth-flame algorithm as an Optuna sampler: one trial is one flight of one moth.
-
-Array = NDArray[np.float64]
-CAUCHY_SHARE = 0.05
-"""Scale of the Cauchy steps of Eq. 13, as a share of the unit interval."""
-
-
-class EmfoaSampler(optuna.samplers.BaseSampler):
-    """Moth-flame optimisation with elite opposition, Cauchy steps and the pull of the best flame (Eq. 8-22).
-
-    The best finished trials are the flames. The first population is drawn uniformly, its second half as elite opposites
-    of the first (Eq. 19-22); from then on trial number n is the flight of moth n mod N: a logarithmic spiral from its
-    last position around its flame (Eq. 8-10), with a Cauchy step in the first half of the budget (Eq. 13-16) and the
-    pull of the best flame in the second (Eq. 17-18). The number of flames falls over the budget (Eq. 11).
-
-    Moths move in the unit cube: a number in its (linear or logarithmic) range, a category by its one-hot code. Pruned
-    trials count as finished, and as worse than all complete ones.
-
-    Args:
-        seed: Of the random numbers.
-        n_trials: The budget over which flames are reduced; later trials stay in the last phase.
-        population: Moths (and flames).
-    """
-
-    def __init__(self, *, seed: int | None = None, n_trials: int = 100, population: int = 8) -> None:
-        if n_trials < 1 or population < 2:
-            raise ValueError(f"n_trials must be >= 1 and population >= 2, got {n_trials=}, {population=}")
-        self._rng = np.random.default_rng(seed)
-        self._independent = optuna.samplers.RandomSampler(seed=seed)
-        self._n_trials = n_trials
-        self._population = population
-        self._space = IntersectionSearchSpace(include_pruned=True)
-
-    def reseed_rng(self) -> None:
-        """Draw a new seed, for parallel workers."""
-        self._rng = np.random.default_rng()
-        self._independent.reseed_rng()
-
-    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        """The parameters that all finished trials share."""
-        shared = self._space.calculate(study).items()
-        return {name: distribution for name, distribution in shared if not distribution.single()}
-
-    def sample_relative(
-        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
-    ) -> dict[str, Any]:
-        """One flight of one moth."""
-        if len(study.directions) > 1:
-            raise ValueError("EmfoaSampler takes one objective")
-        if not search_space:
-            return {}
-        cube = _SearchSpaceTransform(search_space, transform_0_1=True)
-        sign = -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
-        trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
-        finished = [one for one in trials if one.value is not None and search_space.keys() <= one.params.keys()]
-        units = [cube.transform({name: one.params[name] for name in search_space}) for one in finished]
-        moths = np.array(units).reshape(-1, len(cube.bounds))
-        if len(moths) < self._population:
-            return cube.untransform(self._first_population(moths))
-        ranks = [(one.state == TrialState.PRUNED, sign * float(one.value or 0.0)) for one in finished]
-        flames = moths[sorted(range(len(moths)), key=ranks.__getitem__)[: self._population]]
-        index, at = trial.number % self._population, min(trial.number, self._n_trials)
-        own = [row for row, one in enumerate(finished) if one.number % self._population == index]
-        moth = moths[own[-1] if own else -1]
-        around = flames[min(index, flames_left(self._population, at, self._n_trials) - 1)]
-        now = flight(at / self._n_trials, EMFOA)
-        landed = moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
-        return cube.untransform(np.clip(landed, 0.0, 1.0))
-
-    def sample_independent(
-        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
-    ) -> Any:
-        """Uniformly, for parameters outside the shared space."""
-        return self._independent.sample_independent(study, trial, param_name, param_distribution)
-
-    def _first_population(self, members: Array) -> Array:
-        """A member of the first population in the unit cube: uniform, or the elite opposite of an earlier member."""
-        unit = self._rng.random(members.shape[1])
-        if len(members) >= self._population // 2:
-            low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
-            unit = opposites(members[0], low, high, low, high, self._rng.random)
-        return np.asarray(unit)
-
-
 FIRST_STEP = 3
-"""Instances that every trial runs on before it is compared."""
-DOMINATED_SHARE = 0.1
-"""With several objectives a trial ends once this share of the trials, at least two, beats it in all of them."""
+"""Instances that every trial runs on before it may be pruned."""
 WILCOXON_LEVEL = 0.1
 
 
@@ -257,32 +100,3 @@ def build_pruner(name: PrunerName) -> optuna.pruners.BasePruner:
     with warnings.catch_warnings():  # the Wilcoxon pruner counts as experimental
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return _PRUNERS[name]()
-
-
-def steps(name: PrunerName, count: int) -> list[int]:
-    """After how many of `count` instances a trial may be pruned; the last one is the whole set.
-
-    ``halving`` doubles the set (the rungs of successive halving), ``wilcoxon`` tests after every instance.
-    """
-    if name == "none" or count <= FIRST_STEP:
-        return [count]
-    if name == "wilcoxon":
-        return list(range(FIRST_STEP, count + 1))
-    rungs = [FIRST_STEP]
-    while rungs[-1] * 2 < count:
-        rungs.append(rungs[-1] * 2)
-    return [*rungs, count]
-
-
-def is_dominated(trials: Sequence[FrozenTrial], number: int, step: int) -> bool:
-    """Whether enough of the trials that came as far beat a trial in every objective at the same step."""
-    name = step_name(step)
-    reported = {trial.number: trial.user_attrs[name] for trial in trials if name in trial.user_attrs}
-    rivals, own = np.array(list(reported.values())), reported[number]
-    better = ((rivals <= own).all(axis=1) & (rivals != own).any(axis=1)).sum()
-    return bool(better >= max(2, DOMINATED_SHARE * len(rivals)))
-
-
-def step_name(step: int) -> str:
-    """User attribute that holds a trial's values after so many instances; Optuna has none for several objectives."""
-    return f"values_after_{step}_instances"

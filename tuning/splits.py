@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, product, zip_longest
@@ -11,8 +11,6 @@ from typing import Any, Literal, cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.core.errors import StudyError
@@ -46,7 +44,6 @@ class Design:
             recordings have no further frames: then nothing can be claimed.
         held_out: What judges the choice.
         recorded: Recordings on which the choice must not be worse.
-        notes: How the splits are not apart, where the study accepts that; to be shown beside every number.
     """
 
     tune: tuple[ProblemInstance, ...]
@@ -54,21 +51,18 @@ class Design:
     confirm: tuple[ProblemInstance, ...]
     held_out: tuple[ProblemInstance, ...]
     recorded: tuple[ProblemInstance, ...]
-    notes: tuple[str, ...] = ()
 
 
-def design_of(spec: StudySpec, *, accept: bool = False, further: int = 0) -> Design:
+def design_of(spec: StudySpec, *, further: int = 0) -> Design:
     """Lay out the instances of a study and check them.
 
     Args:
         spec: The study.
-        accept: Whether splits that are not apart are only noted, as for a study that is only looked at.
         further: Rendered scenes that are added to the choice and to the judgement.
 
     Raises:
         DynslamError: See `splits.check_splits`; or further scenes cannot be made.
     """
-    accept = accept or spec.allow_overlap
     tune, confirm, held_out = (spec.instances(*texts) for texts in (spec.tune, spec.confirm, spec.held_out))
     taken = {instance.scene for instance in (*tune, *confirm, *held_out)}
     if not confirm:
@@ -81,14 +75,14 @@ def design_of(spec: StudySpec, *, accept: bool = False, further: int = 0) -> Des
         confirm += further_scenes(confirm, further, taken, TUNE_SCENES)
         held_out += further_scenes(held_out, further, taken, HELD_OUT_SCENES) if held_out else []
     splits: dict[Split, list[ProblemInstance]] = {"tune": tune, "confirm": confirm, "held_out": held_out}
-    notes = check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
+    check_splits(spec.name, splits, data_root=spec.data_root)
     recorded = _recordings(spec, taken) if spec.recorded is None else spec.instances(*spec.recorded)
     if spec.recorded:
         splits = {"tune": [*tune, *confirm], "held_out": recorded}
-        notes += check_splits(spec.name, splits, data_root=spec.data_root, accept=accept)
+        check_splits(spec.name, splits, data_root=spec.data_root)
     tune = running_order(tune, spec.sampler_seed)
     reference = with_more_starts(tune)
-    return Design(tuple(tune), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded), tuple(notes))
+    return Design(tuple(tune), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded))
 
 
 def running_order(instances: PySequence[ProblemInstance], seed: int) -> list[ProblemInstance]:
@@ -120,8 +114,6 @@ def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
 
 # Whether a study's instances are what they say: apart by content, by the catalogue, by the scenes.
 
-ACCEPT = "allow_overlap = true in the study file accepts it, and every table of the study will say so"
-
 Split = Literal["tune", "confirm", "held_out"]
 
 
@@ -130,8 +122,7 @@ def check_splits(
     splits: Mapping[Split, PySequence[ProblemInstance]],
     *,
     data_root: str | None = None,
-    accept: bool = False,
-) -> list[str]:
+) -> None:
     """Open every instance of a study and compare its splits.
 
     Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
@@ -143,14 +134,10 @@ def check_splits(
         name: Of the study.
         splits: Its instances: to tune on, to judge the survivors on, and held out.
         data_root: Folder of the recorded sequences.
-        accept: Whether the study accepts it (`StudySpec.allow_overlap`).
-
-    Returns:
-        What is wrong, a line each, where it is accepted.
 
     Raises:
-        StudyError: Something is wrong and not accepted, a split names the same frames twice, or an instance is too
-            long, too short or without ground truth; names both spellings.
+        StudyError: They are not apart, a split names the same frames twice, or an instance is too long, too short or
+            without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
     tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))
@@ -167,10 +154,8 @@ def check_splits(
     ]
     for names, used, own in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
         faults += [_misplaced(name, used, own) for name in names if getattr(opened[name], "split", "") == own]
-    if faults and not accept:
-        more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}{more}", ACCEPT)
-    return faults
+    if faults:
+        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}", "leave one out")
 
 
 def _check_repeats(
@@ -204,70 +189,34 @@ def _misplaced(name: str, used: str, own: str) -> str:
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
 
-# Whether two recordings show the same: by what was filmed and how the camera moved, never by names or stamps.
+# Whether two recordings show the same: by their images, never by names.
 
-_AROUND_S = np.array([-0.1, -0.05, 0.05, 0.1])
-"""The shape of a path at a frame: the camera's distances from its positions so long before and after it."""
 _PAIRS = 6
-"""So many pairs of frames with the most similar shapes, and as many with equal stamps, are compared by their images."""
-_LEAST_M = 1e-3
-"""The shape of a shorter path is the ground truth's rounding."""
+"""So many pairs of frames are compared by their images."""
+_ENOUGH = 3
+"""Pairs with equal images; fewer may be chance, as two paths may cross."""
 _THUMB = (32, 24)
 _GREY_LEVELS = 1.5
 _DEPTH_SHARE = 0.002
-_ENOUGH = 3
-"""Pairs with equal images; fewer may be chance, as two paths may cross."""
 
 
 def same_recording(one: Sequence, other: Sequence) -> bool:
     """Whether frames of one recording are frames of the other; of two rendered scenes never: their digests tell.
 
-    Frames are paired where the ground truths have the same shape around them (in whatever frame of reference, at
-    whatever stamps), where stamps are equal, and in order from the first and from the last frame; of a few pairs the
-    decoded images are compared, reduced to `_THUMB` pixels. Other names, shifted stamps, other image files, frames left
-    out and a smaller size leave a copy a copy.
+    Of a few frames with equal stamps (without any, of frames spread evenly over both) the decoded images are compared,
+    reduced to `_THUMB` pixels. Other names, other image files and a smaller size leave a copy a copy, and so do frames
+    that are left out or other stamps, one of the two.
     """
-    if _is_rendered(one) and _is_rendered(other):
+    if hasattr(one, "scene_digest") and hasattr(other, "scene_digest"):
         return False
-    pairs = dict.fromkeys(_likely_pairs(one, other))
-    alike = (True for here, there in pairs if _alike(one[here], other[there], one.camera, other.camera))
-    return len(list(islice(alike, _ENOUGH))) == min(_ENOUGH, len(one), len(other))
-
-
-def _likely_pairs(one: Sequence, other: Sequence) -> Iterator[tuple[int, int]]:
-    shapes = [_shapes(one), _shapes(other)]
-    distance, index = cKDTree(shapes[1]).query(shapes[0])
-    nearest = np.asarray(index, np.intp)
-    relative = np.asarray(distance, np.float64) / (np.linalg.norm(shapes[0], axis=1) + _LEAST_M)
-    yield from ((int(here), int(nearest[here])) for here in np.argsort(relative, kind="stable")[:_PAIRS])
-    if _is_rendered(one) or _is_rendered(other):
-        return  # its frames are computed one by one, and its ground truth is exact: the shape is enough
     stamps = (np.round(one.timestamps, 6), np.round(other.timestamps, 6))
-    _, here, there = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
-    spread = np.unique(np.linspace(0, len(here) - 1, min(_PAIRS, len(here))).astype(np.intp))
-    yield from zip(here[spread].tolist(), there[spread].tolist(), strict=True)
-    yield from ((0, 0), (len(one) - 1, len(other) - 1))
-
-
-def _is_rendered(sequence: Sequence) -> bool:
-    """Whether the frames of a sequence are computed and its content is known by its parameters."""
-    return hasattr(sequence, "scene_digest")
-
-
-def _shapes(sequence: Sequence) -> NDArray[np.float64]:
-    """Distances in metres ``[N, 4]`` of the camera at every frame from itself `_AROUND_S` earlier and later.
-
-    They depend neither on the frame of reference nor on a shift of the stamps.
-    """
-    truth = sequence.ground_truth
-    assert truth is not None  # else its instances are refused
-
-    def positions(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
-        axes = [np.interp(stamps, truth.timestamps, truth.positions[:, axis]) for axis in range(3)]
-        return np.stack(axes, axis=-1)
-
-    stamps = sequence.timestamps[:, None]
-    return np.asarray(np.linalg.norm(positions(stamps + _AROUND_S) - positions(stamps), axis=2), np.float64)
+    _, *frames = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
+    if not len(frames[0]):
+        frames = [np.arange(len(one)), np.arange(len(other))]
+    here, there = (numbers[np.linspace(0, len(numbers) - 1, _PAIRS).astype(int)].tolist() for numbers in frames)
+    pairs = set(zip(here, there, strict=True))
+    alike = sum(_alike(one[first], other[second], one.camera, other.camera) for first, second in pairs)
+    return alike >= min(_ENOUGH, len(one), len(other))
 
 
 def _alike(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:

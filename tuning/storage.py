@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, wraps
-from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -37,7 +36,7 @@ from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.sanitise import HIDDEN, without_passwords
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.samplers import is_feasible
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, parse_instances
+from dynslam_bench.tuning.study_file import StudySpec
 
 EARLIER = "earlier"
 """User attribute of trials that an earlier study made: which, and whether by other code. They are no candidates."""
@@ -46,20 +45,17 @@ EARLIER = "earlier"
 def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     """The best complete trials that fulfil the constraints, without repeats of the same settings.
 
-    With several objectives the front: the best in the first one, the best in the second, and so on in turn. If no trial
-    is feasible, the least bad ones. Where they are too few, pruned ones follow, those that came furthest first.
+    Several objectives count together (geometric mean of their ratios). If no trial is feasible, the least bad ones.
+    Where they are too few, pruned ones follow, those that came furthest first.
     """
     trials = [trial for trial in study.get_trials(deepcopy=False) if EARLIER not in trial.user_attrs]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     candidates = [trial for trial in complete if is_feasible(trial)] or complete
-    if len(study.directions) > 1:
-        front = {trial.number for trial in study.best_trials}
-        candidates = [trial for trial in candidates if trial.number in front] or candidates
-    orders = [sorted(candidates, key=lambda trial: trial.values[at]) for at in range(len(study.directions))]
     pruned = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.user_attrs.get("scenes")]
+    candidates.sort(key=lambda trial: sum(trial.values))
     pruned.sort(key=lambda trial: (-len(trial.user_attrs["instances"]), centre(trial.user_attrs["scenes"].values())))
     distinct: list[FrozenTrial] = []
-    for trial in chain(chain.from_iterable(zip(*orders, strict=True)), pruned):
+    for trial in [*candidates, *pruned]:
         if all(trial.params != other.params for other in distinct):
             distinct.append(trial)
     return distinct[:count]
@@ -70,9 +66,9 @@ def count_states(study: optuna.Study) -> dict[str, int]:
     return dict(Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False)))
 
 
-def errors_of(trial: FrozenTrial) -> dict[ProblemInstance, float]:
-    """ATE in metres on each instance that a trial ran on."""
-    return {parse_instances(text)[0]: float(ate) for text, _, ate, *_ in trial.user_attrs.get("instances", [])}
+def extension_of(study: optuna.Study) -> dict[str, int]:
+    """Scenes and trials by which a study was extended."""
+    return {"scenes": 0, "trials": 0, **study.user_attrs.get("extension", {})}
 
 
 # A study's trials as a pandas frame: one row a trial.
@@ -236,13 +232,12 @@ def read_stored(folder: Path) -> tuple[StudySpec, Path]:
     ]
 
 
-def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:
+def load_study(results: Path, spec: StudySpec) -> optuna.Study:
     """Load a stored study.
 
     Args:
         results: The results folder.
         spec: The study.
-        **how: Further arguments of ``optuna.load_study``.
 
     Raises:
         StudyError: There is none; nothing is made then.
@@ -251,7 +246,7 @@ def load_study(results: Path, spec: StudySpec, **how: Any) -> optuna.Study:
     if not spec.storage and not study_folder(results, spec).is_dir():
         raise absent
     try:
-        return optuna.load_study(study_name=spec.name, storage=open_storage(results, spec), **how)
+        return optuna.load_study(study_name=spec.name, storage=open_storage(results, spec))
     except KeyError as error:
         raise absent from error
 

@@ -24,7 +24,7 @@ from dynslam_bench.core.records import digest, validated, write_atomic
 from dynslam_bench.core.sanitise import storable, words_without_passwords
 from dynslam_bench.core.settings import Scalar
 from dynslam_bench.core.toml import read_settings
-from dynslam_bench.runs import RunEvent
+from dynslam_bench.runs import RunEvent, run_many
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.record import program_of
 from dynslam_bench.tuning.objectives import (
@@ -36,21 +36,23 @@ from dynslam_bench.tuning.objectives import (
     Outcome,
     Outcomes,
     coverage,
-    evaluate,
     find_objective,
     fps,
+    held_protocol,
+    outcome,
     own_objective,
     together,
     violations,
 )
 from dynslam_bench.tuning.plan import Plan, distributions, starting_point
-from dynslam_bench.tuning.samplers import build_pruner, build_sampler, is_dominated, step_name, steps
+from dynslam_bench.tuning.samplers import build_pruner, build_sampler
 from dynslam_bench.tuning.splits import design_of
 from dynslam_bench.tuning.storage import (
     EARLIER,
     SPEC_FILE,
     Heartbeats,
     best_trials,
+    extension_of,
     load_study,
     open_storage,
     read_stored,
@@ -59,7 +61,7 @@ from dynslam_bench.tuning.storage import (
     without_password,
     worker_name,
 )
-from dynslam_bench.tuning.study_file import ProblemInstance, PrunerName, StudySpec, read_study
+from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, read_study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -121,7 +123,6 @@ class Study(Plan):
     Args:
         spec: The study, or its TOML file; None if the fields say it all.
         results: The results folder.
-        reading: Only look at a stored study: one of another version of the code opens too, but runs nothing more.
         objective: In place of the spec's: names of objectives, or functions from
             `objectives.Outcome` to a cost above 0, one or several.
         sampler: Any of Optuna's, in place of the spec's.
@@ -131,11 +132,10 @@ class Study(Plan):
     Attributes:
         study: Optuna's study.
         on_run: Called with every event of every run from now on; None for no calls.
-        pruner: The study's; trials of several objectives are compared at the steps of ``halving``.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
-            study's name; nothing has run then. With `reading` also when nothing is stored.
+            study's name; nothing has run then.
     """
 
     def __init__(
@@ -143,7 +143,6 @@ class Study(Plan):
         spec: StudySpec | Path | str | None = None,
         results: str | Path = "results",
         *,
-        reading: bool = False,
         objective: str | Cost | Sequence[str | Cost] | None = None,
         sampler: optuna.samplers.BaseSampler | None = None,
         callbacks: Iterable[Callback] = (),
@@ -156,29 +155,25 @@ class Study(Plan):
         if base is None or changes:
             values = {} if base is None else base.model_dump()
             base = validated(StudySpec, {"name": "study", **values, **changes}, "the study", StudyError)
-        super().__init__(base, results, objectives=objectives, accept=reading)
-        spec, self._callbacks = base, tuple(callbacks)
-        self.reading = reading
-        several = len(self.objectives) > 1  # Optuna's pruners take one objective
-        self.pruner: PrunerName = "halving" if several and spec.pruner == "wilcoxon" else spec.pruner
-        sampler = build_sampler(spec) if sampler is None else sampler
-        self.steps = self._comparable_steps()
+        super().__init__(base, results, objectives=objectives)
+        self._callbacks = tuple(callbacks)
+        sampler = build_sampler(base) if sampler is None else sampler
         self.store.prepare()
-        self.folder = study_folder(self.results, spec)
+        self.folder = study_folder(self.results, base)
         self._identity = self._identify()
         self._lock = threading.Lock()
         self._interrupted = threading.Event()
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
-        self.study = self._open(sampler, [] if reading else list(self._beginnings()))
+        self.study = self._open(sampler, list(self._beginnings()))
         self._heartbeats = Heartbeats(self.study)
         if self.extension["scenes"]:
-            self.design = design_of(spec, accept=reading, further=self.extension["scenes"])
+            self.design = design_of(base, further=self.extension["scenes"])
 
     @property
     def extension(self) -> dict[str, int]:
         """Scenes and trials that `extend` has added."""
-        return {"scenes": 0, "trials": 0, **self.study.user_attrs.get("extension", {})}
+        return extension_of(self.study)
 
     @property
     def trials(self) -> int:
@@ -208,10 +203,10 @@ class Study(Plan):
             StudyError: The baseline fails on a sequence; says where and why.
         """
         self.reference(on_event, jobs)
-        deadline, tell = time.monotonic() + (self.spec.timeout_s or math.inf), on_event or (lambda _: None)
+        tell = on_event or (lambda _: None)
 
         def work() -> None:
-            while time.monotonic() < deadline and not self._interrupted.is_set():
+            while not self._interrupted.is_set():
                 if not self._more():
                     if not self._others_run():
                         return
@@ -248,15 +243,8 @@ class Study(Plan):
         missing = [instance for instance in self.design.reference if instance not in self._reference]
         if on_event is not None and missing:
             on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
-        with self._ending_all():
-            try:
-                self._reference |= self.outcomes(
-                    self.baseline.settings, missing, tracker=self.baseline.tracker, jobs=jobs
-                )
-            except InstanceFailedError as error:
-                raise StudyError(f"the baseline fails: {error.args[0]}", "a study needs one that runs") from error
-            except CancelledError as error:
-                raise StudyError("interrupted") from error
+        outcomes, _ = self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)
+        self._reference |= outcomes
         return self._reference
 
     def outcomes(
@@ -265,49 +253,80 @@ class Study(Plan):
         instances: Sequence[ProblemInstance],
         *,
         tracker: str = "",
-        jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
-        """Run settings on instances as this study does; see `objectives.evaluate`.
+        """Run settings on instances, one after the other; runs that are stored are taken from there.
 
         Args:
             settings: Overrides, dotted name to value.
             instances: Where.
             tracker: Whose; the study's if empty.
-            jobs: Runs at a time.
-            cache: Whether to use the stage cache; None for what the study says.
+            cache: Whether to use the stage cache, whose times are those of when its entries were made; None for what
+                the study says.
+
+        Raises:
+            InstanceFailedError: A run crashed, timed out, ran out of memory or was invalid.
+            CancelledError: The study was interrupted.
+            DynslamError: Settings or an instance are unknown or unfit.
         """
-        return evaluate(
-            tracker or self.spec.tracker, settings, instances, results=self.store, jobs=jobs,
-            protocol=self.spec.protocol, threads=self.spec.threads, cache=self.spec.cache if cache is None else cache,
-            data_root=self.spec.data_root, study=self.spec.name, cancelled=self._interrupted.is_set, on_run=self.on_run,
-        )  # fmt: skip
+        spec, results = self.spec, dict[ProblemInstance, Outcome]()
+        how = {"threads": spec.threads, "cache": spec.cache if cache is None else cache, "data_root": spec.data_root}
+        protocol, interrupted = held_protocol(spec.protocol), self._interrupted.is_set
+        for instance in instances:
+            if interrupted():
+                raise CancelledError(f"interrupted before {instance}")
+            run = instance.run_spec(tracker or spec.tracker, settings=dict(settings), study=spec.name, **how)
+            (record,) = run_many(
+                [run], results=self.store, protocol=protocol, cancelled=interrupted, on_event=self.on_run
+            )
+            results[instance] = outcome(self.store, record, instance, protocol, spec.data_root)
+        return results
 
     def evaluate_beside(
-        self, configurations: Sequence[Configuration], instances: Sequence[ProblemInstance], *, jobs: int = 1
-    ) -> list[dict[ProblemInstance, Outcome] | InstanceFailedError]:
-        """Run configurations instance by instance, without the stage cache, so that their times can be compared.
+        self,
+        configurations: Sequence[Configuration],
+        instances: Sequence[ProblemInstance],
+        *,
+        jobs: int = 1,
+        cache: bool = False,
+    ) -> tuple[dict[ProblemInstance, Outcome], list[dict[ProblemInstance, Outcome] | InstanceFailedError]]:
+        """Run the baseline and configurations instance by instance: other load on the machine slows all of them alike.
 
-        Other load on the machine then slows all of them alike.
+        Args:
+            configurations: What to run.
+            instances: Where.
+            jobs: Runs at a time.
+            cache: Whether to use the stage cache, with which times cannot be compared.
 
         Returns:
-            For each configuration its outcomes, or the error of its first failed run; it runs on no instance after it.
+            The outcomes of the baseline, and for each configuration its outcomes, or the error of its first failed run;
+            it runs on no instance after it.
+
+        Raises:
+            StudyError: The baseline fails; says where and why.
         """
-        results: list[dict[ProblemInstance, Outcome] | InstanceFailedError] = [{} for _ in configurations]
+        several = [self.baseline, *configurations]
+        results: list[dict[ProblemInstance, Outcome] | InstanceFailedError] = [{} for _ in several]
 
         def one(instance: ProblemInstance, number: int) -> None:
             result = results[number]
             if isinstance(result, dict):
                 try:
-                    tracker, settings = configurations[number]
-                    result |= self.outcomes(settings, [instance], tracker=tracker, cache=False)
+                    tracker, settings = several[number]
+                    result |= self.outcomes(settings, [instance], tracker=tracker, cache=cache)
                 except InstanceFailedError as error:
+                    if number == 0:
+                        raise StudyError(
+                            f"the baseline fails: {error.args[0]}", "a study needs one that runs"
+                        ) from error
                     results[number] = error
 
         with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-beside") as pool, self._ending_all():
-            for future in [pool.submit(one, *task) for task in product(instances, range(len(results)))]:
+            for future in [pool.submit(one, *task) for task in product(instances, range(len(several)))]:
                 future.result()
-        return results
+        baseline, *others = results
+        assert isinstance(baseline, dict)
+        return baseline, others
 
     @staticmethod
     def open(study: StudySpec | Path | str, results: Path | str = "results") -> StoredStudy:
@@ -330,12 +349,6 @@ class Study(Plan):
     def configuration_of(self, trial: FrozenTrial | optuna.Trial) -> Configuration:
         """What a trial runs with."""
         return Configuration(self.spec.tracker, {**self.held, **trial.params})
-
-    def _comparable_steps(self) -> list[int]:
-        """The steps at which every objective has an instance that counts."""
-        *early, last = steps(self.pruner, len(self.design.tune))
-        counted = [[objective.counts(instance) for instance in self.design.tune] for objective in self.objectives]
-        return [*(step for step in early if all(any(flags[:step]) for flags in counted)), last]
 
     def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
         """The next trial: the first is the baseline's, then come those that wait, then the sampler's.
@@ -361,22 +374,22 @@ class Study(Plan):
 
     def _evaluate(self, trial: optuna.Trial) -> Evaluation:
         outcomes: dict[ProblemInstance, Outcome] = {}
-        reference, values = self._reference or self.reference(), list[float]()
-        for step in self.steps:
-            first = len(outcomes)
-            try:
-                outcomes |= self.outcomes(self.configuration_of(trial).settings, self.design.tune[first:step])
-            except (CancelledError, InstanceFailedError) as error:
-                text = CRASHED_WORKER if isinstance(error, CancelledError) else str(error)
-                return Evaluation(TrialState.FAIL, text)
-            values = [objective.value(outcomes, reference) for objective in self.objectives]
-            trial.set_user_attr("coverage", coverage(outcomes))
-            trial.set_user_attr("fps", fps(outcomes))
-            trial.set_user_attr("scenes", together(self.objectives).ratios(outcomes, reference))
-            rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
-            trial.set_user_attr("instances", rows)
-            if self._pruned(trial, outcomes, values, first) and trial.number > 0:
-                return Evaluation(TrialState.PRUNED, f"pruned after {step} of {self.steps[-1]} instances")
+        reference, pruned = self._reference or self.reference(), False
+        try:
+            for instance in self.design.tune:
+                outcomes |= self.outcomes(self.configuration_of(trial).settings, [instance])
+                if pruned := self._prune(trial, outcomes, instance):
+                    break
+        except (CancelledError, InstanceFailedError) as error:
+            return Evaluation(TrialState.FAIL, CRASHED_WORKER if isinstance(error, CancelledError) else str(error))
+        trial.set_user_attr("coverage", coverage(outcomes))
+        trial.set_user_attr("fps", fps(outcomes))
+        trial.set_user_attr("scenes", together(self.objectives).ratios(outcomes, reference))
+        rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
+        trial.set_user_attr("instances", rows)
+        if pruned:
+            return Evaluation(TrialState.PRUNED, f"pruned after {len(outcomes)} of {len(self.design.tune)} instances")
+        values = [objective.value(outcomes, reference) for objective in self.objectives]
         violated = violations(self.spec, outcomes, reference)
         for name, value in violated.items():
             trial.set_constraint(name, value)
@@ -385,31 +398,27 @@ class Study(Plan):
         broken = [name for name, value in violated.items() if value > 0]
         return Evaluation(TrialState.COMPLETE, text + (f", violates {' and '.join(broken)}" if broken else ""), values)
 
+    def _prune(self, trial: optuna.Trial, outcomes: Outcomes, last: ProblemInstance) -> bool:
+        """Report a trial's value after its last instance, and ask Optuna's pruner, which takes one objective.
+
+        For Wilcoxon's test that is the instance's own value. Optuna's pruners know no constraints: a trial that
+        violates one takes no part in the comparison of successive halving.
+        """
+        objective, reference = self.objectives[0], self._reference
+        if len(self.objectives) > 1 or not objective.counts(last):
+            return False
+        if self.spec.pruner == "wilcoxon":
+            trial.report(*objective.by_start({last: outcomes[last]}, reference), len(outcomes))
+        elif all(value <= 0 for value in violations(self.spec, outcomes, reference).values()):
+            trial.report(objective.value(outcomes, reference), len(outcomes))
+        return 0 < trial.number and len(outcomes) < len(self.design.tune) and trial.should_prune()
+
     def tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
         """Store what a trial came to."""
         if evaluation.state != TrialState.COMPLETE:
             trial.set_user_attr("reason", evaluation.text)
         with self._lock:
             self.study.tell(trial, evaluation.values, state=evaluation.state)
-
-    def _pruned(self, trial: optuna.Trial, outcomes: Outcomes, values: list[float], first: int) -> bool:
-        """Report a trial's values and ask the pruner; `first` instances were reported before.
-
-        Optuna's pruners know no constraints: a trial that violates one at a step takes no part in the comparison there.
-        """
-        step, final = len(outcomes), len(outcomes) == self.steps[-1]
-        if self.pruner == "wilcoxon":
-            for index, value in enumerate(self.objectives[0].by_start(outcomes, self._reference)):
-                if index >= first:
-                    trial.report(value, index)
-            return not final and trial.should_prune()
-        if final or any(value > 0 for value in violations(self.spec, outcomes, self._reference).values()):
-            return False
-        if len(values) == 1:
-            trial.report(values[0], step)
-            return trial.should_prune()
-        trial.set_user_attr(step_name(step), values)
-        return is_dominated(self.study.get_trials(deepcopy=False), trial.number, step)
 
     def _more(self) -> bool:
         """Whether another trial is wanted; running ones count, those of dead workers are marked as failed."""
@@ -463,19 +472,16 @@ class Study(Plan):
     ) -> optuna.Study:
         """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.pruner)}
-        if self.reading:
-            study = load_study(self.results, self.spec, **how)
-        else:
-            how |= {"storage": open_storage(self.results, self.spec), "study_name": self.spec.name}
-            try:
-                study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
-                self._begin(study, beginnings)
-            except optuna.exceptions.DuplicatedStudyError:
-                study = optuna.load_study(**how)
-            except Exception as error:  # storages raise their drivers' errors
-                text = f"cannot open study '{self.spec.name}': {error}"
-                raise StudyError(without_password(text, self.spec.storage)) from None
+        how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.spec.pruner)}
+        how |= {"storage": open_storage(self.results, self.spec), "study_name": self.spec.name}
+        try:
+            study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
+            self._begin(study, beginnings)
+        except optuna.exceptions.DuplicatedStudyError:
+            study = optuna.load_study(**how)
+        except Exception as error:  # storages raise their drivers' errors
+            text = f"cannot open study '{self.spec.name}': {error}"
+            raise StudyError(without_password(text, self.spec.storage)) from None
         self._check_identity(study)
         if not self.spec.storage:
             write_atomic(self.folder / SPEC_FILE, json.dumps(self.spec.for_others(), indent=2) + "\n")
@@ -516,15 +522,13 @@ class Study(Plan):
             )
 
     def _identify(self) -> dict[str, Any]:
-        """What must be the same when a study is resumed, by name; to read one, its own fields alone.
+        """What must be the same when a study is resumed, by name.
 
-        Beside the fields these are the baseline's settings, the content of its sequences, and the program that runs on
-        them: code, weights, libraries, device.
+        Beside the study's fields these are the baseline's settings, the content of its sequences, and the program that
+        runs on them: code, weights, libraries, device.
         """
         spec = self.spec
-        identity = spec.model_dump(mode="json", exclude={"trials", "timeout_s", "top", "storage", "start", "baseline"})
-        if self.reading:
-            return identity
+        identity = spec.model_dump(mode="json", exclude={"trials", "top", "storage", "start", "baseline"})
         instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
         for sequence, instance in {instance.sequence: instance for instance in reversed(instances)}.items():
             how = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(self.held)}
@@ -544,6 +548,7 @@ class StoredStudy:
 
     Attributes:
         spec: What it asks for.
+        folder: Its folder in the results.
         study: Optuna's study.
 
     Raises:
@@ -558,7 +563,7 @@ class StoredStudy:
             self.spec, root = read_stored(path)
         else:
             self.spec = read_study(path)
-        self.study = load_study(root, self.spec)
+        self.folder, self.study = study_folder(root, self.spec), load_study(root, self.spec)
 
     def frame(self) -> pd.DataFrame:
         """All trials; see `storage.trials_frame`.

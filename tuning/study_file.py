@@ -269,7 +269,7 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
     return tuple(given)
 
 
-SamplerName = Literal["tpe", "random", "nsga2", "gp", "cmaes", "emfoa"]
+SamplerName = Literal["tpe", "random", "nsga2", "gp"]
 PrunerName = Literal["halving", "wilcoxon", "none"]
 EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
 """Objectives that hold the error themselves."""
@@ -308,8 +308,6 @@ class StudySpec(Record, frozen=True):
         recorded: Instances of recordings that the choice must not be worse on; None for the first frames of a held-out
             recording where one is present.
         space: Which settings are tuned.
-        allow_overlap: Accept splits that share content, or sequences that the catalogue or their scene gives to the
-            other split; every table of the study then says so.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the baseline (its logarithm is
             minimised, see `objectives.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
             the worst quarter of the scenes; ``robustness``: ATE on the degraded instances; ``coverage``: share of lost
@@ -321,13 +319,12 @@ class StudySpec(Record, frozen=True):
         seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that draws nothing from it.
         offsets: Start offsets of the instances that name none: so many leading frames are left out.
         trials: Finished trials, trial 0 (the baseline's settings) included.
-        timeout_s: No trial begins after this many seconds; None for no limit.
         top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
         pruner: ``wilcoxon`` is Optuna's `WilcoxonPruner` over the single instances, ``halving`` its
             `SuccessiveHalvingPruner` over growing sets of them, ``none`` its `NopPruner`. Trials of several objectives
-            are pruned by dominance, with either of the first two.
+            are not pruned.
         storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
             ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
             ``~/.pgpass``): it is in no file that is written.
@@ -345,7 +342,6 @@ class StudySpec(Record, frozen=True):
     confirm: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
     recorded: tuple[str, ...] | None = None
-    allow_overlap: bool = False
     space: SpaceSpec = SpaceSpec()
     objectives: tuple[str, ...] = Field(default=("accuracy",), min_length=1)
     ate_margin: float = Field(default=0.05, gt=0, le=1)
@@ -354,7 +350,6 @@ class StudySpec(Record, frozen=True):
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     offsets: tuple[Offset, ...] = Field(default=(0, 3), min_length=1)
     trials: int = Field(default=40, ge=2)
-    timeout_s: float | None = Field(default=None, gt=0)
     top: int = Field(default=2, ge=1)
     sampler: SamplerName = "tpe"
     sampler_seed: int = 0

@@ -102,7 +102,7 @@ def publish(
     output: Annotated[Path, typer.Option("-o", "--output", help="The site's folder, e.g. docs/example.")],
     study: Annotated[
         Optional[list[Path]],  # noqa: UP045
-        typer.Option(help="Folder of a study with its page, as `tune report` names it; once for each study."),
+        typer.Option(help="Folder of a study with its page, as `tune run` names it; once for each study."),
     ] = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
     remark: Annotated[str, typer.Option(help="What a reader should know, for the first page.")] = "",

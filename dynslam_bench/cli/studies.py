@@ -1,4 +1,4 @@
-"""``tune space|run|worker|extend|status|best|report``."""
+"""``tune space|run|worker|extend|status|best``."""
 
 from __future__ import annotations
 
@@ -93,19 +93,20 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
     from dynslam_bench.tuning.judgement import StudySummary
-    from dynslam_bench.tuning.storage import best_trials, count_states
+    from dynslam_bench.tuning.storage import best_trials, count_states, extension_of
 
-    tuner = tuning.Study(tuning.read_study(study), results, reading=True)
-    facts: dict[str, Any] = {"study": tuner.spec.name, "folder": tuner.folder, "asked_for": tuner.trials}
-    facts |= count_states(tuner.study)
+    stored = tuning.Study.open(study, results)
+    asked_for = stored.spec.trials + extension_of(stored.study)["trials"]
+    facts: dict[str, Any] = {"study": stored.spec.name, "folder": stored.folder, "asked_for": asked_for}
+    facts |= count_states(stored.study)
     settings: dict[str, Any] = {}
-    summary = tuner.folder / "summary.json"
+    summary = stored.folder / "summary.json"
     conclusion = StudySummary.read(summary) if summary.is_file() else None
     if conclusion is not None and conclusion.best is not None:  # as `tune best`
         facts |= {"best_trial": conclusion.best.trial, "conclusion": conclusion.conclusion}
         settings = conclusion.best.params
     else:
-        for trial in best_trials(tuner.study, 1):
+        for trial in best_trials(stored.study, 1):
             facts |= {"best_trial": trial.number, "best_ratios": [math.exp(value) for value in trial.values]}
             settings = trial.params
     lines = ["", table(("setting", "value"), list(settings.items()))] if settings else []
@@ -116,38 +117,16 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
 def best(
     study: Study,
     results: Results = Path("results"),
-    pick: Annotated[
-        str, typer.Option(help="best; of a study of several objectives fast, balanced, accurate too.")
-    ] = "best",
-    trial: Annotated[Optional[int], typer.Option(min=0, help="Of a trial, in place of a pick.")] = None,  # noqa: UP045
+    trial: Annotated[Optional[int], typer.Option(min=0, help="Of a trial, in place of the best.")] = None,  # noqa: UP045
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")] = None,  # noqa: UP045
 ) -> None:
     """Write a study's settings as a preset that `run --settings` takes."""
     from dynslam_bench.core.records import write_atomic
 
-    text = tuning.read_preset_text(tuning.read_study(study), results, pick, trial)
+    text = tuning.read_preset_text(tuning.read_study(study), results, trial)
     if output is not None:
         write_atomic(output, text)
     write(text.rstrip() if output is None else str(output))
-
-
-@app.command()
-def report(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
-    """Write a study's page; the best trials are checked first if they are not yet."""
-    from dynslam_bench.tuning.storage import study_folder
-
-    spec = tuning.read_study(study)
-    stored = study_folder(results, spec) / "summary.json"
-    tuner = tuning.Study(spec, results, reading=stored.is_file())
-    if stored.is_file():
-        summary = tuning.StudySummary.read(stored)
-    else:
-        tuner.reference()
-        with progress(f"checking the best of {spec.name}") as advance:
-            bar = StudyBar(advance)
-            tuner.on_run = bar.run
-            summary = tuning.finish(tuner, bar.note)
-    show_summary(tuner, summary, tuning.write_page(tuner, summary))
 
 
 class StudyBar:

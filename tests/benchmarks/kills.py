@@ -41,9 +41,7 @@ from dynslam_bench.core.files import SHARED_MEMORY  # noqa: E402
 from dynslam_bench.runs.process.fork_server import SERVERS, process_tree  # noqa: E402
 
 SUITE = 'trackers = ["never-move", "constant-velocity"]\nsequences = ["{folder}"]\nframes = [0, 10]\n'
-STUDY = (
-    'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\nseeds = [0]\noffsets = [0]\nallow_overlap = true\n'
-)
+STUDY = 'tracker = "opencv-odometry"\ntune = ["{folder}"]\ntrials = 3\nseeds = [0]\noffsets = [0]\n'
 LIGHT_SERVER = """#!/bin/sh
 exec {python} -c "import sys; import dynslam_bench.runs.process.fork_server as server
 server.PRELOADED = ('numpy', 'cv2', 'gymnasium', 'dynslam_bench.envs', 'dynslam_bench.runs.process.child')

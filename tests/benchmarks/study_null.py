@@ -1,10 +1,11 @@
 """What studies say where nothing is better and where something is: simulated studies.
 
-    python tests/benchmarks/study_null.py [--studies 100] [--table null planted regret extended]
+    python tests/benchmarks/study_null.py [--studies 100] [--table null choice planted regret extended]
 
 Whole studies (trials, choice, held-out check) over runs from a noise model: `sd` is the spread of the log ratio of two
 runs in one scene (measured 0.24 to 0.31), and beside it each setting differs from the baseline by 0.15 in log from
-scene to scene. `null`: no setting is better than another. `planted`: the best setting has 30 % less error than the
+scene to scene. `null`: no setting is better than another. `choice`: the same without a search, which takes no part in
+the choice: two such settings on the scenes of the choice. `planted`: the best setting has 30 % less error than the
 baseline, and a study has at most 40 trial runs. Beside it stands how often the best setting itself is proven, known
 without any trial: by the study's rule, and by the best possible rule with as few false claims (a z-test of known
 variance over all scenes that no trial saw). Studies that are not proven are extended once by six scenes. `regret`: the
@@ -70,6 +71,23 @@ def null(studies: int, folder: Path) -> Iterable[str]:
             yield line(scenes, str(simulated.STARTS_SD), *shares)
 
 
+def choice(studies: int, folder: Path) -> Iterable[str]:
+    """Of so many choices among two settings that are no better, the share where one is chosen."""
+    import simulated
+
+    from dynslam_bench.tuning.judgement import compared
+
+    tuner = simulated.SimulatedTuner(study_on(6), folder / "choice")
+    confirm = tuner.design.confirm
+    yield line("scenes of the choice", "sd", "chosen")
+    for simulated.STARTS_SD in SPREADS:
+        chosen = 0
+        for tuner.noise_seed in range(studies):
+            baseline, *candidates = (tuner.outcomes({"gain": gain}, confirm) for gain in (1.5, 1.0, 2.0))
+            chosen += any(compared(one, baseline, candidates=2).bound < 1 for one in candidates)
+        yield line(len(confirm) // 2, str(simulated.STARTS_SD), f"{100 * chosen / studies:.1f} %")
+
+
 def planted(settings: Mapping[str, Any]) -> float:
     """The best gain has 30 % less error than the default of 1.5, and lies a third of the range (0.2 to 3) away."""
     away = math.log(1.5 / settings.get("gain", 1.5)) / (math.log(3 / 0.2) / 3)
@@ -124,7 +142,7 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
 
 
 def best_power(design: Any, gain: float) -> float:
-    """How often a z-test of known variances tells a gain from nothing, with a false claim in 800 (5 % x 2.5 %)."""
+    """How often a z-test of known variances tells a gain from nothing, with a false claim in 1600 (2.5 % x 2.5 %)."""
     import simulated
 
     from dynslam_bench.tuning.study_file import scenes
@@ -135,19 +153,20 @@ def best_power(design: Any, gain: float) -> float:
         starts = stats.norm.rvs(size=(20_000, len(split) // len(groups)), random_state=0)
         start_variance = np.median(starts, axis=1).var() * simulated.STARTS_SD**2
         information += len(groups) / (start_variance + simulated.SCENES_SD**2)
-    return float(stats.norm.sf(stats.norm.isf(0.05 * 0.025) - gain * math.sqrt(information)))
+    return float(stats.norm.sf(stats.norm.isf(0.025 * 0.025) - gain * math.sqrt(information)))
 
 
 def regret(studies: int, folder: Path) -> Iterable[str]:
-    """Regret of a study with each pruner, beside plain Optuna's on the same runs, and the runs of its trials."""
+    """Regret of a study with each pruner, beside plain Optuna's on as many runs, and how many trials each made."""
     import simulated
 
     from dynslam_bench.tuning import finish
 
     simulated.STARTS_SD = 0.28
-    yield line("pruner", "regret", "plain Optuna", "trial runs")
+    own = ("pruner", "runs of trials", "regret", "trials")
+    yield line(*own, "plain Optuna, `WilcoxonPruner`", "its trials", "plain Optuna, no pruner", "its trials")
     for pruner in ("none", "halving", "wilcoxon"):
-        ours, others, runs = [], [], []
+        runs, ours, others = [], [], {optuna.pruners.WilcoxonPruner: [], optuna.pruners.NopPruner: []}
         for seed in range(studies):
             spec = study_on(8, pruner=pruner, trials=24, sampler="tpe", sampler_seed=seed)
             tuner = simulated.SimulatedTuner(spec, folder / f"{pruner}-{seed}", effect=simulated.valley, seed=seed)
@@ -155,17 +174,27 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
             runs.append(
                 sum(len(trial.user_attrs["instances"]) for trial in trials)
             )  # the baseline's too, as in `plain`
-            ours.append(simulated.valley(finish(tuner).best.params))
-            others.append(simulated.valley(plain(tuner, seed, runs[-1])))
-        yield line(pruner, mean(ours), mean(others), round(np.mean(runs)))
+            ours.append((simulated.valley(finish(tuner).best.params), len(trials)))
+            for kind, found in others.items():
+                found.append(plain(tuner, seed, runs[-1], kind()))
+        cells = [cell for found in (ours, *others.values()) for cell in summed(found)]
+        yield line(pruner, round(np.mean(runs)), *cells)
 
 
-def plain(tuner: Any, seed: int, most: int) -> dict[str, Any]:
-    """Settings of the best of two trials by the same bound: TPE and `WilcoxonPruner` as Optuna's manual has them."""
+def summed(found: Sequence[tuple[float, int]]) -> tuple[str, int]:
+    """Mean regret with its standard error, and mean number of trials."""
+    regrets, trials = zip(*found, strict=True)
+    error = np.std(regrets, ddof=1) / math.sqrt(len(regrets))
+    return f"{np.mean(regrets):.3f} ± {error:.3f}", round(np.mean(trials))
+
+
+def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -> tuple[float, int]:
+    """Regret of the best of two trials by the same bound, and how many there were: Optuna as its manual has it."""
+    import simulated
+
     from dynslam_bench.tuning.judgement import compared
     from dynslam_bench.tuning.plan import distributions
 
-    pruner = optuna.pruners.WilcoxonPruner(p_threshold=0.1)
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), pruner=pruner)
     study.enqueue_trial({parameter.name: tuner.base[parameter.name] for parameter in tuner.space})
     order, runs = np.random.default_rng(seed), 0
@@ -187,11 +216,7 @@ def plain(tuner: Any, seed: int, most: int) -> dict[str, Any]:
     def bound(trial: optuna.trial.FrozenTrial) -> float:
         return compared(tuner.outcomes(trial.params, tuner.design.confirm), baseline, candidates=2).bound
 
-    return min(best, key=bound).params
-
-
-def mean(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.3f} +- {np.std(values, ddof=1) / math.sqrt(len(values)):.3f}"
+    return simulated.valley(min(best, key=bound).params), len(study.trials)
 
 
 def extended(studies: int, folder: Path) -> Iterable[str]:
@@ -215,7 +240,7 @@ def extended(studies: int, folder: Path) -> Iterable[str]:
         yield line(extension, chosen[extension] / studies, proven[extension] / studies)
 
 
-TABLES = {"null": null, "planted": recovered, "regret": regret, "extended": extended}
+TABLES = {"null": null, "choice": choice, "planted": recovered, "regret": regret, "extended": extended}
 
 
 def main() -> None:

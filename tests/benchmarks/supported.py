@@ -34,7 +34,6 @@ tune = ["toy"]
 trials = 2
 seeds = [0]
 offsets = [0]
-allow_overlap = true
 """
 STEPS = {
     "import": ["python", "-c", "from dynslam_bench import envs, tuning, reports, runs"],

@@ -313,7 +313,7 @@ def test_a_study(cli, facts, tmp_path):
     assert "not judged" in cli("tune", "best", "study.toml", "--trial", "0")[1]
     assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
     assert facts("run", f"{toy_tracker.__file__}:SPEC", "1", "--settings", "preset.toml")[0]["status"] == "ok"
-    assert cli("tune", "report", "study.toml")[1].splitlines()[0] == more["summary"]["conclusion"]
+    assert facts("tune", "status", "study.toml")["conclusion"] == more["summary"]["conclusion"]
     Path("study.toml").write_text(STUDY.replace("gain", "gian"))
     assert "did you mean 'gain'" in one_line(cli("tune", "space", "study.toml")[2])
 

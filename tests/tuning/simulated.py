@@ -99,7 +99,6 @@ class SimulatedTuner(Study):
         instances: Sequence[ProblemInstance],
         *,
         tracker: str = "",
-        jobs: int = 1,
         cache: bool | None = None,
     ) -> dict[ProblemInstance, Outcome]:
         who = digest({**self.base, **settings})
@@ -116,7 +115,7 @@ class SimulatedTuner(Study):
         return math.exp(math.log(0.03) + scene + self.effect(settings) + own + start)
 
 
-def simulated_design(spec: StudySpec, accept: bool = False, further: int = 0) -> Design:
+def simulated_design(spec: StudySpec, *, further: int = 0) -> Design:
     return _design(spec.tune, spec.confirm, spec.held_out, further)
 
 

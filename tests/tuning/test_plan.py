@@ -176,13 +176,11 @@ def test_any_trial_is_a_preset(tmp_path: Path) -> None:
     spec = make_spec(trials=4, pruner="none")
     tuner = SimulatedTuner(spec, tmp_path, in_memory=False)
     trial = tuner.run().study.get_trials()[2]
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("dynslam_bench.tuning.judgement.Study", lambda *_, **__: tuner)
-        text = read_preset_text(spec, tmp_path, trial=2)
-        (tmp_path / "two.toml").write_text(text)
-        assert read_settings(tmp_path / "two.toml") == trial.params and 'status = "not judged"' in text
-        with pytest.raises(StudyError, match="no trial 9"):
-            read_preset_text(spec, tmp_path, trial=9)
+    text = read_preset_text(spec, tmp_path, trial=2)
+    (tmp_path / "two.toml").write_text(text)
+    assert read_settings(tmp_path / "two.toml") == trial.params and 'status = "not judged"' in text
+    with pytest.raises(StudyError, match="no trial 9"):
+        read_preset_text(spec, tmp_path, trial=9)
 
 
 def test_a_pruned_trial_is_a_preset_too(folders: list[str], tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ FIELDS: dict[str, Any] = {
 def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs are drawn."""
     design = simulated_design(make_spec())
-    monkeypatch.setattr("dynslam_bench.tuning.plan.design_of", lambda spec, accept: design)
+    monkeypatch.setattr("dynslam_bench.tuning.plan.design_of", lambda spec: design)
     for name in ("outcomes", "_identify", "_error"):
         monkeypatch.setattr(Study, name, getattr(SimulatedTuner, name), raising=False)
     for name, value in {"effect": staticmethod(valley), "noise_seed": 0, "_made": set()}.items():

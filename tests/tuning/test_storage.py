@@ -5,17 +5,14 @@ from __future__ import annotations
 import errno
 import multiprocessing
 import os
-import pickle
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import optuna
 import pytest
 from faults import in_a_small_process, survey
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning.samplers import RestrictedCmaEsSampler, restore_cma
 from dynslam_bench.tuning.storage import JournalFile, open_database, open_storage
 from dynslam_bench.tuning.study_file import StudySpec
 
@@ -91,40 +88,6 @@ def test_workers_may_begin_on_an_empty_database_at_the_same_time(tmp_path: Path)
     assert [outcomes.get(timeout=120) for _ in workers] == [""] * 4
     for worker in workers:
         worker.join()
-
-
-class Command:
-    """What an attacker writes into a storage."""
-
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return os.system, ("touch owned",)
-
-
-FORGED = [pickle.dumps(Command(), protocol) for protocol in (0, 2, 4, 5)]
-FORGED += [b"cbuiltins\neval\n.", b"cnumpy\nload\n.", b"cnumpy.core.multiarray\n_reconstruct.x\n.", b"x"]
-
-
-@pytest.mark.parametrize("data", FORGED)
-def test_a_storage_cannot_run_code_through_cmaes(data: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(StudyError, match="no state of CMA-ES"):
-        restore_cma(data)
-    trial = optuna.trial.create_trial(value=0.0, system_attrs={"cma:optimizer:0": data.hex()})
-    with pytest.raises(StudyError, match="no state of CMA-ES"):
-        RestrictedCmaEsSampler()._restore_optimizer([trial])
-    assert not (tmp_path / "owned").exists()
-
-
-def test_optuna_restores_states_where_the_sampler_restricts_it() -> None:
-    assert "_restore_optimizer" in vars(optuna.samplers.CmaEsSampler)
-
-
-def test_a_state_of_cmaes_comes_back() -> None:
-    cmaes = pytest.importorskip("cmaes")
-    made = cmaes.CMA(mean=np.zeros(2), sigma=1.0, seed=1)
-    made.tell([(made.ask(), float(k)) for k in range(made.population_size)])
-    restored = restore_cma(pickle.dumps(made))
-    assert restored.generation == 1 and np.array_equal(restored.ask(), made.ask())
 
 
 @pytest.mark.parametrize("storage", ["redis://host/0", "postgres", "file:///x", "s3://bucket"])

@@ -26,7 +26,6 @@ from dynslam_bench.tuning.objectives import (
     detectable,
     scenes_needed,
     spread_test,
-    upper,
 )
 from dynslam_bench.tuning.storage import FEWEST_TRIALS, importances, open_storage
 from dynslam_bench.tuning.study_file import ProblemInstance
@@ -49,23 +48,21 @@ def test_intervals_and_bounds_cover_the_truth(scenes: int, lost: float) -> None:
     spread = np.where(rng.random((rounds, scenes)) < lost, 1.2, 0.3)
     samples = truth + rng.normal(0, 1, (rounds, scenes)) * spread
     found = [bounds(sample) for sample in samples]
-    covered = np.mean([each is not None and each[0] <= truth <= each[1] for each in found])
-    below = np.mean([upper(sample, 0.95) < truth for sample in samples])
+    covered = np.mean([each[0] <= truth <= each[1] for each in found])
+    below = np.mean([each[1] < truth for each in found])
     assert 0.935 <= covered <= 0.98, "nominal 95 %, never less; a little more under catastrophes"
-    assert 0.015 <= below <= 0.065, "nominal 5 %"
+    assert 0.005 <= below <= 0.035, "nominal 2.5 %"
 
 
 def test_the_interval_is_students_and_from_ten_on_that_of_the_trimmed_mean() -> None:
     sample = np.random.default_rng(0).normal(size=9)
     interval = bounds(sample)
     assert interval == pytest.approx(stats.t.interval(0.95, 8, sample.mean(), stats.sem(sample)))
-    assert interval is not None and upper(sample, 0.975) == pytest.approx(interval[1])
     many = np.random.default_rng(1).normal(size=20)  # 10 % of 20 is whole, so that SciPy's formula is the same
     winsorised = np.asarray(mstats.winsorize(many, (0.1, 0.1)))
     error = winsorised.std(ddof=1) / (0.8 * math.sqrt(20))
-    assert centre(many) == pytest.approx(stats.trim_mean(many, 0.1))
-    assert bounds(many) == pytest.approx(stats.t.interval(0.95, 15, stats.trim_mean(many, 0.1), error))
-    assert bounds([1.0]) is None and upper([1.0], 0.95) == math.inf
+    assert centre(many) == pytest.approx(np.sort(many)[2:18].mean())
+    assert bounds(many) == pytest.approx(stats.t.interval(0.95, 15, centre(many), error))
 
 
 def outcomes(errors: dict[ProblemInstance, float]) -> dict[ProblemInstance, Outcome]:
@@ -100,6 +97,7 @@ def test_few_scenes_have_an_interval_over_starts_that_shows_nothing() -> None:
 
 LUCKY = Ratio(ratio=0.9, low=0.6, high=1.3, n=8, sequences=4, bound=1.2, spread=0.3)
 WIDE = Ratio(ratio=0.9, low=0.7, high=1.2, n=12, sequences=6, spread=0.3)
+TINY = WIDE.model_copy(update={"ratio": 0.994})
 SPEED = {"confirm": CONFIRM, "ate_margin": 0.05}
 
 
@@ -117,39 +115,41 @@ def test_the_verdict_names_a_baseline_that_is_not_the_default_and_what_the_defau
 
 
 @pytest.mark.parametrize(
-    ("changes", "p_value", "notes", "verdict", "named"),
+    ("changes", "p_value", "verdict", "named"),
     [
-        ({}, 0.5, [], Verdict.PROVEN, "25.0 % less ATE: ATE x 0.750 [0.600, 0.900] on 6 scenes"),
-        ({}, 0.5, ["same"], Verdict.PROMISING, "not apart"),
-        ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "upper bound 1.200"),
-        ({"confirm": LUCKY}, 0.5, [], Verdict.PROMISING, "about 62 more scenes would settle it"),
-        ({"confirm": LUCKY.model_copy(update={"ratio": 1.07})}, 0.5, [], Verdict.PROMISING, "nobody can tell how many"),
-        ({"held_out": WIDE}, 0.5, [], Verdict.PROMISING, "about 60 more scenes would settle it"),
-        ({"held_out": None}, 0.5, [], Verdict.PROMISING, "fewer than 3 held-out scenes"),
-        ({"confirm": LUCKY, "held_out": WIDE}, 0.5, [], Verdict.NO_MATTER, "p = 0.50"),
-        ({"confirm": LUCKY, "held_out": WIDE}, 0.001, [], Verdict.PROMISING, "perhaps 10.0 % less"),
-        ({"confirm": LUCKY, "held_out": WIDE}, None, [], Verdict.PROMISING, "perhaps"),
-        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.001, [], Verdict.WORSE, "is not better"),
-        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.24, [], Verdict.NO_MATTER, "p = 0.24"),
-        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, None, [], Verdict.NOT_JUDGED, "cannot tell"),
-        ({"held_out": Ratio(ratio=1.5, low=1.1, high=2, n=8, sequences=4)}, 0.5, [], Verdict.WORSE, "50.0 % more ATE"),
-        ({"recorded": Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)}, 0.5, [], Verdict.WORSE, "recordings"),
-        ({"held_out": Ratio(ratio=0.98, low=0.96, high=1.001, n=8, sequences=4)}, 0.001, [], Verdict.NO_MATTER,
+        ({}, 0.5, Verdict.PROVEN, "25.0 % less ATE: ATE x 0.750 [0.600, 0.900] on 6 scenes"),
+        ({"confirm": LUCKY}, 0.5, Verdict.PROMISING, "upper bound 1.200"),
+        ({"confirm": LUCKY}, 0.5, Verdict.PROMISING, "About 62 more scenes would settle it"),
+        ({"confirm": LUCKY.model_copy(update={"ratio": 1.07})}, 0.5, Verdict.PROMISING, "nobody can tell how many"),
+        ({"held_out": WIDE}, 0.5, Verdict.PROMISING, "About 60 more scenes would settle it"),
+        ({"held_out": None}, 0.5, Verdict.PROMISING, "fewer than 3 held-out scenes"),
+        ({"confirm": LUCKY, "held_out": WIDE}, 0.5, Verdict.NO_MATTER, "p = 0.50"),
+        ({"confirm": LUCKY, "held_out": WIDE}, 0.001, Verdict.PROMISING, "perhaps 10.0 % less"),
+        ({"confirm": LUCKY, "held_out": WIDE}, None, Verdict.PROMISING, "perhaps"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.001, Verdict.WORSE, "is not better"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, 0.24, Verdict.NO_MATTER, "p = 0.24"),
+        ({"held_out": WIDE.model_copy(update={"ratio": 1.1})}, None, Verdict.NOT_JUDGED, "cannot tell"),
+        ({"held_out": Ratio(ratio=1.5, low=1.1, high=2, n=8, sequences=4)}, 0.5, Verdict.WORSE, "50.0 % more ATE"),
+        ({"recorded": Ratio(ratio=1.3, low=1.1, high=1.5, n=4, sequences=1)}, 0.5, Verdict.WORSE, "recordings"),
+        ({"held_out": Ratio(ratio=0.98, low=0.96, high=1.001, n=8, sequences=4)}, 0.001, Verdict.NO_MATTER,
          "gains at most 4.0 %"),
-        ({"feasible": False}, 0.5, [], Verdict.WORSE, "constraint"),
-        ({**SPEED, "on_confirm": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
-        ({**SPEED, "on_confirm": accuracy(1), "on_held_out": accuracy(1.1)}, 0.5, [], Verdict.PROMISING, "below 1.05"),
-        ({"confirm": None}, 0.5, [], Verdict.NOT_JUDGED, "no frames are left"),
-        ({"confirm": CONFIRM.model_copy(update={"sequences": 2}), "held_out": None}, 0.5, [], Verdict.NOT_JUDGED,
+        ({"confirm": LUCKY, "held_out": TINY}, 0.001, Verdict.NO_MATTER, "below 5 % is not worth more scenes"),
+        ({"held_out": TINY}, 0.001, Verdict.PROMISING, "below 5 % is not worth more scenes"),
+        ({"feasible": False}, 0.5, Verdict.WORSE, "constraint"),
+        ({**SPEED, "on_confirm": accuracy(1.1)}, 0.5, Verdict.PROMISING, "below 1.05"),
+        ({**SPEED, "on_confirm": accuracy(1), "on_held_out": accuracy(1.1)}, 0.5, Verdict.PROMISING, "below 1.05"),
+        ({"confirm": None}, 0.5, Verdict.NOT_JUDGED, "no frames are left"),
+        ({"confirm": CONFIRM.model_copy(update={"sequences": 2}), "held_out": None}, 0.5, Verdict.NOT_JUDGED,
          "2 scenes only"),
-        ({"failed": "it broke"}, 0.5, [], Verdict.NOT_JUDGED, "it broke"),
+        ({"failed": "it broke"}, 0.5, Verdict.NOT_JUDGED, "it broke"),
     ],
 )  # fmt: skip
 def test_the_verdict_is_one_of_five_with_the_numbers(
-    changes: dict[str, object], p_value: float | None, notes: list[str], verdict: Verdict, named: str
+    changes: dict[str, object], p_value: float | None, verdict: Verdict, named: str
 ) -> None:
-    given, text = judge([candidate(0.6, 0.75, 0.9, **changes)], p_value, notes)
+    given, text = judge([candidate(0.6, 0.75, 0.9, **changes)], p_value)
     assert (given, text.startswith(verdict.value.capitalize())) == (verdict, True) and named in text
+    assert max(len(sentence.split()) for sentence in text.split(". ")) <= 34
     assert judge([])[0] == Verdict.NOT_JUDGED
 
 
@@ -173,7 +173,7 @@ def test_the_scenes_that_a_gain_needs_are_the_fewest_and_show_it_in_four_of_five
     assert scenes_needed(gain, 0.25) == 8 and detectable(0.25, 1) == 1
     for true, share in ((math.log(1 - gain), 0.8), (0.0, 0.025)):
         intervals = [bounds(rng.normal(true, 0.25, 8)) for _ in range(2000)]
-        assert np.mean([found is not None and found[1] < 0 for found in intervals]) == pytest.approx(share, abs=0.03)
+        assert np.mean([found[1] < 0 for found in intervals]) == pytest.approx(share, abs=0.03)
 
 
 @pytest.mark.parametrize("count", [FEWEST_TRIALS - 1, 60])
@@ -201,9 +201,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return [str(toy_tracker.make_sequence(root / f"s{i}", 0.8 * i)) for i in range(5)]
 
 
-def test_a_study_is_a_frame(
-    folders: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_is_a_frame(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = StudySpec.model_validate({
         "name": "toy", "tracker": TRACKER, "tune": folders[:1], "held_out": folders[1:], "trials": 5, "top": 1,
         "sampler": "random", "sampler_seed": 3, "pruner": "none", "min_coverage": 0.5, "recorded": [],
@@ -216,8 +214,7 @@ def test_a_study_is_a_frame(
     assert summary.conclusion in page and "dynslam-bench tune run 'my study.toml'" in page
     assert ("Use them" in page) == (summary.verdict == Verdict.PROVEN)
     assert StudySummary.read(tuner.folder / "summary.json").conclusion == summary.conclusion
-    monkeypatch.setattr("dynslam_bench.tuning.read_study", lambda path: spec)
-    status(Path("toy.toml"), tmp_path)
+    status(tuner.folder)
     shown = capsys.readouterr().out
     assert summary.best is not None and summary.conclusion in shown, "status names the trial of best.toml"
     assert re.search(rf"best_trial +{summary.best.trial}\n", shown)
