@@ -114,7 +114,8 @@ def test_variants_are_listed_under_their_system_and_rank_never() -> None:
     paper = next(family for family in groups["published"] if family[0].id == "emfoa-oft-paper")
     assert len(ours) == 10 and len(paper) == 3 and ours[0].ranked and paper[0].provenance == "faithful-paper"
     for spec in (*ours[1:], *paper[1:]):
-        assert spec.provenance == "own" and not spec.ranked and spec.id.startswith(("emfoa-oft?", "emfoa-oft-paper?"))
+        assert spec.provenance == "own" and spec.ranked == (spec.id == "emfoa-oft?masks=none")
+        assert spec.id.startswith(("emfoa-oft?", "emfoa-oft-paper?"))
 
 
 @pytest.mark.parametrize(
