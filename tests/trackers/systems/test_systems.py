@@ -104,7 +104,7 @@ def test_specs_are_complete(spec: TrackerSpec) -> None:
         assert spec.citation and ("our back end" in spec.label or "ablation" in spec.label)
 
 
-def test_variants_are_listed_under_their_system_and_rank_never() -> None:
+def test_variants_are_listed_under_their_system_and_ablations_rank_never() -> None:
     groups = tracker_groups()
     names = {spec.id for group in groups.values() for family in group for spec in family}
     assert names == {tracker.spec.id for tracker in TRACKERS.all()} and "never-move" in {
