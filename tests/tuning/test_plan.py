@@ -44,7 +44,7 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(folders: l
     run_study(make(folders), results=tmp_path)
     after = Plan(make(folders), tmp_path).preview(jobs=2)
     assert after.runs == 3 and after.spread != before.spread and after.minutes != before.minutes
-    assert after.unused == {} and "10 %" in after.lines[0] and "3 stored runs" in after.lines[0]
+    assert after.unused == {} and "10 %" in after.figures[0] and "3 stored runs" in after.figures[0]
 
 
 def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Path) -> None:
@@ -61,9 +61,9 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     Study(spec, tmp_path).reference()
     preview = plan.preview()
     assert {name.split(".")[0] for name in preview.unused} == {"epipolar"}
-    assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.lines[-1]
+    assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.proposal[-1]
     alone = spec.model_copy(update={"space": SpaceSpec(include=("epipolar.*",))})
-    assert Plan(alone, tmp_path).preview().lines[-1] == "Nothing would be left of the space without them."
+    assert Plan(alone, tmp_path).preview().proposal[-1] == "Nothing would be left of the space without them."
 
 
 def test_ratios_are_to_the_baseline_and_the_default_stands_beside(folders: list[str], tmp_path: Path) -> None:
