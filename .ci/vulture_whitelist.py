@@ -31,6 +31,7 @@ Open3dOdometry  # trackers.adapters.specs
 OpenCvOdometry  # trackers.adapters.specs
 OrbSlam3  # trackers.adapters.specs
 OrbSlam3Monocular  # trackers.adapters.specs
+Svo  # trackers.adapters.specs
 Replay  # trackers.adapters.specs
 BoxDepthFilter  # trackers.systems: a system names its rules
 BoxEpipolarFilter  # trackers.systems: a system names its rules

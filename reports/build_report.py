@@ -452,7 +452,7 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
             "are of the whole recordings is not checked."
         )
     section.blocks += table_blocks(tables.per_sequence(board, protocol, published), folded=True)
-    lost = any(row.coverage < 1 and not row.failed for row in board.rows)
+    lost = any(row.incomplete and not row.failed for row in board.rows)
     section.blocks += table_blocks(
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
         tables.tracked_errors(board, protocol) if lost else None,

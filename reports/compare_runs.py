@@ -17,13 +17,14 @@ from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.html.board_page import ratio_numbers
 from dynslam_bench.reports.html.page import render, write_side
 from dynslam_bench.reports.html.run_sets import write_runs
-from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell
+from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell, mean_coverage
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, ratio_interval
 from dynslam_bench.reports.tables.leaderboard import interval_cell
 from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
+from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
 
 
@@ -213,7 +214,7 @@ def _table(
     for name, paired in compared.items():
         separators.add(len(rows))
         for sequence, *sides in paired:
-            coverages = [sum(row.coverage for row in cell.rows) / len(cell.rows) for cell in sides]
+            coverages = [mean_coverage(cell.rows) for cell in sides]
             rows.append(
                 [
                     TableCell(name),
@@ -221,7 +222,7 @@ def _table(
                     *(TableCell(mm(cell.median or 0.0), value=cell.median) for cell in sides),
                     number(ratio_of(sequence, *sides), ".3f"),
                     TableCell(),
-                    *(TableCell(f"{100 * coverage:.1f} %", value=coverage) for coverage in coverages),
+                    *(TableCell(coverage_text(coverage), value=coverage) for coverage in coverages),
                     TableCell(" + ".join(str(len(cell.scores)) for cell in sides)),
                 ]
             )

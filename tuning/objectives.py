@@ -87,7 +87,7 @@ def outcome(
     processor = total if elsewhere else record.timings.get("processor", total)
     period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     times = (total.mean_s, processor.mean_s, period / total.mean_s)
-    return Outcome(instance, record.run_id, ate, record.coverage, *times)
+    return Outcome(instance, record.run_id, ate, record.coverage or 0.0, *times)
 
 
 def held_protocol(protocol: Protocol | str) -> Protocol:

@@ -27,7 +27,7 @@ from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
 from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS
 from dynslam_bench.tuning.study import Study
-from dynslam_bench.tuning.study_file import ProblemInstance, scenes
+from dynslam_bench.tuning.study_file import scenes
 
 _LEVELS = {Verdict.PROVEN: "green", Verdict.WORSE: "red"}
 """Colour of the verdict; all others are amber."""
@@ -88,7 +88,9 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
     trials = ", ".join(f"{count} {state}" for state, count in summary.trials.items() if count)
     design = tuner.design
     splits = {"to tune on": design.tune, "to choose on": design.confirm, "held out": design.held_out}
-    sizes = ", ".join(f"{name} {_size(instances)}" for name, instances in splits.items())
+    sizes = ", ".join(
+        f"{name} {len(instances)} runs, {len(scenes(instances))} scenes" for name, instances in splits.items()
+    )
     limits = {"coverage": tuner.spec.min_coverage, "frames a second": tuner.spec.min_fps}
     named = ", ".join(f"{name} of {least:g} or more" for name, least in limits.items() if least is not None)
     constraints = f" Constraints: {named}." if named else ""
@@ -96,10 +98,6 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
         f"Do other values of {len(tuner.space)} settings give {tuner.spec.tracker} less {goals} than "
         f"{summary.baseline}? Trials: {trials}. Runs: {sizes}.{constraints}"
     )
-
-
-def _size(instances: Sequence[ProblemInstance]) -> str:
-    return f"{len(instances)} runs, {len(scenes(instances))} scenes" if instances else "none"
 
 
 def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
@@ -143,10 +141,7 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
 
 def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]:
     """The best settings with their status, and how to use them only if they are proven."""
-    shown, best = Block("table", table=settings), summary.best
-    if best is None:
-        return [shown]
-    text = read_text(tuner.folder / "best.toml")
+    shown, text = Block("table", table=settings), read_text(tuner.folder / "best.toml")
     if summary.verdict != Verdict.PROVEN or summary.keeps_default:
         why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
         return [shown, Block("code", title=f"best.toml, not recommended: {why}", text=text)]
@@ -161,14 +156,12 @@ def _importance_note(summary: StudySummary) -> str:
     return f"Importances (PED-ANOVA) and their 95 % intervals: {shares}. They add up to 100 % even where none matters."
 
 
-def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure | None:
-    """Ratios of all trials, of the confirmed candidates, and of the choice where it is judged; None for no trial."""
+def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
+    """Ratios of all trials, of the confirmed candidates, and of the choice where it is judged."""
     tried = [
         (trial.number, math.exp(trial.values[0]))
         for trial in tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     ]
-    if not tried:
-        return None
     spread = 0.5 * (np.random.default_rng(0).random(len(tried)) - 0.5)
     stages = [f"tried: {len(tried)} whole trials"]
     traces = [

@@ -193,11 +193,6 @@ class Preview(Record):
             lines.append(left if self.include else "Nothing would be left of the space without them.")
         return lines
 
-    @property
-    def lines(self) -> list[str]:
-        """Both."""
-        return [*self.figures, *self.proposal]
-
 
 class Plan:
     """What follows from a study alone; nothing runs, and nothing is stored.

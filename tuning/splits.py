@@ -173,8 +173,8 @@ def _check_repeats(
         if (here.block, here.noise, _drawn(one)) == (there.block, there.noise, _drawn(other)):
             raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
         shared = min(here.stop, there.stop) - max(here.start, there.start)
-        repeats = (here.start, here.stop) == (there.start, there.stop) and (one in apart) == (other in apart)
-        if shared > 0 and not repeats:
+        repeats = place_of(one) == place_of(other) or (here.start, here.stop) == (there.start, there.stop)
+        if shared > 0 and not (repeats and (one in apart) == (other in apart)):
             raise StudyError(f"'{one}' and '{other}' share {shared} frames", "write instances of a sequence apart")
 
 

@@ -408,8 +408,9 @@ class Study(Plan):
         if len(self.objectives) > 1 or not objective.counts(last):
             return False
         if self.spec.pruner == "wilcoxon":
-            trial.report(*objective.by_start({last: outcomes[last]}, reference), len(outcomes))
-        elif all(value <= 0 for value in violations(self.spec, outcomes, reference).values()):
+            (value,) = objective.by_start({last: outcomes[last]}, reference)
+            trial.report(value, len(outcomes))
+        elif max(violations(self.spec, outcomes, reference).values(), default=0) <= 0:
             trial.report(objective.value(outcomes, reference), len(outcomes))
         return 0 < trial.number and len(outcomes) < len(self.design.tune) and trial.should_prune()
 

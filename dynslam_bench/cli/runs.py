@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -35,6 +35,9 @@ from dynslam_bench.cli.output import (
 )
 from dynslam_bench.core.errors import RunError, did_you_mean
 from dynslam_bench.core.toml import assignments, label_text
+
+if TYPE_CHECKING:
+    from dynslam_bench.runs.store import Merged
 
 COLUMNS = {
     "run": "run_id",
@@ -181,15 +184,7 @@ def merge(
     """Copy the runs of results folders into one; exit with 3 if another result of a run is there, which stays."""
     store = stored.RunStore(output)
     merged = stored.merge([_open(folder) for folder in sources], store)
-    present(
-        merged,
-        f"{len(merged.added)} runs copied to {store.root}, {len(merged.stored)} were there already, "
-        f"{len(merged.left_out)} left out",
-    )
-    for entry in merged.left_out:
-        warn(f"left out {entry.path}: {entry.reason}")
-    if merged.left_out:
-        raise typer.Exit(SOME_RUNS_FAILED)
+    show_merged(merged, str(store.root))
 
 
 @app.command()
@@ -208,6 +203,16 @@ def rm(
     for run_id in dict.fromkeys(chosen):
         store.remove(run_id)
         write(run_id)
+
+
+def show_merged(merged: Merged, target: str) -> None:
+    """What was copied into a store; exit with 3 if something was left out."""
+    counts = f"{len(merged.stored)} were there already, {len(merged.left_out)} left out"
+    present(merged, f"{len(merged.added)} runs copied to {target}, {counts}")
+    for entry in merged.left_out:
+        warn(f"left out {entry.path}: {entry.reason}")
+    if merged.left_out:
+        raise typer.Exit(SOME_RUNS_FAILED)
 
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
@@ -271,7 +276,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in pairs)
     if worse:
         write(f"{worse} of {len(rows)} runs are worse than a static camera.")
-    if any(row["ate_rmse_m"] is not None and row["coverage"] < 1 for row in rows):
+    if any(None not in (row["ate_rmse_m"], row["coverage"]) and row["coverage"] < 1 for row in rows):
         write("ATE: of the tracked frames alone; static camera: of all. A report uses hold-last-pose.")
 
 

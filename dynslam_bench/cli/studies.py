@@ -41,7 +41,7 @@ def space(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_j
 
     rows = [(p.name, range_text(p), plan.base[p.name], p.unit, p.meaning) for p in plan.space]
     shown = table(("setting", "range", "baseline", "unit", "meaning"), rows)
-    present({"settings": plan.space, "preview": preview}, shown, "", *preview.lines)
+    present({"settings": plan.space, "preview": preview}, shown, "", *preview.figures, *preview.proposal)
 
 
 @app.command()

@@ -120,6 +120,10 @@ def import_(
     protocol: ProtocolId = "tum-rgbd/v1",
     timestamps: Timestamps = None,
     topic: Annotated[Optional[str], typer.Option(help="Of a bag: the topic of the poses.")] = None,  # noqa: UP045
+    truth: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Ground truth (TUM) of a sequence whose images are not here; coverage is unknown then."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Put a trajectory from elsewhere beside our own runs."""
@@ -138,6 +142,7 @@ def import_(
         camera=camera,
         timestamps=timestamps,
         topic=topic,
+        truth=truth,
     )
     show_runs([record], store, protocol)
     if record.status == "lost":

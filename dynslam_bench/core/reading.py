@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dynslam_bench.core.errors import DynslamError, raising
+from dynslam_bench.core.sanitise import inside
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -144,6 +145,28 @@ def file_sha256(path: Path, progress: Callable[[int, int], object] = lambda done
             digest.update(block)
             progress(file.tell(), total)
     return digest.hexdigest()
+
+
+def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamError) -> list[str]:
+    """The files of a folder that are missing, or are not what a list of checksums says, one line each.
+
+    Args:
+        folder: The folder.
+        sums: The list, as ``sha256sum`` writes it.
+        kind: What is raised.
+
+    Raises:
+        DynslamError: Of the given kind: the list cannot be read, or names a file outside of the folder.
+    """
+    faults = []
+    for line in read_lines(sums, kind=kind):
+        expected, _, name = line.rstrip("\n").partition("  ")
+        path = inside(folder, name, where=str(sums), kind=kind)
+        if not path.is_file():
+            faults.append(f"{name} is missing")
+        elif file_sha256(path) != expected:
+            faults.append(f"{name} is not what {sums.name} says")
+    return faults
 
 
 def _too_large(path: Path, limit: int) -> str:

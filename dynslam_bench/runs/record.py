@@ -24,6 +24,11 @@ LOST_COVERAGE = 0.5
 """A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
 
 
+def coverage_text(coverage: float | None) -> str:
+    """The share of tracked frames for people."""
+    return "unknown" if coverage is None else f"{100 * coverage:.1f} %"
+
+
 def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
     """Code, weights and library versions in a run's identity, by name, as short texts."""
     code = digest([identity.get(name) for name in _CODE], 8)
@@ -154,7 +159,7 @@ class RunRecord(Record):
         n_lost: Frames with state ``lost``.
         n_initialising: Frames with state ``initialising``.
         n_dropped: Frames that never reached the tracker.
-        coverage: ``n_tracked / n_frames``.
+        coverage: ``n_tracked / n_frames``; None where the frames are not known, see `import_trajectory`.
         keyframes: Keyframes at the end, None if the tracker does not say.
         map_points: Map points at the end, None if the tracker does not say.
         maps: Maps at the end that never met, those of their own begun after a loss among them; None if the tracker does
@@ -208,7 +213,7 @@ class RunRecord(Record):
     n_lost: int = 0
     n_initialising: int = 0
     n_dropped: int = 0
-    coverage: float = 0.0
+    coverage: float | None = 0.0
     keyframes: int | None = None
     map_points: int | None = None
     maps: int | None = None
@@ -253,6 +258,15 @@ class RunRecord(Record):
         return self.status in FAILED
 
     @property
+    def incomplete(self) -> bool:
+        """Whether it is known that frames have no pose."""
+        return self.coverage is not None and self.coverage < 1
+
+    def public(self) -> RunRecord:
+        """The record for others: without the command line and the folders of the machine that made it."""
+        return self.model_copy(update={"command": [], "place": ""})
+
+    @property
     def asked(self) -> dict[str, Any]:
         """The settings that were asked for; in place of a map's path the digest of its content, as ``map``.
 
@@ -293,7 +307,7 @@ class RunRecord(Record):
     def describe(self) -> str:
         """One line: tracker, sequence, seed, status, coverage, frame time."""
         parts = [f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"]
-        parts.append(f"coverage {100 * self.coverage:.1f} %")
+        parts.append(f"coverage {coverage_text(self.coverage)}")
         if self.frame_time_s is not None:
             parts.append(f"{1000 * self.frame_time_s:.1f} ms a frame")
         return ", ".join(parts) + (f" ({self.reason})" if self.reason else "")

@@ -325,13 +325,17 @@ class RunStore:
         Raises:
             InfrastructureError: It cannot be written.
         """
+        self.copy_part(other, record)
+        with self.work_folder(record.run_id) as work:
+            shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
+            return self.publish(work, record)
+
+    def copy_part(self, other: RunStore, record: RunRecord) -> None:
+        """Copy the stamps and the ground truth of a run's part of a sequence, as far as they are not here."""
         for file in sorted(other._part(record.sequence.part).glob("*.txt")):
             target = self._part(record.sequence.part) / file.name
             if not target.is_file():
                 write_atomic(target, file.read_bytes())
-        with self.work_folder(record.run_id) as work:
-            shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
-            return self.publish(work, record)
 
     def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
         """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth; done once a part."""
@@ -621,8 +625,8 @@ class Merged:
     left_out: list[Unreadable]
 
 
-def merge(sources: Iterable[RunStore], store: RunStore) -> Merged:
-    """Copy the runs of stores into one; nothing that it holds is changed.
+def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) -> Merged:
+    """Copy the runs of stores into one, with or without the trials of studies; nothing that it holds is changed.
 
     A run is left out if its record is damaged or its stamps are lost, or if the store holds another result under its
     id, other stamps or another ground truth of its sequence.
@@ -636,6 +640,8 @@ def merge(sources: Iterable[RunStore], store: RunStore) -> Merged:
         records, unreadable = source.all()
         merged.left_out.extend(unreadable)
         for record in records:
+            if record.trial_of and not trials:
+                continue
             if reason := _why_left_out(source, record, store):
                 merged.left_out.append(Unreadable(source.folder(record.run_id), reason))
             elif store.get(record.run_id) is not None:

@@ -19,9 +19,9 @@ from dynslam_bench.core.download import CHUNK, MOST_BYTES, Progress, Report, dow
 from dynslam_bench.core.errors import DynslamError, SequenceError, did_you_mean
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.reading import file_sha256, read_lines, read_text
+from dynslam_bench.core.reading import compare_sums, read_text
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.core.sanitise import inside, is_inside, without_passwords
+from dynslam_bench.core.sanitise import is_inside, without_passwords
 from dynslam_bench.sequences.cameras import chosen_camera, find_camera
 from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of
@@ -258,23 +258,11 @@ def verify(
             progress(index + 1, len(sequence))
     manifest = folder / MANIFEST
     try:
-        faults += _compare(folder, manifest) if manifest.is_file() else []
+        faults += compare_sums(folder, manifest, SequenceError) if manifest.is_file() else []
     except SequenceError as error:
         faults.append(str(error))
     dropped = getattr(sequence, "dropped", None)
     return Verification(sequence.id, folder, len(sequence), tuple(faults), manifest.is_file(), dropped)
-
-
-def _compare(folder: Path, manifest: Path) -> list[str]:
-    faults = []
-    for line in read_lines(manifest, kind=SequenceError):
-        expected, _, name = line.rstrip("\n").partition("  ")
-        path = inside(folder, name, where=str(manifest), kind=SequenceError)
-        if not path.is_file():
-            faults.append(f"{name} is missing")
-        elif file_sha256(path) != expected:
-            faults.append(f"{name} is not what was fetched")
-    return faults
 
 
 def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:

@@ -147,12 +147,24 @@ class _Runner:
             self.report.alive()
             check_result(results[-1], frame)
             poses.append(np.array(results[-1].T_world_cam))
+        if isinstance(self.subject, TrackerSpec) and not self.subject.online:
+            results = _results_of(used.finalize(), frames)
+            poses = [np.array(result.T_world_cam) for result in results]
         for frame, result, pose in zip(frames, results, poses, strict=True):
             same = result.T_world_cam is None or np.array_equal(result.T_world_cam, pose)
             require(same, f"the pose of frame {frame.index} changed later", "return a copy of the state, not the state")
         if tracker is None:
             _close(used)
         return results
+
+
+def _results_of(final: Trajectory, frames: list[Frame]) -> list[TrackResult]:
+    """The final trajectory of a tracker that has no other one, frame by frame."""
+    poses = dict(zip(final.timestamps.tolist(), final.T_world_cam, strict=True))
+    return [
+        TrackResult(poses[frame.timestamp], "ok") if frame.timestamp in poses else TrackResult(None, "lost")
+        for frame in frames
+    ]
 
 
 def check_result(result: object, frame: Frame) -> None:
@@ -270,6 +282,8 @@ def _hard_frame(run: _Runner, name: str) -> None:
 
 
 def _final(run: _Runner, count: int | None = None) -> None:
+    if count == 1 and isinstance(run.subject, TrackerSpec) and not run.subject.online:
+        raise NotApplicable("a program for whole sequences may need more than one frame")
     tracker, frames = run.construct(), run.frames[:count]
     run.track(frames, tracker)
     finalises = callable(getattr(tracker, "finalize", None))

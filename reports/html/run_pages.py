@@ -34,7 +34,7 @@ from dynslam_bench.reports.tables.table import mm, significant_text
 from dynslam_bench.runs.artifacts import VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import CSV_FILE
-from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.record import RunRecord, coverage_text
 from dynslam_bench.runs.store import file_stamp, part_words
 
 Array = NDArray[np.float64]
@@ -261,7 +261,7 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
     lost = row.n_frames - row.n_tracked
     if score is not None and static and score >= static and not row.fixed_camera:
         return "amber", f"No better than a static camera: {error}"
-    if row.coverage < 1:
+    if row.incomplete:
         loss = _loss(frames, length)
         return "amber", f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}" + f". {loss}" * bool(loss)
     if row.hints:
@@ -301,7 +301,7 @@ def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
         f"RPE over {relative[0].describe()}" if relative else "RPE": (
             "" if relative is None else f"{mm(relative[1])} mm{'/s' * relative[0].rate}"
         ),
-        "coverage": f"{100 * row.coverage:.1f} %",
+        "coverage": coverage_text(row.coverage),
         "time of a frame": "" if row.frame_ms is None else f"{significant_text(row.frame_ms)} ms",
         "memory": "" if row.peak_memory_mb is None else f"{row.peak_memory_mb:.0f} MB",
     }
@@ -314,7 +314,7 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
         return []
     part = part_words(row)
     words = [f"{row.label} on {row.sequence.id}{part and f' [{part}]'}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm"]
-    words += ["lost frames held at the last pose", f"coverage {100 * row.coverage:.1f} %", protocol.describe()]
+    words += ["lost frames held at the last pose", f"coverage {coverage_text(row.coverage)}", protocol.describe()]
     words += [f"revision {row.git.revision[:10]}"] if row.git else []
     return [f"{', '.join(words)}.", *reservations([row])]
 

@@ -555,6 +555,12 @@ def make_cell(rows: Sequence[RunRow]) -> Cell:
     return Cell(tuple(ordered), tuple(kept))
 
 
+def mean_coverage(rows: Sequence[RunRow]) -> float | None:
+    """Mean over runs of the share of tracked frames; None if no run's is known."""
+    shares = [row.coverage for row in rows if row.coverage is not None]
+    return float(np.mean(shares)) if shares else None
+
+
 def mean_skipped(rows: Sequence[RunRow]) -> float | None:
     """Mean over runs of the share of frames on which the fundamental matrix was not used; None if none has it."""
     shares = [row.epipolar_skipped for row in rows if row.epipolar_skipped is not None]

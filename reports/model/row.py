@@ -343,7 +343,7 @@ def _hold_last_pose_error(
     if evaluation is None:
         return None
     error = evaluation.metrics["ate_rmse_m"]
-    if evaluation.coverage == 1.0:
+    if evaluation.coverage == 1.0 or record.coverage is None:
         return error
     with suppress(DynslamError):
         trajectory = store.trajectory(record.run_id, protocol.trajectory)

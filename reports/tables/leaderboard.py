@@ -14,7 +14,16 @@ import numpy as np
 from dynslam_bench.core.toml import label_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, Cell, compare_pairs, mean_skipped, rank
+from dynslam_bench.reports.model.board import (
+    OVERALL,
+    STATIC_CAMERA,
+    Board,
+    Cell,
+    compare_pairs,
+    mean_coverage,
+    mean_skipped,
+    rank,
+)
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
@@ -31,6 +40,7 @@ from dynslam_bench.reports.tables.table import (
     significant_text,
     texts,
 )
+from dynslam_bench.runs.record import coverage_text
 
 # -- the leaderboard, and cells that several tables share
 
@@ -165,7 +175,7 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
     """The cells of a tracker by the names of their columns; what is not known is left out."""
     runs = board.runs(key)
     ended = [row for row in runs if not row.failed]
-    coverage = float(np.mean([row.coverage for row in runs]))
+    coverage = mean_coverage(runs)
     hinted = _hinted(runs)
     masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
     tracker, skipped = runs[0].tracker, mean_skipped(runs)
@@ -173,7 +183,7 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
         "tracker": TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id),
-        "coverage": TableCell(f"{100 * coverage:.1f} %", value=coverage),
+        "coverage": TableCell(coverage_text(coverage), value=coverage),
         "× real time": speed_cell(ended),
         "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
         "rows": TableCell(tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items())),
@@ -625,7 +635,7 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
     cell = board.cells[key].get(sequence)
     if cell is None:
         return TableCell("–", emphasis="muted", tip="not run")
-    coverage = f"coverage {100 * float(np.mean([row.coverage for row in cell.rows])):.1f} %"
+    coverage = f"coverage {coverage_text(mean_coverage(cell.rows))}"
     link = run_link(cell.typical)
     count = "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
     if not cell.success:
@@ -680,7 +690,7 @@ def shade(ratio: float) -> float:
 
 def failure_rule_table(board: Board) -> Table | None:
     """How much the ranking depends on how failures and lost frames are counted; None if nothing was lost."""
-    if not board.ranked or all(row.coverage >= 1 and not row.failed for row in board.rows):
+    if not board.ranked or not any(row.incomplete or row.failed for row in board.rows):
         return None
     rules: dict[str, Callable[[RunRow], float | None]] = {
         "lost frames held": lambda row: row.score_m,
@@ -731,7 +741,7 @@ def failures(board: Board) -> Table | None:
             TableCell(board.sequence(row)),
             TableCell(row.repeat),
             TableCell(row.ending),
-            TableCell(f"{100 * row.coverage:.1f} %", value=row.coverage),
+            TableCell(coverage_text(row.coverage), value=row.coverage),
             TableCell(row.reason),
             TableCell(row.run_id, link=run_link(row)),
         ]
@@ -944,4 +954,4 @@ def skipped_words(cell: Cell) -> str:
 
 def has_lost(cell: Cell | None) -> bool:
     """Whether frames were lost in a run that succeeded: the errors of the cell are of the tracked ones only."""
-    return cell is not None and any(row.coverage < 1 for row in cell.kept if not row.failed)
+    return cell is not None and any(row.incomplete for row in cell.kept if not row.failed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,13 @@ import toy_tracker
 from optuna.trial import TrialState
 from simulated import SimulatedTuner, make_spec, valley
 
+from dynslam_bench.cli.studies import status
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning import Plan, StudySpec, Verdict, finish, read_preset_text, run_study, write_page
+from dynslam_bench.tuning.objectives import InstanceFailedError, Outcome
 from dynslam_bench.tuning.storage import EARLIER, best_trials, importances
-from dynslam_bench.tuning.study_file import SpaceSpec
+from dynslam_bench.tuning.study_file import ProblemInstance, SpaceSpec
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 
@@ -44,7 +46,7 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(folders: l
     run_study(make(folders), results=tmp_path)
     after = Plan(make(folders), tmp_path).preview(jobs=2)
     assert after.runs == 3 and after.spread != before.spread and after.minutes != before.minutes
-    assert after.unused == {} and "10 %" in after.lines[0] and "3 stored runs" in after.lines[0]
+    assert after.unused == {} and "10 %" in after.figures[0] and "3 stored runs" in after.figures[0]
 
 
 def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Path) -> None:
@@ -61,9 +63,9 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     Study(spec, tmp_path).reference()
     preview = plan.preview()
     assert {name.split(".")[0] for name in preview.unused} == {"epipolar"}
-    assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.lines[-1]
+    assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.proposal[-1]
     alone = spec.model_copy(update={"space": SpaceSpec(include=("epipolar.*",))})
-    assert Plan(alone, tmp_path).preview().lines[-1] == "Nothing would be left of the space without them."
+    assert Plan(alone, tmp_path).preview().proposal[-1] == "Nothing would be left of the space without them."
 
 
 def test_ratios_are_to_the_baseline_and_the_default_stands_beside(folders: list[str], tmp_path: Path) -> None:
@@ -204,3 +206,45 @@ def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_pat
     summary = finish(tuner)
     assert summary.verdict == Verdict.NOT_JUDGED and "no trial with other settings" in summary.conclusion
     assert read_settings(tuner.folder / "best.toml") == {} and write_page(tuner, summary).is_file()
+
+
+def test_one_recording_alone_is_not_judged(
+    folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tuner = run_study(make(folders, confirm=[], held_out=[], trials=3), results=tmp_path)
+    summary = finish(tuner)
+    assert summary.verdict == Verdict.NOT_JUDGED and "no frames are left" in summary.conclusion
+    assert summary.best is not None and summary.best.confirm is None and summary.p_value is None
+    page = write_page(tuner, summary).read_text()
+    assert summary.conclusion in page and "not recommended: not judged" in page
+    status(tuner.folder)
+    assert "no frames are left" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(StudyError, match="scenes can be made of rendered sequences alone"):
+        tuner.extend(scenes=1)
+
+
+def test_scenes_of_uneven_lengths_and_starts_count_alike(folders: list[str], tmp_path: Path) -> None:
+    uneven = [f"{folders[0]}?offsets=0-2", f"{folders[1]}[0:8]", f"{folders[2]}?stride=2&offsets=0,3"]
+    tuner = run_study(make(folders, tune=uneven, confirm=folders[3:6], held_out=[]), results=tmp_path)
+    trial = tuner.study.get_trials()[1]
+    assert len(trial.user_attrs["instances"]) == 6 and len(trial.user_attrs["scenes"]) == 3
+    assert trial.value == pytest.approx(sum(trial.user_attrs["scenes"].values()) / 3)
+    assert finish(tuner).candidates[0].confirm.sequences == 3
+
+
+class CrashingBaseline(SimulatedTuner):
+    """Its baseline crashes on the scenes of the choice."""
+
+    def outcomes(
+        self, settings: Mapping[str, Any], instances: Sequence[ProblemInstance], **how: Any
+    ) -> dict[ProblemInstance, Outcome]:
+        if not settings and set(instances) & set(self.design.confirm):
+            raise InstanceFailedError(f"{instances[0]}: crashed: it broke")
+        return super().outcomes(settings, instances, **how)
+
+
+def test_a_baseline_that_crashes_where_it_judges_is_one_clear_line(tmp_path: Path) -> None:
+    tuner = CrashingBaseline(make_spec(trials=3), tmp_path)
+    tuner.run()
+    with pytest.raises(StudyError, match=r"^the baseline fails: \S+: crashed: it broke"):
+        finish(tuner)

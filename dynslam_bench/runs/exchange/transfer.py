@@ -20,15 +20,25 @@ from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.envs.arguments import Frames, open_frames
 from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE
-from dynslam_bench.geometry import Array, Trajectory, associate, nearest_gap, write_kitti, write_tum
+from dynslam_bench.geometry import (
+    Array,
+    Trajectory,
+    associate,
+    nearest_gap,
+    read_tum,
+    to_seconds,
+    write_kitti,
+    write_tum,
+)
 from dynslam_bench.runs.exchange.formats import read_trajectory, write_bag, write_colmap, write_euroc, write_vslam_lab
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
-from dynslam_bench.runs.record import RunRecord, TrackerInfo
+from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo
 from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore
-from dynslam_bench.sequences.catalogue import parse_frames
-from dynslam_bench.sequences.view import part_of
+from dynslam_bench.sequences.catalogue import entry_of, parse_frames
+from dynslam_bench.sequences.tags import motion_tags
+from dynslam_bench.sequences.view import Part, part_of
 from dynslam_bench.slam.map_files import read_ply
 
 Which = Literal["online", "final"]
@@ -103,9 +113,8 @@ def export_run(
     with atomic_folder(target) as work:
         notes = FORMATS[form](_Job(store, record, chosen, trajectory, data_root, camera), work)
         digests = {path.name: digest_of(path) for path in sorted(work.iterdir()) if path.is_file()}
-        public = record.model_copy(update={"command": [], "place": ""})
         written_by = dynslam_bench.__version__
-        provenance = Provenance(format=form, files=digests, which=chosen, run=public, written_by=written_by)
+        provenance = Provenance(format=form, files=digests, which=chosen, run=record.public(), written_by=written_by)
         write_atomic(work / PROVENANCE_FILE, provenance.to_json())
     return Exported(target, (*digests, PROVENANCE_FILE), chosen, tuple(notes))
 
@@ -291,6 +300,7 @@ def import_trajectory(
     camera: str | Path | None = None,
     timestamps: str | Path | None = None,
     topic: str | None = None,
+    truth: str | Path | None = None,
 ) -> RunRecord:
     """Store an external trajectory as a record of kind ``imported``.
 
@@ -309,6 +319,8 @@ def import_trajectory(
         timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one each, in seconds, for
             COLMAP a list of stamps and images.
         topic: Of a bag with several topics of poses, the one to take.
+        truth: Ground truth in TUM's format of a sequence whose images are not here. Its frames are not known then, and
+            so is the coverage.
 
     Returns:
         The record, ``lost`` by the rule of runs (`judge_coverage`); its notes count poses whose stamps are no frame's.
@@ -322,13 +334,21 @@ def import_trajectory(
         raise RunError("an imported trajectory needs the name of its tracker")
     file = Path(path).expanduser()
     loaded = read_trajectory(file, timestamps, topic)
-    opened = open_frames(sequence, data_root, camera, frames, stride)
-    covered, odd, last = _join(loaded.trajectory, opened.timestamps, f"{file} shares", f"'{opened.id}'")
-    notes, total = loaded.notes.describe(), len(opened)
-    if odd:
+    notes, opened, stated = loaded.notes.describe(), None, None
+    if truth is None:
+        opened = open_frames(sequence, data_root, camera, frames, stride)
+        part, stamps = part_of(opened), timestamps_ns(opened)
+    else:
+        stated = read_tum(Path(truth).expanduser())
+        part, stamps = _part_by_truth(sequence, stated), stated.timestamps_ns
+    covered, odd, last = _join(loaded.trajectory, to_seconds(stamps), f"{file} shares", f"'{part.id}'")
+    total = len(stamps)
+    if opened is None:
+        covered, total, last = len(loaded.trajectory), len(loaded.trajectory), len(loaded.trajectory) - 1
+        notes.append("coverage is unknown: the images of the sequence were not here, and so its frames are not known")
+    elif odd:
         notes.append(f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's")
     status, reason = judge_coverage(covered, total, total - 1 - last, total)
-    part = part_of(opened)
     identity = {
         "kind": "imported",
         "tracker": tracker,
@@ -342,34 +362,59 @@ def import_trajectory(
         **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
         **({} if topic is None else {"topic": topic}),
     }
+    named = part_digest(identity)
+    info = sequence_info(opened, part.content, named) if stated is None else _info_by_truth(part, stated, named)
     record = RunRecord(
         kind="imported",
         run_id=digest(identity, 16),
         status=status,
         reason=reason,
         tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),
-        sequence=sequence_info(opened, part.content, part_digest(identity)),
+        sequence=info,
         frames=None if frames is None else parse_frames(frames),
         stride=stride,
         n_frames=total,
         n_tracked=covered,
         n_lost=total - covered,
-        coverage=covered / total,
+        coverage=None if opened is None else covered / total,
         started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(),
         identity=identity,
         provenance=provenance or stated_provenance(file) or str(file),
-        place=place_of(sequence),
-        stamps_match=not odd,
+        place="" if opened is None else place_of(sequence),
+        stamps_match=not odd and opened is not None,
         notes=notes,
     ).normalised()
     store = results if isinstance(results, RunStore) else RunStore(results)
     store.prepare()
     with store.work_folder(record.run_id) as work:
-        write_tum(work / f"trajectory_{which}.txt", loaded.trajectory, comment=f"imported: {tracker} on {opened.id}")
-        store.add_sequence(record.sequence.part, timestamps_ns(opened), opened.ground_truth)
+        write_tum(work / f"trajectory_{which}.txt", loaded.trajectory, comment=f"imported: {tracker} on {part.id}")
+        store.add_sequence(record.sequence.part, stamps, opened.ground_truth if opened else stated)
         store.publish(work, record)
     return record
+
+
+def _part_by_truth(sequence: str, truth: Trajectory) -> Part:
+    """The whole of a sequence of which only the ground truth is here."""
+    entry, content = entry_of(sequence), digest([truth.timestamps_ns.tolist(), truth.T_world_cam.round(9).tolist()])
+    return Part(sequence if entry is None else entry.id, content, content, {}, 0, len(truth), 1, None)
+
+
+def _info_by_truth(part: Part, truth: Trajectory, named: str) -> SequenceInfo:
+    """What is known of it: the catalogue's entry and the camera's motion."""
+    entry = entry_of(part.id)
+    stated = {} if entry is None else {name: getattr(entry, name) for name in ("fps", "license", "citation", "split")}
+    return SequenceInfo(
+        id=part.id,
+        content=part.content,
+        part=named,
+        block=part.block,
+        frames=len(truth),
+        duration_s=float(truth.timestamps[-1] - truth.timestamps[0]),
+        ground_truth=True,
+        tags=sorted({*(entry.tags if entry else ()), *motion_tags(truth)}),
+        **({"fps": 0.0} | stated),
+    )
 
 
 def _join(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> tuple[int, int, int]:

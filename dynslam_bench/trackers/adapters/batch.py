@@ -91,6 +91,7 @@ class BatchTracker:
             "associations": folder / "sequence" / "associations.txt",
             "camera": settings,
             "output": output,
+            "folder": folder,
             "threads": self._context.threads,
         }
         self._write_lists(folder / "sequence")
@@ -110,12 +111,14 @@ class BatchTracker:
         ended = f"killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
         if not output.is_file():
             raise TrackerError(f"{program.name}: {ended}, and wrote no {program.output}; {words_said}", hint)
-        self.measured["notes"] = [f"the program {ended}; {words_said}"] if code else []
         try:
-            return self._read(output)
+            trajectory = self._read(output)
         except TrajectoryError as error:
             text = str(error).replace(str(output), program.output)
             raise TrackerError(f"{program.name}: {text}; it {ended}; {words_said}") from None
+        odd = code or len(trajectory) < len(self._stamps)
+        self.measured["notes"] = [f"the program {ended}; {words_said}"] if odd else []
+        return trajectory
 
     def close(self) -> None:
         """Remove the folder; may be called more than once."""

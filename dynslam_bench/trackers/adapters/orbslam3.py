@@ -6,7 +6,6 @@ import hashlib
 import lzma
 import math
 import os
-import sys
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-import dynslam_bench
 from dynslam_bench.contracts import TrackerContext
 from dynslam_bench.core.errors import TrackerError, raising
 from dynslam_bench.core.files import write_atomic
@@ -22,7 +20,11 @@ from dynslam_bench.core.folders import vocabularies_folder
 from dynslam_bench.core.reading import MEGABYTE, read_bytes
 from dynslam_bench.geometry import Camera
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
-from dynslam_bench.trackers.adapters.subprocess_tracker import FinalizingProgramTracker, ProgramTracker
+from dynslam_bench.trackers.adapters.subprocess_tracker import (
+    FinalizingProgramTracker,
+    ProgramTracker,
+    python_program,
+)
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
 HINT = (
@@ -166,14 +168,7 @@ class OrbSlam3Program(ProgramTracker):
 
     def __init__(self, settings: OrbSlam3Settings, context: TrackerContext) -> None:
         self.settings, self._vocabulary = settings, find_vocabulary(settings.vocabulary)
-        packages = [str(Path(dynslam_bench.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
-        super().__init__(
-            "orbslam3",
-            settings,
-            context,
-            [sys.executable, "-m", WORKER],
-            environment={"PYTHONPATH": os.pathsep.join(filter(None, packages))},
-        )
+        super().__init__("orbslam3", settings, context, **python_program(WORKER))
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Write its settings file from the camera, start it and load the vocabulary.

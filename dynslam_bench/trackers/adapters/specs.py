@@ -9,6 +9,7 @@ import os
 import re
 import shlex
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -109,8 +110,9 @@ class BatchProgram(Record):
     Attributes:
         name: Shown in tables.
         command: Program and arguments, run without a shell. ``{sequence}`` (a folder in TUM layout), ``{camera}``
-            (ORB-SLAM's YAML), ``{associations}``, ``{output}``, ``{threads}`` and ``{here}`` (the TOML file's folder)
-            are put in. A word that names a file below that folder is that file.
+            (ORB-SLAM's YAML), ``{associations}``, ``{output}``, ``{folder}`` (which holds these), ``{threads}``,
+            ``{here}`` (the TOML file's folder) and ``{python}`` (this one) are put in. A word that names a file below
+            the TOML file's folder is that file.
         output: What it writes, in its working folder, which is new for every run.
         format: ``tum`` (stamp tx ty tz qx qy qz qw, camera to world), or ``indices``: the frame's index for the stamp.
         sensors: ``rgb`` for a program without depth.
@@ -135,7 +137,7 @@ class BatchProgram(Record):
         words = [
             str(here / word) if re.search(r"[./]", word) and (here / word).is_file() else word for word in self.command
         ]
-        for name, place in {"here": str(here), **places}.items():
+        for name, place in {"here": str(here), "python": sys.executable, **places}.items():
             words = [word.replace(f"{{{name}}}", place) for word in words]
         return words
 
@@ -192,6 +194,24 @@ class OrbSlam3Settings(ProgramSettings):
     )
     close_depth_baselines: float = tunable(
         40.0, meaning="points nearer than this many baselines count as close", low=20, high=80, limits=(1, 1000)
+    )
+
+
+class SvoSettings(ProgramSettings):
+    """Settings of `svo`."""
+
+    features: int = tunable(120, meaning="features a frame", low=60, high=400, scale="log", limits=(20, 5000))
+    init_disparity_px: float = tunable(
+        50.0,
+        meaning="median disparity at which the map begins",
+        low=10,
+        high=80,
+        scale="log",
+        limits=(1, None),
+        unit="px",
+    )
+    max_lost_features: int = tunable(
+        40, meaning="a frame that loses more features is lost", low=20, high=400, scale="log", limits=(1, None)
     )
 
 
@@ -326,6 +346,24 @@ ORBSLAM3_MONO = replace(
     ),
 )
 
+SVO = TrackerSpec(
+    id="svo",
+    entry_point=f"{_HERE}.svo:Svo",
+    label="SVO",
+    settings=SvoSettings,
+    summary="The real SVO (monocular, semi-direct), untouched, in a process of its own.",
+    sensors="rgb",
+    deterministic=False,
+    provenance="external",
+    license="GPL-3.0-or-later",
+    citation="C. Forster, M. Pizzoli, D. Scaramuzza, SVO: Fast semi-direct monocular visual odometry, ICRA 2014",
+    requires={"svo_cpp": "pip install --no-deps svo-cpp (Linux x86-64)"},
+    remarks=(
+        "Made for cameras that look down with a wide view. Assumes a static world, and after a loss only relocalises. "
+        "Its scale is free. Images are undistorted for it. Its package asks for a second OpenCV, which it never loads."
+    ),
+)
+
 OPENCV_ODOMETRY = TrackerSpec(
     id="opencv-odometry",
     entry_point=f"{_HERE}.odometry:OpenCvOdometry",
@@ -354,6 +392,7 @@ OPEN3D_ODOMETRY = TrackerSpec(
 )
 
 ADAPTERS = (
-    NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, BATCH, ORBSLAM3, ORBSLAM3_MONO, OPENCV_ODOMETRY, OPEN3D_ODOMETRY,
+    NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, BATCH, ORBSLAM3, ORBSLAM3_MONO, SVO, OPENCV_ODOMETRY,
+    OPEN3D_ODOMETRY,
 )  # fmt: skip
 """The control trackers and the adapters."""

@@ -25,6 +25,7 @@ from typing import IO, Any, Literal, cast, get_args
 import cv2
 import numpy as np
 
+import dynslam_bench
 from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError, raising
@@ -475,6 +476,15 @@ class ProgramTracker:
         if self._program is None:
             raise TrackerError(f"{self.name} was used before reset() or after close()")
         return self._program.ask(request, timeout_s, doing)
+
+
+def python_program(module: str) -> dict[str, Any]:
+    """``command`` and ``environment`` of a `ProgramTracker` that runs a module of this package."""
+    packages = [str(Path(dynslam_bench.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
+    return {
+        "command": [sys.executable, "-m", module],
+        "environment": {"PYTHONPATH": os.pathsep.join(filter(None, packages))},
+    }
 
 
 class FinalizingProgramTracker(ProgramTracker):

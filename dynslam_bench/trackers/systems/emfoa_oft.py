@@ -1,6 +1,6 @@
 """EMFOA-OFT-SLAM as the paper describes it, this project's system made from it, and the ablations of both.
 
-An ablation is a variant: its id names the system and what differs, as in ``emfoa-oft?masks=none``.
+A variant of a system is an ablation, but for ``emfoa-oft?masks=none``, a system of its own: its id says what differs.
 
 The paper: masks of an improved Mask R-CNN drop the features on people; DAISY Filter Flow, optimised by the elite
 moth-flame algorithm, matches the remaining ORB points with the previous image; the fundamental matrix of those matches
@@ -108,7 +108,6 @@ def _spec(name: str, label: str, base: type[SystemSettings], groups: Groups, sum
 
 VARIANTS: dict[str, tuple[type[SystemSettings], Groups, str]] = {
     "emfoa-oft?depth=none": (SemanticSystemSettings, EPIPOLAR, "without the tests of depth, which are ours"),
-    "emfoa-oft?masks=none": (SystemSettings, OWN, "geometry alone"),
     "emfoa-oft?masks=none&depth=none": (SystemSettings, EPIPOLAR, "the guarded epipolar test alone"),
     "emfoa-oft?masks=vote": (
         SemanticSystemSettings,
@@ -169,6 +168,13 @@ SPECS = (
         EPIPOLAR,
         "our own system without depth: masks, EMFOA-optimised sparse flow, guarded epipolar test",
         sensors="rgb",
+    ),
+    _spec(
+        "emfoa-oft?masks=none",
+        "EMFOA-OFT without masks, our own (our back end)",
+        SystemSettings,
+        OWN,
+        "our own system without masks: EMFOA-optimised sparse flow, guarded epipolar test, tests of depth",
     ),
     *(
         _spec(name, f"{name} (ablation)", base, groups, f"ablation: {difference}", ranked=False)

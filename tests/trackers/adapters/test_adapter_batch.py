@@ -1,8 +1,8 @@
 """Programs that read a whole sequence and write one trajectory at its end."""
 
 import importlib.util
-import lzma
-import shutil
+import os
+import re
 import sys
 from pathlib import Path
 
@@ -14,9 +14,15 @@ from test_adapter_orbslam3 import PACKED, XYZ
 
 from dynslam_bench import api as db
 from dynslam_bench.core.errors import SettingsError, TrackerError, TrackerTimeoutError
+from dynslam_bench.geometry import Trajectory, se3, write_tum
 from dynslam_bench.reports.model.board import load_board
 from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.readers.layouts import read_vslam_lab
+from dynslam_bench.testing import CornerSequence, TurningSequence, isolated_tracker_report
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
+from dynslam_bench.trackers.adapters.specs import BatchSettings
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples" / "batch"
 
 HEAD = """
 import os, sys, time
@@ -159,21 +165,106 @@ def test_the_record_and_the_board_say_that_only_the_final_trajectory_exists(toml
     assert board.runs(board.final_only[0])[0].trajectory == "final"
 
 
+ROWS = {
+    "no file": ("print('loading'); sys.exit('no licence')", "crashed", "exit code 1, and wrote no .*'no licence'"),
+    "half a file": ("write([[row[0], 0] for row in rows[:3]]); print('lost')", "lost", "tracked on 3 of 12.*'lost'"),
+    "no stamps": ("write(rows, '1 0 0 0 0 1 0 0 0 0 1 0'); print('bye')", "crashed", "line 1.*'bye'"),
+    "another clock": ("write([[9e5 + i, 0] for i in range(12)]); print('bye')", "crashed", "stamps from 900000.*'bye'"),
+    "never ends": ("print('frame 3', flush=True); time.sleep(60)", "timeout", "not done within 2 s.*'frame 3'"),
+    "needs a display": ("sys.exit('Failed to open X display')", "crashed", "'Failed to open X display'.*xvfb-run"),
+}
+
+
+@pytest.mark.parametrize("code, status, words", ROWS.values(), ids=ROWS)
+def test_each_way_to_fail_is_a_row_with_the_program_s_last_words(toml, toy_folder, tmp_path, code, status, words):
+    settings = {"timeout_s": 2}
+    run = db.run(f"batch:{toml(code)}", toy_folder, frames=(0, 12), settings=settings, results=tmp_path / "results")
+    assert run.status == status
+    assert re.search(words, " ".join([run.record.reason, *run.record.notes]))
+
+
+BY_HEART = """
+width = next(line.split()[1] for line in open(camera) if line.startswith("Camera.width"))
+truth = [line.split() for line in open(os.path.join(os.path.dirname(__file__), width + ".txt")) if line[0] != "#"]
+write([pose for pose in truth if float(pose[0]) in {float(row[0]) for row in rows}], "{} {} {} {} {} {} {} {}")
+"""
+
+
+@pytest.mark.parametrize("inverted", [False, True], ids=["good", "world to camera"])
+def test_the_conformance_kit_checks_the_final_trajectory(toml, tmp_path, inverted):
+    path = toml(BY_HEART)
+    for scene in (CornerSequence(4), TurningSequence()):
+        truth = scene.ground_truth
+        poses = se3.inverse(truth.T_world_cam) if inverted else truth.T_world_cam
+        write_tum(tmp_path / f"{scene.camera.width}.txt", Trajectory(truth.timestamps, poses))
+    report = isolated_tracker_report(f"batch:{path}", frames=4)
+    statuses = {check.name: check.status for check in report.checks}
+    assert [check.name for check in report.failed] == ["camera to world"] * inverted, report.checks
+    assert statuses["results"] == statuses["final trajectory"] == statuses["two resets"] == "passed"
+    assert statuses["one frame"] == "skipped"
+
+
+def test_the_conformance_kit_names_what_a_program_does_wrong(toml):
+    report = isolated_tracker_report(f"batch:{toml('sys.exit(7)')}", frames=4)
+    assert [check.name for check in report.failed] == ["results"] and "exit code 7" in report.failed[0].message
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)
+def test_the_examples_describe_programs(file):
+    program, here = BatchSettings(program=str(file)).read()
+    words = program.words(here, **dict.fromkeys(("sequence", "camera", "associations", "output", "folder"), "/x"))
+    assert not any(re.search(r"\{\w+\}", word) for word in words)
+    scripts = [word for word in words if word.endswith(".py") and Path(word).is_absolute()]
+    assert all(Path(script).is_file() for script in scripts) and program.license
+
+
+PIXI = r"""#!{python}
+import pathlib, sys
+assert sys.argv[1:6] == ["run", "--frozen", "-e", "dpvo", "execute-mono"]
+stated = dict(zip((key[2:] for key in sys.argv[6::2]), sys.argv[7::2]))
+rows = [line.split(",") for line in open(stated["rgb_csv"]).read().splitlines()[1:]]
+assert all(pathlib.Path(stated["sequence_path"], row[1]).is_file() for row in rows)
+poses = "".join(row[0] + ",0.5,0,0,0,0,0,1\n" for row in rows)
+heading = "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n"
+pathlib.Path(stated["exp_folder"], "00000_KeyFrameTrajectory.csv").write_text(heading + poses)
+"""
+
+
+def test_a_system_of_vslam_lab_gets_its_tables(tmp_path, toy_folder, monkeypatch):
+    """Our own reader of VSLAM-LAB's layout reads the tables; a program in pixi's place writes VSLAM-LAB's poses."""
+    (tmp_path / "pixi").write_text(PIXI.format(python=sys.executable))
+    (tmp_path / "pixi").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    for file in EXAMPLES.glob("vslam_lab.*"):
+        (tmp_path / file.name).write_text(file.read_text().replace("/opt/VSLAM-LAB", str(tmp_path)))
+    with (tmp_path / "vslam_lab.py").open("a") as script:
+        script.write(f"import shutil\nshutil.copytree('.', {str(tmp_path / 'seen')!r})\n")
+    trajectory, _, sequence = ran(tmp_path / "vslam_lab.toml", toy_folder)
+    assert np.allclose(trajectory.timestamps, sequence.timestamps, atol=1e-6)
+    assert np.allclose(trajectory.positions[:, 0], 0.5)
+    camera = read_vslam_lab(tmp_path / "seen", None).camera
+    assert camera.matrix == pytest.approx(sequence.camera.matrix) and camera.width == sequence.camera.width
+
+
 @pytest.mark.skipif(importlib.util.find_spec("pyorbslam3") is None, reason="pyorbslam3 is not installed")
 @pytest.mark.skipif(
     not (PACKED.is_file() and XYZ.is_dir()), reason="no ORB vocabulary or TUM excerpt beside the checkout"
 )
-def test_orb_slam3_as_a_batch_program(tmp_path):
+def test_orb_slam3_as_a_batch_program(tmp_path, monkeypatch):
     """Its final trajectory is as near to the truth as that of the same system, frame by frame."""
-    (tmp_path / "words.txt").write_bytes(lzma.decompress(PACKED.read_bytes()))
-    shutil.copy(Path(__file__).with_name("orbslam3_batch.py"), tmp_path)
-    arguments = ["words.txt", "{camera}", "{sequence}", "{associations}", "{output}"]
-    command = [sys.executable, "orbslam3_batch.py", *arguments]
-    (tmp_path / "orb.toml").write_text(f"name = 'ORB-SLAM3'\ncommand = {command!r}\n")
+    monkeypatch.setenv("DYNSLAM_BENCH_ORB_VOCABULARY", str(PACKED))
     how = {"frames": (0, 40), "results": tmp_path / "results", "protocol": "tum-rgbd/v1"}
-    batch = db.run(f"batch:{tmp_path / 'orb.toml'}", XYZ, **how)
-    online = db.run("orbslam3", XYZ, settings={"vocabulary": str(tmp_path / "words.txt")}, **how)
+    batch = db.run(f"batch:{EXAMPLES / 'orb_slam3.toml'}", XYZ, **how)
+    online = db.run("orbslam3", XYZ, **how)
     assert batch.status == online.status == "ok" and batch.record.coverage == 1.0
     final = online.store.score(online.record, "tum-rgbd/v1").final.metrics["ate_rmse_m"]
     assert batch.metrics["ate_rmse_m"] == pytest.approx(final, rel=0.5) and final < 0.03
     assert batch.record.peak_memory_mb > 100
+
+
+@pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="open3d is not installed (its wheel has 400 MB)")
+@pytest.mark.skipif(not XYZ.is_dir(), reason="no TUM excerpt beside the checkout")
+def test_open3d_as_a_batch_program(tmp_path):
+    run = db.run(f"batch:{EXAMPLES / 'open3d.toml'}", XYZ, frames=(0, 20), results=tmp_path)
+    assert run.status == "ok" and run.record.coverage == 1.0
+    assert run.metrics["ate_rmse_m"] < 0.5 * run.metrics["static_camera_ate_rmse_m"]

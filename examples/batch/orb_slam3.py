@@ -1,4 +1,7 @@
-"""ORB-SLAM3 as its program `rgbd_tum` runs it: VOCABULARY CAMERA SEQUENCE ASSOCIATIONS OUTPUT."""
+"""ORB-SLAM3 on a whole sequence, as its program `rgbd_tum` does it: CAMERA SEQUENCE ASSOCIATIONS OUTPUT.
+
+Needs `pip install '.[orbslam3]'` and the vocabulary's path in $DYNSLAM_BENCH_ORB_VOCABULARY.
+"""
 
 import os
 import sys
@@ -7,15 +10,16 @@ from pathlib import Path
 import cv2
 import pyorbslam3
 
+from dynslam_bench.trackers.adapters.orbslam3 import find_vocabulary
 
-def main(vocabulary: str, camera: str, sequence: str, associations: str, output: str) -> None:
-    """Track every pair of images, then save the trajectory."""
+
+def main(camera: str, sequence: str, associations: str, output: str) -> None:
     settings = cv2.FileStorage(camera, cv2.FILE_STORAGE_READ)
     factor = settings.getNode("DepthMapFactor").real()
     own = Path("camera.yaml")  # the bindings take depth in metres
     text = Path(camera).read_text()
     own.write_text(text.replace(f"RGBD.DepthMapFactor: {factor}", "RGBD.DepthMapFactor: 1.0"))
-    slam = pyorbslam3.Slam(vocabulary, str(own), pyorbslam3.Sensor.RGBD)
+    slam = pyorbslam3.Slam(str(find_vocabulary("")), str(own), pyorbslam3.Sensor.RGBD)
     for line in Path(associations).read_text().splitlines():
         stamp, rgb, _, depth = line.split()
         image = cv2.cvtColor(cv2.imread(f"{sequence}/{rgb}"), cv2.COLOR_BGR2RGB)

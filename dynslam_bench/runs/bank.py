@@ -1,0 +1,272 @@
+"""A bank of trajectories: a results folder of text files alone, with checksums, that is exchanged and scored again.
+
+It holds ``runs/<run_id>/`` with ``run.json`` and the trajectories, ``sequences/<part>/`` with stamps and ground truth,
+and ``SHA256SUMS`` of them all, in the format of ``sha256sum -c``. Whatever reads a results folder reads a bank.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+from pydantic import ConfigDict, Field
+
+from dynslam_bench.core.download import download
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, raising
+from dynslam_bench.core.files import TemporaryFolder, replace_folder, write_atomic
+from dynslam_bench.core.reading import compare_sums, file_sha256, read_lines
+from dynslam_bench.core.records import Record, digest, validated
+from dynslam_bench.core.toml import read_toml
+from dynslam_bench.runs.exchange.transfer import Which, import_trajectory
+from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, merge
+from dynslam_bench.sequences.fetch import extract
+
+SUMS = "SHA256SUMS"
+_PARTS = ("runs", "sequences")
+_ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
+_REPOSITORY = re.compile(r"[a-z+]+://.*|[\w.-]+@[\w.-]+:.*")
+
+
+class Bank(RunStore):
+    """A results folder that takes of a run what scores are computed from, and nothing of the machine that made it."""
+
+    def copy_from(self, other: RunStore, record: RunRecord) -> RunRecord:
+        """Copy the record, the trajectories, the stamps and the ground truth of a run.
+
+        Raises:
+            InfrastructureError: It cannot be written.
+        """
+        self.copy_part(other, record)
+        with self.work_folder(record.run_id) as work:
+            for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
+                if file.is_file():
+                    shutil.copyfile(file, work / file.name)
+            with raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space"):
+                (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
+                replace_folder(work, self.folder(record.run_id))
+        return record
+
+    def files(self) -> list[str]:
+        """Names of the files that its checksums are of, links and hidden ones included, relative to it."""
+        paths = (path for part in _PARTS for path in (self.root / part).rglob("*"))
+        return sorted(path.relative_to(self.root).as_posix() for path in paths if path.is_symlink() or path.is_file())
+
+
+class StatedTrajectory(Record):
+    """A table ``[[trajectory]]`` of a manifest.
+
+    Attributes:
+        file: A trajectory in TUM's format: an address, or a path from the manifest's folder.
+        sha256: Of the file.
+        tracker: Name of the system that made it.
+        label: Its name in tables.
+        sequence: Id of the sequence.
+        provenance: Where the file comes from; the address by default.
+        which: Whether its poses are the causal ones or those after the final optimisation.
+        truth: The ground truth, an address or a path, where the sequence's images are not here.
+        truth_sha256: Of the ground truth.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    file: str = Field(min_length=1)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    tracker: str = Field(min_length=1)
+    label: str = ""
+    sequence: str = Field(min_length=1)
+    provenance: str = ""
+    which: Which = "final"
+    truth: str = ""
+    truth_sha256: str = Field("", pattern="^([0-9a-f]{64})?$")
+
+
+class Manifest(Record):
+    """A file that names trajectories of others; they are fetched, and checked against their checksums."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    trajectory: list[StatedTrajectory]
+
+
+def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
+    """Add the runs of results folders and the trajectories of manifests to a bank; trials of studies are no results.
+
+    Args:
+        sources: Results folders, and manifests (``.toml``).
+        bank: The bank; it is made where there is none.
+
+    Returns:
+        What was added, what was there already, and what was left out, with reasons (see `merge`).
+
+    Raises:
+        RunError: A source holds no runs or is no manifest, or the bank has faults.
+        DynslamError: The bank cannot be written.
+    """
+    with ExitStack() as stack:
+        stores, left_out = [], list[Unreadable]()
+        for source in map(Path, sources):
+            if source.suffix == ".toml":
+                stores.append(RunStore(stack.enter_context(closing(TemporaryFolder())).path))
+                left_out += _import(source, stores[-1])
+            else:
+                stores.append(_with_runs(source))
+        merged = _merge(stores, bank)
+    return Merged(merged.added, merged.stored, left_out + merged.left_out)
+
+
+def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
+    """Import what a manifest names; yields what cannot be, with reasons."""
+    entries = validated(Manifest, read_toml(manifest, kind=RunError), str(manifest), RunError).trajectory
+    with closing(TemporaryFolder()) as folder:
+        for entry in entries:
+            try:
+                file = _fetched(entry.file, entry.sha256, manifest.parent, folder.path)
+                truth = _fetched(entry.truth, entry.truth_sha256, manifest.parent, folder.path) if entry.truth else None
+                import_trajectory(
+                    file, entry.tracker, entry.sequence, results=store, label=entry.label, which=entry.which,
+                    provenance=entry.provenance or entry.file, truth=truth,
+                )  # fmt: skip
+            except DynslamError as error:
+                yield Unreadable(Path(entry.file), str(error))
+
+
+def _fetched(place: str, sha256: str, base: Path, folder: Path) -> Path:
+    """A file of a manifest with this checksum; an empty one is not known."""
+    if _REPOSITORY.fullmatch(place):
+        target = folder / f"{digest(place)}.txt"
+        download(place, target, sha256=sha256 or None)
+        return target
+    with raising(RunError, f"cannot read {place}"):
+        actual = file_sha256(base / place)
+    if not actual.startswith(sha256):
+        raise RunError(f"{place} has the checksum {actual}, expected {sha256}")
+    return base / place
+
+
+def verify(bank: str | Path) -> list[str]:
+    """Every fault of a bank, one line each: files that are missing, changed or not listed, records that do not fit.
+
+    Raises:
+        RunError: There is no bank.
+    """
+    store = Bank(bank)
+    sums = store.root / SUMS
+    if not sums.is_file():
+        raise RunError(f"{store.root} is no bank: it has no {SUMS}", "make one: dynslam-bench bank add RESULTS BANK")
+    faults = compare_sums(store.root, sums, RunError)
+    listed = {line.rstrip("\n").partition("  ")[2] for line in read_lines(sums, kind=RunError)}
+    names = store.files()
+    faults += [f"{name} is a link" for name in names if (store.root / name).is_symlink()]
+    faults += [f"{name} is not listed in {SUMS}" for name in names if name not in listed]
+    records, unreadable = store.all()
+    faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
+    for record in records:
+        if record.run_id != digest(record.identity, 16):
+            faults.append(f"runs/{record.run_id}: its id is not that of what it says of itself")
+        if f"sequences/{record.sequence.part}/timestamps.txt" not in listed:
+            faults.append(f"runs/{record.run_id}: the stamps of its sequence are missing")
+    return faults
+
+
+def pull(source: str, bank: str | Path) -> Merged:
+    """Add the runs of another bank.
+
+    Args:
+        source: A folder, a git repository, or the address of an archive (``.zip``, ``.tgz``, ``.tar``).
+        bank: The bank that gets them.
+
+    Raises:
+        RunError: One of the two has faults, or the source is no bank.
+        DynslamError: It cannot be fetched, or the bank not be written.
+    """
+    with ExitStack() as stack:
+        folder = Path(source)
+        if _ARCHIVE.fullmatch(source):
+            work = stack.enter_context(closing(TemporaryFolder())).path
+            folder = work / "bank"
+            folder.mkdir()
+            download(source, work / "archive")
+            extract(work / "archive", folder)
+            folder = next((path.parent for path in sorted(folder.rglob(SUMS))), folder)
+        elif _is_repository(source):
+            folder = stack.enter_context(_cloned(source))
+        _check(folder)
+        return _merge([RunStore(folder)], bank)
+
+
+def push(bank: str | Path, target: str) -> Merged:
+    """Add the runs of a bank to another one.
+
+    Args:
+        bank: The bank.
+        target: A folder, or a git repository, which gets a commit.
+
+    Raises:
+        RunError: One of the two has faults, or git refuses, e.g. since another push came first.
+        DynslamError: The target cannot be written.
+    """
+    _check(bank)
+    if not _is_repository(target):
+        return _merge([RunStore(bank)], target)
+    with _cloned(target) as clone:
+        merged = _merge([RunStore(bank)], clone)
+        if merged.added:
+            _git(clone, "add", "--force", "--", SUMS, *_PARTS)
+            _git(clone, "commit", "--quiet", "--message", f"Add {len(merged.added)} runs")
+            _git(clone, "push", "--quiet", "origin", "HEAD")
+    return merged
+
+
+def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
+    """Merge stores into a bank without faults, and bring its checksums up to date."""
+    store = Bank(bank)
+    if (store.root / SUMS).exists() or store.files():
+        _check(bank)
+    merged = merge(sources, store, trials=False)
+    sums = (f"{file_sha256(store.root / name)}  {name}\n" for name in store.files())
+    write_atomic(store.root / SUMS, "".join(sums))
+    return merged
+
+
+def _check(bank: str | Path) -> None:
+    if faults := verify(bank):
+        raise RunError(f"{bank} has {len(faults)} faults, the first: {faults[0]}", "bank verify lists all")
+
+
+def _with_runs(folder: Path) -> RunStore:
+    store = RunStore(folder)
+    if not store.runs.is_dir():
+        raise RunError(f"there are no runs in {store.root}")
+    return store
+
+
+def _is_repository(place: str) -> bool:
+    """Whether a place is a git repository that has to be cloned: an address, or a bare one."""
+    bare = Path(place, "HEAD").is_file() and Path(place, "objects").is_dir()
+    return bare or _REPOSITORY.fullmatch(place) is not None
+
+
+@contextmanager
+def _cloned(repository: str) -> Iterator[Path]:
+    with closing(TemporaryFolder()) as folder:
+        _git(folder.path, "clone", "--quiet", "--config", "core.autocrlf=false", "--", repository, "bank")
+        yield folder.path / "bank"
+
+
+def _git(folder: Path, verb: str, *words: str) -> None:
+    """Run git in a folder.
+
+    Raises:
+        RunError: It is not installed, or refuses.
+    """
+    with raising(RunError, "cannot start git", "install it"):
+        done = subprocess.run(
+            ["git", verb, *words], cwd=folder, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
+        )
+    if done.returncode:
+        raise RunError(f"git {verb} ended with exit code {done.returncode}: {' '.join(done.stderr.split())[-400:]}")
