@@ -334,7 +334,7 @@ class Study(Plan):
         return StoredStudy(study, results)
 
     def finish(self, *, jobs: int = 1) -> StudySummary:
-        """Judge the best trials, write presets, summary and page; see `judgement.finish`."""
+        """Judge the best trials, write preset, summary and page; see `judgement.finish`."""
         from dynslam_bench.tuning.judgement import finish
         from dynslam_bench.tuning.page import write_page
 
@@ -368,7 +368,7 @@ class Study(Plan):
         return trial
 
     def evaluate(self, trial: optuna.Trial) -> Evaluation:
-        """Run a trial on growing sets of instances until it ends or is pruned."""
+        """Run a trial on one instance after the other until it ends or is pruned."""
         with self._heartbeats.beating():
             return self._evaluate(trial)
 
