@@ -29,7 +29,7 @@ from dynslam_bench.sequences.fetch import extract
 SUMS = "SHA256SUMS"
 _PARTS = ("runs", "sequences")
 _ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
-_REPOSITORY = re.compile(r"[a-z+]+://.*|[\w.-]+@[\w.-]+:.*")
+_ADDRESS = re.compile(r"[a-z+]+://.*|[\w.-]+@[\w.-]+:.*")
 
 
 class Bank(RunStore):
@@ -119,11 +119,19 @@ def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
     return Merged(merged.added, merged.stored, left_out + merged.left_out)
 
 
+def read_manifest(path: Path) -> list[StatedTrajectory]:
+    """The trajectories that a manifest names.
+
+    Raises:
+        RunError: It cannot be read, or is no manifest.
+    """
+    return validated(Manifest, read_toml(path, kind=RunError), str(path), RunError).trajectory
+
+
 def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
     """Import what a manifest names; yields what cannot be, with reasons."""
-    entries = validated(Manifest, read_toml(manifest, kind=RunError), str(manifest), RunError).trajectory
     with closing(TemporaryFolder()) as folder:
-        for entry in entries:
+        for entry in read_manifest(manifest):
             try:
                 file = _fetched(entry.file, entry.sha256, manifest.parent, folder.path)
                 truth = _fetched(entry.truth, entry.truth_sha256, manifest.parent, folder.path) if entry.truth else None
@@ -137,7 +145,7 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
 
 def _fetched(place: str, sha256: str, base: Path, folder: Path) -> Path:
     """A file of a manifest with this checksum; an empty one is not known."""
-    if _REPOSITORY.fullmatch(place):
+    if _ADDRESS.fullmatch(place):
         target = folder / f"{digest(place)}.txt"
         download(place, target, sha256=sha256 or None)
         return target
@@ -248,13 +256,14 @@ def _with_runs(folder: Path) -> RunStore:
 def _is_repository(place: str) -> bool:
     """Whether a place is a git repository that has to be cloned: an address, or a bare one."""
     bare = Path(place, "HEAD").is_file() and Path(place, "objects").is_dir()
-    return bare or _REPOSITORY.fullmatch(place) is not None
+    return bare or _ADDRESS.fullmatch(place) is not None
 
 
 @contextmanager
 def _cloned(repository: str) -> Iterator[Path]:
     with closing(TemporaryFolder()) as folder:
-        _git(folder.path, "clone", "--quiet", "--config", "core.autocrlf=false", "--", repository, "bank")
+        origin = repository if _ADDRESS.fullmatch(repository) else str(Path(repository).absolute())
+        _git(folder.path, "clone", "--quiet", "--config", "core.autocrlf=false", "--", origin, "bank")
         yield folder.path / "bank"
 
 

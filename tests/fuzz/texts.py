@@ -13,8 +13,10 @@ from dynslam_bench.core import sanitise as harmless
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core import toml
 from dynslam_bench.core.errors import DynslamError, TrackerError
+from dynslam_bench.core.reading import compare_sums
 from dynslam_bench.geometry import trajectory_files
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.runs import bank
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.training import labelled_images as labels
 from dynslam_bench.sequences import cameras, catalogue, fetch
@@ -68,6 +70,11 @@ def _text_of(data: bytes | None) -> str:
     return (data or b"").decode("utf-8", "surrogateescape")
 
 
+def _read_sums(data: bytes | None, folder: Path) -> None:
+    at(folder, bank.SUMS, data)
+    assert all(isinstance(fault, str) for fault in bank.verify(folder))
+
+
 def _of_text(read: Callable[[str], object]) -> Callable[[bytes | None, Path], object]:
     return lambda data, _: read(_text_of(data))
 
@@ -97,7 +104,7 @@ def _read_folder(data: bytes | None, folder: Path) -> None:
 
 def _read_manifest(data: bytes | None, folder: Path) -> None:
     at(folder, "rgb/1.png", _PNG)
-    fetch._compare(folder, at(folder, fetch.MANIFEST, data))
+    compare_sums(folder, at(folder, fetch.MANIFEST, data))
 
 
 def _read_coco(data: bytes | None, folder: Path) -> None:
@@ -191,6 +198,12 @@ TARGETS = [
         lambda: [LIST, LIST.replace(b"rgb/2", b"../2"), PAIRS, POSES, PAIRS.replace(b"rgb/2", b"../2")],
     ),
     Target("manifest of a fetch", _read_manifest, lambda: [b"0" * 64 + b"  rgb/1.png\n" + b"1" * 64 + b"  gone.png\n"]),
+    Target("checksums of a bank", _read_sums, lambda: [b"0" * 64 + b"  runs/x\n" + b"1" * 64 + b"  ../gone\n", b"x\n"]),
+    Target(
+        "manifest of a bank",
+        lambda data, folder: bank.read_manifest(at(folder, "m.toml", data)),
+        lambda: [(ROOT / "docs/how-to/authors.toml").read_bytes()[:3000], b"trajectory = [1]\n", b"[[trajectory]]\n"],
+    ),
     Target(
         "camera",
         lambda data, folder: cameras.read_camera(at(folder, "camera.toml", data)).camera(),

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import zipfile
@@ -131,9 +132,10 @@ def test_records_that_do_not_fit_are_named(made):
     assert first in faults[1] and "id" in faults[1] and "stamps" in faults[2]
 
 
-def test_through_a_bare_git_repository_and_back(made, remote, tmp_path, results):
+def test_through_a_bare_git_repository_and_back(made, remote, tmp_path, monkeypatch):
     assert len(bank.push(made, remote).added) == 2
-    assert bank.push(made, remote).added == []
+    monkeypatch.chdir(Path(remote).parent)
+    assert bank.push(made, Path(remote).name).added == []
     log = subprocess.run(["git", "-C", remote, "log", "--format=%s"], capture_output=True, text=True, check=True)
     assert log.stdout == "Add 2 runs\n"
     pulled = bank.pull(remote, tmp_path / "pulled")
@@ -262,3 +264,18 @@ def test_git_is_needed_for_a_repository_alone(made, remote, tmp_path, monkeypatc
         bank.push(made, remote)
     assert len(bank.push(made, str(tmp_path / "folder")).added) == 2
     assert os.environ["PATH"] == "/nowhere"
+
+
+def test_the_shipped_manifest_is_one():
+    """Every entry is pinned to a commit and a checksum."""
+    entries = bank.read_manifest(Path(__file__).resolve().parents[2] / "docs" / "how-to" / "authors.toml")
+    assert len(entries) == len({entry.sha256 for entry in entries}) == 13
+    assert all(re.search("/[0-9a-f]{40}/", place) for entry in entries for place in (entry.file, entry.truth) if place)
+    assert all(bool(entry.truth) == bool(entry.truth_sha256) for entry in entries)
+
+
+@pytest.mark.skipif(not PUBLISHED.is_dir(), reason="needs the authors' trajectories in ../shared/data/trajectories")
+def test_the_shipped_manifest_has_the_checksums_of_the_published_files():
+    known = {sha256(path.read_bytes()).hexdigest() for path in PUBLISHED.rglob("*.txt")}
+    entries = bank.read_manifest(Path(__file__).resolve().parents[2] / "docs" / "how-to" / "authors.toml")
+    assert {digest for entry in entries for digest in (entry.sha256, entry.truth_sha256) if digest} <= known
