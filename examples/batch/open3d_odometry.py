@@ -24,11 +24,15 @@ def main(camera: str, sequence: str, associations: str, output: str) -> None:
         colour = cv2.remap(cv2.imread(f"{sequence}/{rgb}"), *maps, cv2.INTER_LINEAR)
         raw = cv2.remap(cv2.imread(f"{sequence}/{depth}", cv2.IMREAD_UNCHANGED), *maps, cv2.INTER_NEAREST)
         image = o3d.t.geometry.RGBDImage(*(o3d.t.geometry.Image(o3d.core.Tensor(part)) for part in (colour, raw)))
-        if last is not None:
-            found = o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
-                image, last, intrinsics, depth_scale=factor, depth_max=8.0
-            )
-            pose = pose @ found.transformation.numpy()
+        try:
+            if last is not None:
+                arguments = {"depth_scale": factor, "depth_max": 8.0}
+                found = o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(image, last, intrinsics, **arguments)
+                pose = pose @ found.transformation.numpy()
+        except RuntimeError as error:  # too little texture or depth in one of them: no pose of this frame
+            print(stamp, error)
+            last = image
+            continue
         last = image
         stamps.append(float(stamp))
         poses.append(pose)

@@ -24,6 +24,7 @@ from dynslam_bench.trackers.adapters.specs import BatchProgram, BatchSettings, O
 from dynslam_bench.trackers.adapters.subprocess_tracker import LOGGER, end_with_parent, write_images
 
 _POLL_S = 0.1
+_COLOUR = re.compile(r"\x1b\[[\d;]*m")
 LONGEST_TAIL = 1 << 16
 """Bytes of a program's output of which the end is kept."""
 
@@ -211,7 +212,7 @@ def _resident(pid: int) -> int:
 def _tail(log: Path) -> str:
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - LONGEST_TAIL))
-        return file.read().decode(errors="replace")
+        return _COLOUR.sub("", file.read().decode(errors="replace"))
 
 
 def describe(path: Path) -> dict[str, Any]:

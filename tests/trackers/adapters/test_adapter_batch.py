@@ -105,6 +105,7 @@ def test_a_program_that_crashes_behind_its_trajectory_is_taken_and_noted(toml, t
 
 BAD = {
     "writes no file": ("print('loading'); sys.exit('no licence')", {}, "exit code 1, and wrote no .*'no licence'"),
+    "in colours": ("print('\\x1b[31mbroken\\x1b[0m\\n\\x1b[0;m'); sys.exit(2)", {}, "its last words: 'broken'"),
     "needs a display": ("sys.exit('Pangolin X11: Failed to open X display')", {}, "X display'.*xvfb-run"),
     "half a line": ("write(rows, '{} 0.5 0 0')", {}, "slam|line 1"),
     "without stamps": ("write(rows, '1 0 0 0 0 1 0 0 0 0 1 0')", {}, "line 1"),
