@@ -22,6 +22,7 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from dynslam_bench.contracts import Trajectory
     from dynslam_bench.evaluation.protocol import Protocol
     from dynslam_bench.reports import ReportPaths
-    from dynslam_bench.runs import ResolvedRun, RunEvent
+    from dynslam_bench.runs import Plan, RunEvent
     from dynslam_bench.runs.running import OnFault
     from dynslam_bench.tuning import Study, StudySpec, StudySummary
 
@@ -52,14 +53,19 @@ class RunResult:
     """A stored run.
 
     Attributes:
-        record: Everything that is stored of it.
+        run_id: Its id.
         store: The results folder.
         protocol: How its metrics are evaluated.
     """
 
-    record: RunRecord
+    run_id: str
     store: RunStore
     protocol: str
+
+    @property
+    def record(self) -> RunRecord:
+        """Everything that is stored of it, read anew."""
+        return self.store.read_whole(self.run_id)
 
     @property
     def status(self) -> str:
@@ -68,22 +74,22 @@ class RunResult:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """The metrics under the protocol by name (``ate_rmse_m``, ...); empty if it was stopped."""
-        return {} if self.status == "stopped" else dict(self.store.score(self.record, self.protocol).metrics)
+        """The metrics under the protocol by name (``ate_rmse_m``, ...)."""
+        return dict(self.store.score(self.record, self.protocol).metrics)
 
     @property
     def trajectory(self) -> Trajectory | None:
         """Poses of the tracked frames, each as it was when the frame came; None if no frame was tracked."""
-        return self.store.trajectory(self.record.run_id)
+        return self.store.trajectory(self.run_id)
 
     @property
     def folder(self) -> Path:
         """Where its files are."""
-        return self.store.folder(self.record.run_id)
+        return self.store.folder(self.run_id)
 
     def frames(self) -> pd.DataFrame:
         """State, errors, times and diagnostics, one row a frame."""
-        return load_frames(self.record.run_id, self.store.root)
+        return load_frames(self.run_id, self.store.root)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +194,7 @@ def bench(
     time_limit_s: float | None = None,
     memory_limit_mb: float | None = None,
     shard: tuple[int, int] = (1, 1),
-    on_plan: Callable[[Collection[ResolvedRun]], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_fault: OnFault | None = None,
     **choice: Any,
@@ -205,7 +211,7 @@ def bench(
         time_limit_s: Seconds that a run may take, in place of the suite's limit.
         memory_limit_mb: Memory that a run may take, in place of the suite's limit.
         shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ... of them.
-        on_plan: Called before the first run.
+        on_plan: Called once, with the runs that are to be made.
         on_event: Called with every `RunEvent`.
         on_fault: Called with every run that cannot be made.
         **choice: Arguments of `Suite.specs`: ``trackers``, ``seeds``, ``offsets``, ``frames``, ``data_root``, ...
@@ -216,14 +222,13 @@ def bench(
     from dynslam_bench.suites import load_suite
 
     asked = {"time_s": time_limit_s, "memory_mb": memory_limit_mb}
-    limits = {name: value for name, value in asked.items() if value is not None}
-    every = load_suite(suite).specs(**choice)
-    specs = [
-        spec.model_copy(update={"limits": checked(Limits, **(spec.limits.model_dump() | limits))})
-        for spec in every[shard[0] - 1 :: shard[1]]
-    ]
-    if not specs:
-        raise RunError(f"part {shard[0]} of {shard[1]} holds none of the suite's {len(every)} runs", "make fewer parts")
+    chosen = load_suite(suite)
+    limits = chosen.limits.model_dump() | {name: value for name, value in asked.items() if value is not None}
+    every = chosen.model_copy(update={"limits": checked(Limits, **limits)}).specs(**choice)
+    part = islice(every, shard[0] - 1, None, shard[1])
+    if (first := next(part, None)) is None:
+        raise RunError(f"part {shard[0]} of {shard[1]} holds none of the suite's runs", "make fewer parts")
+    specs = chain([first], part)
     how: dict[str, Any] = {"on_plan": on_plan, "on_event": on_event, "on_fault": on_fault, "retry": retry}
     return run_specs(specs, results=results, protocol=protocol, jobs=jobs, scheduler=scheduler, **how)
 
@@ -251,7 +256,7 @@ def run_specs(
     store = RunStore(results)
     executor = None if scheduler is None else dask_executor(scheduler)
     records = run_many(specs, results=store, protocol=protocol, executor=executor, **how)
-    return [RunResult(record, store, protocol) for record in records]
+    return [RunResult(run_id, store, protocol) for run_id in records.run_ids if run_id not in records.not_stored]
 
 
 def dask_executor(address: str) -> Executor:

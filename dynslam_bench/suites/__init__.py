@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,7 +107,7 @@ class Suite(Record):
         seeds: tuple[int, ...] = (),
         offsets: tuple[int, ...] = (),
         frames: tuple[int, int | None] | None = None,
-    ) -> list[RunSpec]:
+    ) -> Iterator[RunSpec]:
         """The runs of the suite, sequence by sequence so that rendered frames are shared while they are fresh.
 
         Args:
@@ -126,7 +127,7 @@ class Suite(Record):
         shared |= {"threads": threads or self.threads, "cache": self.cache, "limits": self.limits}
         shared |= {"data_root": None if data_root is None else str(data_root)}
         entries = self._entries(trackers)
-        return [
+        return (
             RunSpec(
                 tracker=tracker,
                 sequence=sequence,
@@ -143,7 +144,7 @@ class Suite(Record):
             for tracker, settings in entries
             for seed in seeds or self.seeds
             for offset in offsets or self.offsets
-        ]
+        )
 
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""

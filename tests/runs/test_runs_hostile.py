@@ -271,7 +271,7 @@ def test_several_on_one_folder_share_the_work(store: RunStore, toy_folder: str) 
 
     def bench(_: int) -> list[RunRecord]:
         events = {"on_event": lambda event: made.append(event.run_id) if event.kind == "finished" else None}
-        return run_many(specs, results=RunStore(store.root), **events)
+        return list(run_many(specs, results=RunStore(store.root), **events))
 
     with ThreadPoolExecutor(3) as pool:
         first, second, third = pool.map(bench, range(3))

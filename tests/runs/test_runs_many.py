@@ -5,8 +5,10 @@ import json
 import multiprocessing
 import subprocess
 import sys
+import threading
 import time
 import zipfile
+from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from itertools import cycle
 from pathlib import Path
@@ -43,7 +45,7 @@ def kinds(events: list) -> dict[str, int]:
 
 def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
     events: list = []
-    first = run_many(specs(toy_folder, range(2)), results=store, **follow(events))
+    first = list(run_many(specs(toy_folder, range(2)), results=store, **follow(events)))
     assert kinds(events) == {"finished": 2, "started": 2}
     events.clear()
     second = run_many(specs(toy_folder, range(4)), results=store, jobs=2, **follow(events))
@@ -55,10 +57,10 @@ def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
 def test_a_run_of_a_study_is_an_ordinary_one_once_it_is_asked_for_without(store: RunStore, toy_folder: str) -> None:
     (made,) = run_many(specs(toy_folder, range(1), study="mine"), results=store)
     assert made.study == "mine"
-    assert run_many(specs(toy_folder, range(1), study="other"), results=store) == [made]
+    assert list(run_many(specs(toy_folder, range(1), study="other"), results=store)) == [made]
     (asked,) = run_many(specs(toy_folder, range(1)), results=store)
     assert asked.study == "" and asked.run_id == made.run_id
-    assert run_many(specs(toy_folder, range(1), study="mine"), results=store) == [asked]
+    assert list(run_many(specs(toy_folder, range(1), study="mine"), results=store)) == [asked]
     assert store.get(made.run_id) == asked
 
 
@@ -80,6 +82,33 @@ def test_a_wrong_name_is_refused_before_anything_runs(store: RunStore, toy_folde
     assert store.ids() == []
     with pytest.raises(RunError, match="jobs is 0"):
         run_many(specs(toy_folder, range(1)), results=store, jobs=0)
+
+
+def test_what_cannot_be_looked_up_is_set_aside_where_somebody_is_told(store: RunStore, toy_folder: str) -> None:
+    wrong = {"tracker": "orb-slam"}, {"settings": {"speed": 1}}, {"sequence": "nowhere/x"}, {"frames": (5, 6)}
+    asked = [spec.model_copy(update=change) for spec in specs(toy_folder, range(1)) for change in (*wrong, {})]
+    faults: list[str] = []
+    records = run_many(asked, results=store, on_fault=lambda spec, error: faults.append(str(error)))
+    assert [record.status for record in records] == ["ok"] and len(faults) == len(wrong)
+
+
+def test_the_first_runs_are_made_while_others_are_looked_up(
+    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dynslam_bench.runs.running._LOOKED_UP_FIRST", 1)
+    finished = threading.Event()
+
+    def endless() -> Iterator[RunSpec]:
+        yield from specs(toy_folder, range(2))
+        assert finished.wait(300), "no run was made before the last one was known"
+        yield from specs(toy_folder, range(1, 3))
+
+    def told(event: RunEvent) -> None:
+        if event.kind == "finished":
+            finished.set()
+
+    records = run_many(endless(), results=store, on_event=told)
+    assert [record.seed for record in records] == [0, 1, 1, 2] and len(store.ids()) == 3
 
 
 def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:
@@ -248,7 +277,7 @@ def test_every_suite_names_only_what_exists(name: str) -> None:
         assert whole in sequence_ids() or entry_of(sequence) is not None
         if sequence.startswith("synthetic/"):
             assert parse_synthetic_id(sequence).split == "held-out", "the embedded network was trained on the others"
-    specs = suite.specs()
+    specs = list(suite.specs())
     assert len(specs) == len({spec.model_dump_json() for spec in specs}) > 0
 
 
@@ -290,7 +319,7 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
         degrade = { blur = 0.5 }
         """,
     )
-    specs = load_suite(path).specs(data_root="/data", device="cpu", threads=2)
+    specs = list(load_suite(path).specs(data_root="/data", device="cpu", threads=2))
     assert (
         len(specs) == 8 and {spec.threads for spec in specs} == {2} and {spec.data_root for spec in specs} == {"/data"}
     )
