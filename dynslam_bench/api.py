@@ -18,9 +18,7 @@ The names are loaded on first use, so that ``import dynslam_bench`` stays fast. 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -28,9 +26,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
-from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean, raising
+from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean
 from dynslam_bench.core.records import Record
-from dynslam_bench.core.version import install_hint
 from dynslam_bench.runs import DEFAULT_PROTOCOL, Limits, RunRecord, RunSpec, RunStore, load_frames, run_many
 from dynslam_bench.trackers import TRACKERS
 
@@ -194,6 +191,7 @@ def bench(
     time_limit_s: float | None = None,
     memory_limit_mb: float | None = None,
     shard: tuple[int, int] = (1, 1),
+    on_workers: Callable[[list[dict[str, object]]], None] | None = None,
     on_plan: Callable[[Plan], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_fault: OnFault | None = None,
@@ -211,6 +209,7 @@ def bench(
         time_limit_s: Seconds that a run may take, in place of the suite's limit.
         memory_limit_mb: Memory that a run may take, in place of the suite's limit.
         shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ... of them.
+        on_workers: Called before the first run, with what each of the scheduler's workers has.
         on_plan: Called once, with the runs that are to be made.
         on_event: Called with every `RunEvent`.
         on_fault: Called with every run that cannot be made.
@@ -219,6 +218,7 @@ def bench(
     Raises:
         DynslamError: The suite names something unknown, a run cannot be made, or the part holds no run.
     """
+    from dynslam_bench.runs.cluster import DaskWorkers
     from dynslam_bench.suites import load_suite
 
     asked = {"time_s": time_limit_s, "memory_mb": memory_limit_mb}
@@ -230,7 +230,13 @@ def bench(
         raise RunError(f"part {shard[0]} of {shard[1]} holds none of the suite's runs", "make fewer parts")
     specs = chain([first], part)
     how: dict[str, Any] = {"on_plan": on_plan, "on_event": on_event, "on_fault": on_fault, "retry": retry}
-    return run_specs(specs, results=results, protocol=protocol, jobs=jobs, scheduler=scheduler, **how)
+    how |= {"results": results, "protocol": protocol, "jobs": jobs}
+    if scheduler is None:
+        return run_specs(specs, **how)
+    with DaskWorkers(scheduler) as workers:
+        if on_workers is not None:
+            on_workers(workers.describe(chosen.sequences, choice.get("data_root")))
+        return run_specs(specs, executor=workers, **how)
 
 
 def run_specs(
@@ -238,7 +244,6 @@ def run_specs(
     *,
     results: str | Path = "results",
     protocol: str = DEFAULT_PROTOCOL,
-    scheduler: str | None = None,
     **how: Any,
 ) -> list[RunResult]:
     """Make runs that are given one by one.
@@ -247,31 +252,14 @@ def run_specs(
         specs: The runs, e.g. of `make_specs`.
         results: The results folder.
         protocol: How to evaluate.
-        scheduler: Address of a Dask scheduler whose workers make the runs.
         **how: Further arguments of `run_many`.
 
     Raises:
-        DynslamError: See `run_many`; or the scheduler does not answer.
+        DynslamError: See `run_many`.
     """
     store = RunStore(results)
-    executor = None if scheduler is None else dask_executor(scheduler)
-    records = run_many(specs, results=store, protocol=protocol, executor=executor, **how)
+    records = run_many(specs, results=store, protocol=protocol, **how)
     return [RunResult(run_id, store, protocol) for run_id in records.run_ids if run_id not in records.not_stored]
-
-
-def dask_executor(address: str) -> Executor:
-    """The executor of a Dask cluster.
-
-    Raises:
-        RunError: ``distributed`` is not installed, or the scheduler does not answer.
-    """
-    with raising(RunError, "a scheduler needs the package distributed", install_hint("cluster"), of=ImportError):
-        from distributed import Client
-    with raising(
-        RunError, f"no Dask scheduler answers at {address}", "for example tcp://host:8786", of=(OSError, ValueError)
-    ):
-        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # it logs a lost scheduler with a traceback
-        return Client(address, timeout="10s").get_executor()  # type: ignore[no-any-return]
 
 
 def tune(

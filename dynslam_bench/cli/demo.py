@@ -56,7 +56,7 @@ def demo(
     store.prepare()  # before the rendering: an unwritable folder is reported at once
     specs = [
         spec.model_copy(update={"sequence": f"{spec.sequence}&frames={frames}", "frames": None})
-        for spec in load_suite("demo").specs()
+        for spec in load_suite("demo").specs(snapshots=True)
     ]
     study = study_spec(max(MIN_STUDY_FRAMES, int(STUDY_SHARE * frames)), trials)
     write(f"{len(specs)} runs of {frames} frames, and a study of {trials} trials: some minutes")

@@ -22,6 +22,7 @@ from dynslam_bench.cli.output import (
     json_mode,
     note,
     progress,
+    table,
     warn,
     write_error,
 )
@@ -89,6 +90,7 @@ def run(
         bool,
         typer.Option("--cache", help="Take features and masks from the stage cache.", rich_help_panel=opts.MACHINE),
     ] = False,
+    snapshots: opts.Snapshots = False,
     video: Annotated[
         bool, typer.Option("--video", help="Write video.webm beside the run.", rich_help_panel=opts.OUTPUT)
     ] = False,
@@ -158,7 +160,8 @@ def run(
         tracker, sequences, settings=overrides, preset=preset, seeds=seed or [0], offsets=offset or [0],
         frames=frames, stride=stride, camera=camera, data_root=None if data_root is None else str(data_root),
         device=device, threads=threads, realtime=realtime, drop_share=drop, cache=cache, video=video, sheet=sheet,
-        rrd=rrd, save_map=save_map, label=label, degrade=opts.gather_settings(degrade),
+        snapshots=snapshots, rrd=rrd, save_map=save_map, label=label,
+        degrade=opts.gather_settings(degrade),
         limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )  # fmt: skip
     scored_under = protocol or default_protocol(tracker)
@@ -214,6 +217,7 @@ def bench(
             metavar="K/N", help="Only the K-th of N parts of the runs; see `runs merge`.", rich_help_panel=opts.MACHINE
         ),
     ] = "1/1",
+    snapshots: opts.Snapshots = False,
     retry: opts.Retry = None,
     time_limit: opts.TimeLimit = None,
     memory_limit: opts.MemoryLimit = None,
@@ -243,9 +247,16 @@ def bench(
         seeds=tuple(seed or ()),
         offsets=tuple(offset or ()),
         frames=None if frames is None else parse_frames(frames),
+        snapshots=snapshots,
         shard=parse_shard(shard),
+        on_workers=show_workers,
     )
     finish(make, results, jobs, protocol, yes)
+
+
+def show_workers(rows: Sequence[dict[str, object]]) -> None:
+    """What each worker of a scheduler has, on standard error."""
+    announce(table(list(rows[0]), [list(row.values()) for row in rows]) if rows else "the scheduler has no worker yet")
 
 
 def parse_shard(text: str) -> tuple[int, int]:

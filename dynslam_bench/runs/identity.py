@@ -41,7 +41,7 @@ from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-_PACKAGES = (
+CODE_PACKAGES = (
     *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
     *("culling", "slam", "trackers", "envs"),
 )
@@ -217,7 +217,7 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
     prefix, _, segmenter = source.partition(":")
     if prefix == "plugin":
         plugins["segmentation.source"] = plugin_digest(SEGMENTERS.get(segmenter).entry_point)
-    return digest([code_digest(tracker.entry_point, _PACKAGES), plugins])
+    return digest([code_digest(tracker.entry_point, CODE_PACKAGES), plugins])
 
 
 def weights_of(settings: Settings, source: str) -> dict[str, str]:

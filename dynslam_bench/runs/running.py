@@ -37,7 +37,7 @@ from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.runs.artifacts import SHEET_FILE, VIDEO_FILE
+from dynslam_bench.runs.artifacts import PICTURE, SHEET_FILE, VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
@@ -345,11 +345,11 @@ def run_many(
 ) -> Records:
     """Make the runs that are not stored yet, and score all of them.
 
-    The first runs begin once a thousand are looked up, while the others are. A stored run is made again if a video, a
-    sheet or its map is asked for that it lacks. One that is given another label gets that. One that a study made is an
-    ordinary run once it is asked for without the study. A failure is a record and stops nothing; after an interrupt the
-    call goes on. A run that cannot be made stops no other, and nothing of it is stored. Several processes may share a
-    results folder (without `executor`): each run is made by one of them.
+    The first runs begin once a thousand are looked up, while the others are. A stored run is made again if snapshots, a
+    video, a sheet or its map are asked for that it lacks. One that is given another label gets that. One that a study
+    made is an ordinary run once it is asked for without the study. A failure is a record and stops nothing; after an
+    interrupt the call goes on. A run that cannot be made stops no other, and nothing of it is stored. Several processes
+    may share a results folder (without `executor`): each run is made by one of them.
 
     Args:
         specs: What to run; runs that are the same are made once.
@@ -417,11 +417,11 @@ class _Bench:
                 for _ in islice(looking_up, _LOOKED_UP_FIRST):
                     pass
                 if self.executor is None:
-                    makers += [pool.submit(self._until_aborted, self._make_here) for _ in range(self.jobs)]
+                    makers += [pool.submit(self._make_here) for _ in range(self.jobs)]
                 else:
-                    makers.append(pool.submit(self._until_aborted, partial(self._make_remotely, self.executor)))
+                    makers.append(pool.submit(self._make_remotely, self.executor))
                 for _ in looking_up:
-                    if self.aborted.is_set():
+                    if any(maker.done() for maker in makers):  # it failed
                         break
                 for maker in as_completed(makers):
                     maker.result()
@@ -431,13 +431,6 @@ class _Bench:
         if self.first_fault is not None and self.on_fault is None:
             raise self.first_fault
         return Records(self.store, [run_id for run_id in self.run_ids if run_id in self.done], self.not_stored)
-
-    def _until_aborted(self, make: Callable[[], None]) -> None:
-        try:
-            make()
-        except BaseException:
-            self.aborted.set()
-            raise
 
     def _look_up(self, specs: Iterable[RunSpec], again: Collection[str]) -> Iterator[None]:
         """Look the runs up, one a step: take what is stored, let the others wait to be made."""
@@ -596,7 +589,8 @@ def _asked(ask: Callable[..., T], *arguments: object) -> T:
 
 def pictures_asked(spec: RunSpec) -> list[str]:
     """The files beside a run that it was asked for."""
-    asked = ((VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet), (RECORDING_FILE, spec.rrd), (MAP_FILE, spec.save_map))
+    asked = [(PICTURE.format(0), spec.snapshots), (VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet)]
+    asked += [(RECORDING_FILE, spec.rrd), (MAP_FILE, spec.save_map)]
     return [name for name, wanted in asked if wanted]
 
 
@@ -613,13 +607,14 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
 _ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16})/([A-Za-z0-9_]+\.[a-z0-9]+)")
 
 
-def run_packed(spec_json: str, protocol_json: str, identity_json: str) -> bytes:
+def run_packed(spec_json: str, protocol_json: str, identity_json: str, *, at_a_time: int = 1) -> bytes:
     """Make a run on a worker that does not share the results folder; the function that executors are handed.
 
     Args:
         spec_json: A `RunSpec` as JSON.
         protocol_json: The protocol of the partial metrics as JSON.
         identity_json: The run's identity where it was asked for, as JSON.
+        at_a_time: Runs that share this machine.
 
     Returns:
         A zip archive with the run's folder and its sequence's stamps and ground truth, for `unpack`.
@@ -642,7 +637,8 @@ def run_packed(spec_json: str, protocol_json: str, identity_json: str) -> bytes:
     with contextlib.closing(TemporaryFolder()) as folder:
         store = RunStore(folder.path)
         store.prepare()
-        return pack(store, run_one(resolved, store, protocol=Protocol.model_validate_json(protocol_json)))
+        protocol = Protocol.model_validate_json(protocol_json)
+        return pack(store, run_one(resolved, store, protocol=protocol, at_a_time=at_a_time))
 
 
 def pack(store: RunStore, record: RunRecord) -> bytes:

@@ -107,6 +107,7 @@ class Suite(Record):
         seeds: tuple[int, ...] = (),
         offsets: tuple[int, ...] = (),
         frames: tuple[int, int | None] | None = None,
+        snapshots: bool = False,
     ) -> Iterator[RunSpec]:
         """The runs of the suite, sequence by sequence so that rendered frames are shared while they are fresh.
 
@@ -118,13 +119,19 @@ class Suite(Record):
             seeds: In place of the suite's seeds.
             offsets: In place of the suite's start offsets.
             frames: In place of the suite's frames.
+            snapshots: See `RunSpec.snapshots`.
 
         Raises:
             PluginError: A tracker is not known (with a did-you-mean).
             RunError: A tracker is given settings but is no part of the suite.
         """
         shared: dict[str, Any] = {"frames": frames or self.frames, "stride": self.stride, "device": device}
-        shared |= {"threads": threads or self.threads, "cache": self.cache, "limits": self.limits}
+        shared |= {
+            "snapshots": snapshots,
+            "threads": threads or self.threads,
+            "cache": self.cache,
+            "limits": self.limits,
+        }
         shared |= {"data_root": None if data_root is None else str(data_root)}
         entries = self._entries(trackers)
         return (

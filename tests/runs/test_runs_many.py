@@ -3,6 +3,7 @@
 import io
 import json
 import multiprocessing
+import os
 import subprocess
 import sys
 import threading
@@ -13,16 +14,17 @@ from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExec
 from itertools import cycle
 from pathlib import Path
 
+import envs_toys
 import numpy as np
 import pytest
-from envs_toys import TARGET, truth
+from envs_toys import TARGET, truth, write_folder
 from hostile import until
 
-from dynslam_bench.api import dask_executor
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
 from dynslam_bench.runs import RunEvent, RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
+from dynslam_bench.runs.cluster import DaskWorkers
 from dynslam_bench.runs.running import pack, unpack
 from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -374,37 +376,100 @@ def test_rows_are_of_trackers_of_the_suite(tmp_path: Path) -> None:
 # A real Dask cluster: runs come back as bytes, and its end is one clear line. Skipped without `distributed`.
 
 
-def start(program: str, *arguments: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", f"distributed.cli.{program}", "--no-dashboard", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+class Cluster:
+    """A Dask scheduler and its workers, each a process of one thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.place, self.workers = folder, folder / "scheduler.json", []
+        self.scheduler = self.start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+        deadline = time.monotonic() + 300
+        while not (self.place.is_file() and self.place.read_text()):
+            assert self.scheduler.poll() is None and time.monotonic() < deadline
+            time.sleep(0.02)
+        self.address = json.loads(self.place.read_text())["address"]
+
+    def start(self, program: str, *arguments: str, **environment: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", str(self.place), *arguments]
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return subprocess.Popen([*command, "--no-dashboard"], env=os.environ | environment, **silent)
+
+    def add(self, **environment: str) -> subprocess.Popen:
+        """A worker on a host of its own, with these variables of the environment."""
+        host = ("--host", f"127.0.0.{len(self.workers) + 2}") if sys.platform == "linux" else ()
+        private = (*host, "--nthreads", "1", "--no-nanny", "--local-directory", str(self.folder))
+        self.workers.append(self.start("dask_worker", *private, **environment))
+        return self.workers[-1]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    pytest.importorskip("distributed")
+    monkeypatch.setenv("PYTHONPATH", ":".join(path for path in sys.path if path))
+    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")  # no fork server for few runs in a worker
+    started = Cluster(tmp_path)
+    yield started
+    for process in (*started.workers, started.scheduler):
+        process.kill()
+        process.wait()
 
 
 def test_a_scheduler_that_is_killed_in_the_middle_is_one_clear_line(
-    tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, toy_folder: str, cluster: Cluster, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("distributed")
-    monkeypatch.setenv("PYTHONPATH", ":".join(path for path in sys.path if path))
-    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")  # no fork server for one run in the worker
-    place, store = tmp_path / "scheduler.json", RunStore(tmp_path / "results")
-    file = ("--scheduler-file", str(place))
-    with start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", *file) as scheduler:
-        deadline = time.monotonic() + 300
-        while not (place.is_file() and place.read_text()):
-            assert scheduler.poll() is None and time.monotonic() < deadline
-            time.sleep(0.02)
-        executor = dask_executor(json.loads(place.read_text())["address"])
-        private = ("--local-directory", str(tmp_path))
-        with start("dask_worker", *file, "--nthreads", "1", "--no-nanny", *private) as worker:
+    store, executor = RunStore(tmp_path / "results"), DaskWorkers(cluster.address)
+    cluster.add()
 
-            def told(event: RunEvent) -> None:
-                if event.kind == "finished":
-                    scheduler.kill()
+    def told(event: RunEvent) -> None:
+        if event.kind == "finished":
+            cluster.scheduler.kill()
 
-            specs = [RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(9)]
-            with pytest.raises(InfrastructureError, match=r"^the executor gave up: CancelledError") as error:
-                run_many(specs, results=store, executor=executor, on_event=told)
-            worker.kill()
+    asked = specs(toy_folder, range(9))
+    with pytest.raises(InfrastructureError, match=r"^the executor gave up: CancelledError") as error:
+        run_many(asked, results=store, executor=executor, on_event=told)
     assert "\n" not in str(error.value) and "Traceback" not in capfd.readouterr().err
     records, unreadable = store.all()
-    assert 1 <= len(records) < len(specs) and unreadable == []  # what came back stays
+    assert 1 <= len(records) < len(asked) and unreadable == []  # what came back stays
     assert {record.status for record in records} == {"ok"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a host for each worker")
+def test_runs_are_made_by_the_workers_that_can_make_them(
+    tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = write_folder(tmp_path / "data" / "rgbd_dataset_freiburg1_xyz", 8)
+    (tmp_path / "none").mkdir()
+    for name, more in (("same", ""), ("other", "\n\ndef more() -> int:\n    return 1\n")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "toy_of_mine.py").write_text(Path(envs_toys.__file__).read_text() + more)
+    monkeypatch.syspath_prepend(tmp_path / "same")
+    monkeypatch.setenv("DYNSLAM_BENCH_DATA", str(data.parent))
+    path = os.environ["PYTHONPATH"]
+    same, other = ({"PYTHONPATH": f"{tmp_path / name}:{path}"} for name in ("same", "other"))
+    cluster.add(**same)
+    victim = cluster.add(**same)
+    cluster.add(**other)
+    cluster.add(**same, DYNSLAM_BENCH_DATA=str(tmp_path / "none"))
+
+    def told(event: RunEvent) -> None:
+        if event.kind == "finished":
+            victim.kill()
+
+    asked = [
+        RunSpec(tracker="toy_of_mine:SPEC", sequence="tum/fr1/xyz", camera=str(data / "camera.toml"), seed=seed)
+        for seed in range(8)
+    ]
+    here, there = RunStore(tmp_path / "here"), RunStore(tmp_path / "there")
+    with DaskWorkers(cluster.address) as executor:
+        executor._client.wait_for_workers(4)
+        rows = executor.describe(["tum/fr1/xyz"])
+        assert sorted(map(str, (row["lacks"] for row in rows))) == ["['tum/fr1/xyz']", "[]", "[]", "[]"]
+        records = run_many(asked, results=there, executor=executor, on_event=told)
+        (refusals,) = executor._refused.values()
+    assert [record.status for record in records] == ["ok"] * len(asked)
+    reasons = sorted(str(reason) for reason in refusals.values())
+    assert len(reasons) == 2 and "is not at" in reasons[0] and "source differ" in reasons[1]
+    run_many(asked, results=here)
+    assert here.ids() == there.ids()
+    for run_id in here.ids():
+        one, other_one = (store.folder(run_id) / "trajectory_online.txt" for store in (here, there))
+        assert one.read_bytes() == other_one.read_bytes()
