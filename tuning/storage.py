@@ -261,7 +261,8 @@ def open_database(url: str) -> BaseStorage:
     """
     for attempt in range(_ATTEMPTS):
         try:
-            return optuna.storages.get_storage(PatientStorage(url, engine_kwargs={"pool_pre_ping": True}))
+            how = {"pool_pre_ping": True, "pool_size": 1}  # a server takes few connections, e.g. 100
+            return optuna.storages.get_storage(PatientStorage(url, engine_kwargs=how))
         except (DBAPIError, StorageInternalError) as error:
             cause = str(error.__cause__ or error).lower()
             if attempt + 1 == _ATTEMPTS or not any(words in cause for words in _BEING_MADE):

@@ -1,4 +1,4 @@
-"""``runs list|show|rescore|merge|rm``, and runs as the rows of a table."""
+"""``runs list|show|rescore|merge|export|rm``, and runs as the rows of a table."""
 
 from __future__ import annotations
 
@@ -33,8 +33,10 @@ from dynslam_bench.cli.output import (
     warn,
     write,
 )
-from dynslam_bench.core.errors import RunError, did_you_mean
+from dynslam_bench.core.errors import RunError, did_you_mean, raising
+from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.toml import assignments, label_text
+from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:
     from dynslam_bench.runs.store import Merged
@@ -185,6 +187,21 @@ def merge(
     store = stored.RunStore(output)
     merged = stored.merge([_open(folder) for folder in sources], store)
     show_merged(merged, str(store.root))
+
+
+@app.command()
+def export(
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="A .csv, or a .parquet (extra [parquet]).")],
+    results: Results = Path("results"),
+    protocol: ProtocolId = "tum-rgbd/v1",
+) -> None:
+    """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it."""
+    if output.suffix not in (".csv", ".parquet"):
+        raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
+    frame = _open(results).frame(protocol)
+    with raising(RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError):
+        write_atomic(output, frame.to_csv(index=False) if output.suffix == ".csv" else frame.to_parquet())
+    write(str(output))
 
 
 @app.command()
