@@ -383,6 +383,25 @@ class Heartbeats:
             self._seen[name] = count, now
         return now - self._seen[name][1]
 
+    def running(self) -> dict[int, str]:
+        """The running trials, each with its worker and whether that is alive.
+
+        A worker elsewhere is silent if it does not count up while this waits, a little longer than `HEARTBEAT_S`.
+        """
+        trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+        workers = {trial.number: trial.user_attrs.get("worker", "") for trial in trials}
+        counts, deadline = self._study.user_attrs, time.monotonic() + 1.25 * HEARTBEAT_S
+        silent = {name for name in workers.values() if name.rpartition(":")[0] != _machine()}
+        while silent and time.monotonic() < deadline:
+            time.sleep(0.2)
+            silent -= {
+                name for name in silent if self._study.user_attrs.get(_ALIVE + name) != counts.get(_ALIVE + name)
+            }
+        return {
+            number: f"{name}, {'silent' if name in silent else 'dead' if self._has_ended(name) else 'alive'}"
+            for number, name in workers.items()
+        }
+
     def beat(self) -> None:
         """Count up once."""
         self._count += 1

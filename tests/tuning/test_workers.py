@@ -77,6 +77,23 @@ def test_a_worker_elsewhere_is_dead_once_it_counts_no_more(quick: None, monkeypa
     assert dead_after(2.5) == {alive.number, silent.number, nameless.number}
 
 
+def test_running_trials_are_shown_with_their_workers(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = optuna.create_study()
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    names = [worker_name(), f"{worker_name().rpartition(':')[0]}:{ended.pid}", "there:1", "there:2"]
+    for name in names:
+        running(study, name)
+    heartbeats = Heartbeats(study)
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "worker_name", lambda: "there:1")
+        other = Heartbeats(study)
+    with other.beating():
+        states = heartbeats.running()
+    ends = zip(names, ("alive", "dead", "alive", "silent"), strict=True)
+    assert states == {number: f"{name}, {end}" for number, (name, end) in enumerate(ends)}
+
+
 def test_a_worker_here_is_dead_with_its_process() -> None:
     study = optuna.create_study()
     child = subprocess.Popen([sys.executable, "-c", ""])
