@@ -61,7 +61,7 @@ class RunResult:
 
     @property
     def record(self) -> RunRecord:
-        """Everything that is stored of it, read anew."""
+        """Everything that is stored of it; read whenever it is asked for."""
         return self.store.read_whole(self.run_id)
 
     @property

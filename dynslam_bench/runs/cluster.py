@@ -108,7 +108,7 @@ class DaskWorkers(Executor):
             self._refused[kind][answer[0]] = answer[1]
             self._send(outcome, kind, refusers | {answer[0]}, *call)
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+    def shutdown(self, *_: object, **__: object) -> None:
         """Leave the scheduler."""
         self._client.close()
 

@@ -434,7 +434,7 @@ class _Bench:
 
     def _look_up(self, specs: Iterable[RunSpec], again: Collection[str]) -> Iterator[None]:
         """Look the runs up, one a step: take what is stored, let the others wait to be made."""
-        look_up, plan, known = Resolver(), Plan(), set[str]()
+        look_up, plan, run_ids = Resolver(), Plan(), set[str]()
         for spec in specs:
             yield
             try:
@@ -446,12 +446,12 @@ class _Bench:
                     raise
                 self._fault(spec, error)
                 continue
-            if not known:
+            if not run_ids:
                 self.store.prepare()
             self.run_ids.append(run.run_id)
-            if run.run_id in known:
+            if run.run_id in run_ids:
                 continue
-            known.add(run.run_id)
+            run_ids.add(run.run_id)
             stored = self.store.get(run.run_id)
             if stored is not None and stored.status not in again and not _lacks_pictures(self.store, run, stored):
                 self._reuse(run, stored)
@@ -634,7 +634,8 @@ def run_packed(spec_json: str, protocol_json: str, identity_json: str, *, at_a_t
             f"{name} would make another run: {', '.join(differing)} differ",
             "give all workers the same code, packages and data",
         )
-    with contextlib.closing(TemporaryFolder()) as folder:
+    no_space = raising(InfrastructureError, f"{name} cannot write its temporary files", "check the free space")
+    with no_space, contextlib.closing(TemporaryFolder()) as folder:
         store = RunStore(folder.path)
         store.prepare()
         protocol = Protocol.model_validate_json(protocol_json)
@@ -657,10 +658,12 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     Raises:
         RunError: The bytes are no packed run, or hold names that do not belong there.
     """
-    with contextlib.closing(TemporaryFolder()) as folder:
+    no_space = raising(InfrastructureError, "cannot unpack a run that a worker has made", "check the free space")
+    with no_space, contextlib.closing(TemporaryFolder()) as folder:
         sent = RunStore(folder.path)
         with (  # zipfile raises almost anything over damaged archives
             raising(RunError, f"{len(data)} bytes from a worker are no packed run", of=Exception),
+            raising(InfrastructureError, f"cannot write {folder.path}", "check the free space"),
             zipfile.ZipFile(io.BytesIO(data)) as archive,
         ):
             odd = [name for name in archive.namelist() if not _ENTRY.fullmatch(name)]

@@ -1,5 +1,6 @@
 """Many runs: resuming, retrying, parallel and elsewhere, under a jumping clock; imported trajectories; suites."""
 
+import errno
 import io
 import json
 import multiprocessing
@@ -183,6 +184,22 @@ def test_packed_runs_that_are_none(store: RunStore, toy_folder: str, tmp_path: P
             unpack(buffer.getvalue(), other)
     assert other.ids() == [] and not list(tmp_path.rglob("evil*"))
     assert unpack(good, other) == record and other.ids() == [record.run_id]
+
+
+@pytest.mark.parametrize("place", ["worker", "head"])
+def test_a_full_disk_of_a_worker_or_of_the_head_is_one_clear_line(
+    tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if place == "worker":
+        monkeypatch.setattr("dynslam_bench.runs.running.TemporaryFolder", full)
+    else:
+        monkeypatch.setattr("zipfile.ZipFile.extractall", full)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(InfrastructureError, match=r"No space left") as error:
+        run_many(specs(toy_folder, range(1)), results=tmp_path, executor=executor)
+    assert "\n" not in str(error.value) and RunStore(tmp_path).ids() == []
 
 
 # -- imported trajectories -------------------------------------------------------------------------------------------
