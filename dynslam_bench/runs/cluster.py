@@ -15,11 +15,12 @@ from urllib.parse import urlsplit
 
 from dynslam_bench.core.errors import RunError, raising
 from dynslam_bench.core.fingerprint import package_digest, versions
+from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.arguments import resolve_device
 from dynslam_bench.runs.identity import CODE_PACKAGES
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
-from dynslam_bench.sequences.catalogue import entry_of, find_data_root
+from dynslam_bench.sequences.catalogue import entry_of
 
 _KIND = ("tracker", "settings", "sequence", "data_root", "camera", "device", "frames", "offset", "stride")
 """What decides whether a host can make a run."""

@@ -57,10 +57,11 @@ def look_up(folder: str, count: int, results: str) -> dict[str, float]:
 
 
 def fill(folder: str, count: int, results: str) -> dict[str, float]:
-    """Store copies of one run under the ids of all."""
+    """Store copies of one run, with its metrics, under the ids of all."""
     store = RunStore(results)
-    (record,) = run_many([RunSpec(tracker="never-move", sequence=folder, frames=(0, 30), device="cpu")], results=store)
-    model, text, look = store.folder(record.run_id), record.to_json(), Resolver()
+    (record,) = run_many([RunSpec(tracker="orb-slam2", sequence=folder, frames=(0, 30), device="cpu")], results=store)
+    model, text, look, entries = store.folder(record.run_id), record.to_json(), Resolver(), []
+    metrics = store.score(record)
     for spec in specs(folder, count):
         run_id = look(spec).run_id
         (store.runs / run_id).mkdir()
@@ -68,11 +69,14 @@ def fill(folder: str, count: int, results: str) -> dict[str, float]:
             if (model / name).is_file():
                 shutil.copy(model / name, store.runs / run_id)
         (store.runs / run_id / "run.json").write_text(text.replace(record.run_id, run_id))
+        state = store.index.state(run_id, record.sequence.part)
+        entries.append((run_id, state, metrics.to_line().replace(record.run_id, run_id)))
+    store.index.write(f"metrics {metrics.protocol_digest}", metrics.code, entries)
     return {}
 
 
 def resume(folder: str, count: int, results: str) -> dict[str, float]:
-    """Look all up and take them from the store, with their scores known (the second time) or not."""
+    """Look all up and take them from the store."""
     assert len(run_many(specs(folder, count), results=results)) == count
     return {"resume": time.process_time()}
 
@@ -83,7 +87,7 @@ def listing(folder: str, count: int, results: str) -> dict[str, float]:
     return {"list": time.process_time()}
 
 
-PARTS = {"look_up": look_up, "fill": fill, "scored": resume, "resume": resume, "listed": listing, "list": listing}
+PARTS = {"look_up": look_up, "fill": fill, "resume": resume, "listed": listing, "list": listing}
 
 
 def main() -> None:
