@@ -21,6 +21,8 @@ import pytest
 from envs_toys import TARGET, truth, write_folder
 from hostile import until
 
+from dynslam_bench.api import bench
+from dynslam_bench.cli.running import show_workers
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
@@ -490,3 +492,17 @@ def test_runs_are_made_by_the_workers_that_can_make_them(
     for run_id in here.ids():
         one, other_one = (store.folder(run_id) / "trajectory_online.txt" for store in (here, there))
         assert one.read_bytes() == other_one.read_bytes()
+
+
+def test_a_suite_on_a_scheduler_begins_with_what_its_workers_have(
+    tmp_path: Path, toy_folder: str, cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suite = write(tmp_path / "toys.toml", f'trackers = ["{TARGET}"]\nsequences = ["{toy_folder}"]\nframes = [0, 8]\n')
+    cluster.add()
+    with DaskWorkers(cluster.address) as executor:
+        executor._client.wait_for_workers(1)
+    (run,) = bench(suite, results=tmp_path / "results", scheduler=cluster.address, on_workers=show_workers)
+    heading, row = capsys.readouterr().err.splitlines()[:2]
+    assert heading.startswith("worker ") and "the same" in row and run.record.status == "ok"
+    with pytest.raises(RunError, match="no Dask scheduler answers at nowhere:1"):
+        bench(suite, results=tmp_path / "results", scheduler="nowhere:1")
