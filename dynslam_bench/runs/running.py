@@ -343,7 +343,7 @@ def run_many(
     cancelled: Callable[[], bool] = lambda: False,
     on_fault: OnFault | None = None,
 ) -> Records:
-    """Make the runs that are not stored yet, and score all of them.
+    """Make the runs that are not stored yet, and score them.
 
     The first runs begin once a thousand are looked up, while the others are. A stored run is made again if snapshots, a
     video, a sheet or its map are asked for that it lacks. One that is given another label gets that. One that a study
@@ -472,7 +472,7 @@ class _Bench:
             record = self.store.rewrite(record, tracker=labelled)
         if record.study and not run.spec.study:
             record = self.store.rewrite(record, study="")
-        self._score(run, record, "reused")
+        self._take_in(run, record, "reused")
 
     def _make_here(self) -> None:
         """Make the waiting runs, or take what another process has made of them meanwhile.
@@ -549,13 +549,13 @@ class _Bench:
         except RunError as error:
             self._fault(run.spec, error)
         else:
-            self._score(run, record, "finished")
+            self._take_in(run, record, "finished")
 
-    def _score(self, run: ResolvedRun, record: RunRecord, kind: EventKind) -> None:
+    def _take_in(self, run: ResolvedRun, record: RunRecord, kind: EventKind) -> None:
         self.done.add(run.run_id)
         if record.status == "stopped":
             self.not_stored[run.run_id] = record
-        else:
+        elif kind == "finished":
             self.store.score(record, self.protocol)
         self._report(kind, run, record=record)
 
