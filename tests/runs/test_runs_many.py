@@ -120,8 +120,9 @@ def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:
     whole = [RunSpec(tracker=TARGET, sequence=toy_folder, seed=seed) for seed in range(2)]
     keep = resolve(whole[0]).run_id
     records = run_many(whole, results=store, on_progress=lambda run_id, partial: run_id == keep)
-    assert records[0].status == "ok" and store.ids() == [keep]
-    assert records[1].status in ("stopped", "ok")
+    assert records[0].status == "ok" and records[1].status in ("stopped", "ok")
+    stored = {keep} if records[1].status == "stopped" else {record.run_id for record in records}
+    assert set(store.ids()) == stored, "it may have ended before it heard"
 
 
 def _be_daemonic() -> None:
