@@ -48,26 +48,31 @@ class DaskWorkers(Executor):
         self._executor = self._client.get_executor(pure=False)
         self._slots, self._look_again = Counter[str](), float("-inf")
         self._refused: dict[str, dict[str, RunError]] = defaultdict(dict)
+        self._strangers: set[str] = set()
 
     def describe(self, sequences: Sequence[str], data_root: str | None = None) -> list[dict[str, object]]:
-        """What each worker has, as rows of a table.
+        """What each worker has, as rows of a table; one that does not know this package gets no runs.
 
         Args:
             sequences: Ids or folders that runs will need.
             data_root: Folder of the recorded sequences.
         """
         own, workers = _facts(sequences, data_root), self._workers()
+        answers = self._client.run(_facts, sequences, data_root, on_error="ignore")
+        self._strangers = {_host(address) for address in workers.keys() - answers.keys()}
+        unknown = {"code": "", "packages": set(), "device": "", "lacking": set()}
         return [
             {
                 "worker": address,
-                "code": "the same" if facts["code"] == own["code"] else "other",
+                "code": "the same" if facts["code"] == own["code"] else "other" if facts["code"] else "none",
                 "other packages": [" ".join(pair) for pair in sorted(facts["packages"] - own["packages"])],
                 "device": facts["device"],
-                "runs at a time": workers[address]["nthreads"],
-                "memory (GB)": workers[address]["memory_limit"] / 1e9,
+                "runs at a time": worker["nthreads"],
+                "memory (GB)": (worker["memory_limit"] or 0) / 1e9,
                 "lacks": sorted(facts["lacking"] - own["lacking"]),
             }
-            for address, facts in self._client.run(_facts, sequences, data_root).items()
+            for address, worker in workers.items()
+            for facts in [answers.get(address, unknown)]
         ]
 
     def _workers(self) -> dict[str, dict[str, Any]]:
@@ -86,12 +91,14 @@ class DaskWorkers(Executor):
     def _send(self, outcome: Future[bytes], kind: str, refusers: set[str], *call: Any) -> None:
         """Send a run, which `refusers` have refused, to hosts that have refused none of its kind."""
         refused = self._refused[kind]
-        able = sorted(self._slots.keys() - refused.keys())
+        able = sorted(self._slots.keys() - refused.keys() - self._strangers)
         if refused and not able:
             outcome.set_exception(next(iter(refused.values())))
             return
         at_a_time = max(self._slots.values(), default=1)
-        sent = self._executor.submit(_answer, at_a_time, *call, **({"workers": able} if refused else {}))
+        sent = self._executor.submit(
+            _answer, at_a_time, *call, **({"workers": able} if refused or self._strangers else {})
+        )
         outcome.add_done_callback(lambda outcome: sent.cancel() if outcome.cancelled() else None)
         sent.add_done_callback(partial(self._take, outcome, kind, refusers, call))
 

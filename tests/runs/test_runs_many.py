@@ -469,6 +469,9 @@ def test_runs_are_made_by_the_workers_that_can_make_them(
     victim = cluster.add(**same)
     cluster.add(**other)
     cluster.add(**same, DYNSLAM_BENCH_DATA=str(tmp_path / "none"))
+    (tmp_path / "fake" / "dynslam_bench").mkdir(parents=True)
+    (tmp_path / "fake" / "dynslam_bench" / "__init__.py").touch()
+    cluster.add(PYTHONPATH=f"{tmp_path}/fake:{path}")
 
     def told(event: RunEvent) -> None:
         if event.kind == "finished":
@@ -480,9 +483,10 @@ def test_runs_are_made_by_the_workers_that_can_make_them(
     ]
     here, there = RunStore(tmp_path / "here"), RunStore(tmp_path / "there")
     with DaskWorkers(cluster.address) as executor:
-        executor._client.wait_for_workers(4)
+        executor._client.wait_for_workers(5)
         rows = executor.describe(["tum/fr1/xyz"])
-        assert sorted(map(str, (row["lacks"] for row in rows))) == ["['tum/fr1/xyz']", "[]", "[]", "[]"]
+        assert sorted(str(row["lacks"]) for row in rows) == ["['tum/fr1/xyz']", "[]", "[]", "[]", "[]"]
+        assert sorted(str(row["code"]) for row in rows) == ["none", *["the same"] * 4]
         records = run_many(asked, results=there, executor=executor, on_event=told)
         (refusals,) = executor._refused.values()
     assert [record.status for record in records] == ["ok"] * len(asked)
