@@ -18,18 +18,16 @@ The names are loaded on first use, so that ``import dynslam_bench`` stays fast. 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
-from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean, raising
+from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean
 from dynslam_bench.core.records import Record
-from dynslam_bench.core.version import install_hint
 from dynslam_bench.runs import DEFAULT_PROTOCOL, Limits, RunRecord, RunSpec, RunStore, load_frames, run_many
 from dynslam_bench.trackers import TRACKERS
 
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     from dynslam_bench.contracts import Trajectory
     from dynslam_bench.evaluation.protocol import Protocol
     from dynslam_bench.reports import ReportPaths
-    from dynslam_bench.runs import ResolvedRun, RunEvent
+    from dynslam_bench.runs import Plan, RunEvent
     from dynslam_bench.runs.running import OnFault
     from dynslam_bench.tuning import Study, StudySpec, StudySummary
 
@@ -52,14 +50,19 @@ class RunResult:
     """A stored run.
 
     Attributes:
-        record: Everything that is stored of it.
+        run_id: Its id.
         store: The results folder.
         protocol: How its metrics are evaluated.
     """
 
-    record: RunRecord
+    run_id: str
     store: RunStore
     protocol: str
+
+    @property
+    def record(self) -> RunRecord:
+        """Everything that is stored of it; read whenever it is asked for."""
+        return self.store.read_whole(self.run_id)
 
     @property
     def status(self) -> str:
@@ -68,22 +71,22 @@ class RunResult:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """The metrics under the protocol by name (``ate_rmse_m``, ...); empty if it was stopped."""
-        return {} if self.status == "stopped" else dict(self.store.score(self.record, self.protocol).metrics)
+        """The metrics under the protocol by name (``ate_rmse_m``, ...)."""
+        return dict(self.store.score(self.record, self.protocol).metrics)
 
     @property
     def trajectory(self) -> Trajectory | None:
         """Poses of the tracked frames, each as it was when the frame came; None if no frame was tracked."""
-        return self.store.trajectory(self.record.run_id)
+        return self.store.trajectory(self.run_id)
 
     @property
     def folder(self) -> Path:
         """Where its files are."""
-        return self.store.folder(self.record.run_id)
+        return self.store.folder(self.run_id)
 
     def frames(self) -> pd.DataFrame:
         """State, errors, times and diagnostics, one row a frame."""
-        return load_frames(self.record.run_id, self.store.root)
+        return load_frames(self.run_id, self.store.root)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +191,8 @@ def bench(
     time_limit_s: float | None = None,
     memory_limit_mb: float | None = None,
     shard: tuple[int, int] = (1, 1),
-    on_plan: Callable[[Collection[ResolvedRun]], None] | None = None,
+    on_workers: Callable[[list[dict[str, object]]], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_fault: OnFault | None = None,
     **choice: Any,
@@ -205,7 +209,8 @@ def bench(
         time_limit_s: Seconds that a run may take, in place of the suite's limit.
         memory_limit_mb: Memory that a run may take, in place of the suite's limit.
         shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ... of them.
-        on_plan: Called before the first run.
+        on_workers: Called before the first run, with what each of the scheduler's workers has.
+        on_plan: Called once, with the runs that are to be made.
         on_event: Called with every `RunEvent`.
         on_fault: Called with every run that cannot be made.
         **choice: Arguments of `Suite.specs`: ``trackers``, ``seeds``, ``offsets``, ``frames``, ``data_root``, ...
@@ -213,19 +218,25 @@ def bench(
     Raises:
         DynslamError: The suite names something unknown, a run cannot be made, or the part holds no run.
     """
+    from dynslam_bench.runs.cluster import DaskWorkers
     from dynslam_bench.suites import load_suite
 
     asked = {"time_s": time_limit_s, "memory_mb": memory_limit_mb}
-    limits = {name: value for name, value in asked.items() if value is not None}
-    every = load_suite(suite).specs(**choice)
-    specs = [
-        spec.model_copy(update={"limits": checked(Limits, **(spec.limits.model_dump() | limits))})
-        for spec in every[shard[0] - 1 :: shard[1]]
-    ]
-    if not specs:
-        raise RunError(f"part {shard[0]} of {shard[1]} holds none of the suite's {len(every)} runs", "make fewer parts")
+    chosen = load_suite(suite)
+    limits = chosen.limits.model_dump() | {name: value for name, value in asked.items() if value is not None}
+    every = chosen.model_copy(update={"limits": checked(Limits, **limits)}).specs(**choice)
+    part = islice(every, shard[0] - 1, None, shard[1])
+    if (first := next(part, None)) is None:
+        raise RunError(f"part {shard[0]} of {shard[1]} holds none of the suite's runs", "make fewer parts")
+    specs = chain([first], part)
     how: dict[str, Any] = {"on_plan": on_plan, "on_event": on_event, "on_fault": on_fault, "retry": retry}
-    return run_specs(specs, results=results, protocol=protocol, jobs=jobs, scheduler=scheduler, **how)
+    how |= {"results": results, "protocol": protocol, "jobs": jobs}
+    if scheduler is None:
+        return run_specs(specs, **how)
+    with DaskWorkers(scheduler) as workers:
+        if on_workers is not None:
+            on_workers(workers.describe(chosen.sequences, choice.get("data_root")))
+        return run_specs(specs, executor=workers, **how)
 
 
 def run_specs(
@@ -233,7 +244,6 @@ def run_specs(
     *,
     results: str | Path = "results",
     protocol: str = DEFAULT_PROTOCOL,
-    scheduler: str | None = None,
     **how: Any,
 ) -> list[RunResult]:
     """Make runs that are given one by one.
@@ -242,31 +252,14 @@ def run_specs(
         specs: The runs, e.g. of `make_specs`.
         results: The results folder.
         protocol: How to evaluate.
-        scheduler: Address of a Dask scheduler whose workers make the runs.
         **how: Further arguments of `run_many`.
 
     Raises:
-        DynslamError: See `run_many`; or the scheduler does not answer.
+        DynslamError: See `run_many`.
     """
     store = RunStore(results)
-    executor = None if scheduler is None else dask_executor(scheduler)
-    records = run_many(specs, results=store, protocol=protocol, executor=executor, **how)
-    return [RunResult(record, store, protocol) for record in records]
-
-
-def dask_executor(address: str) -> Executor:
-    """The executor of a Dask cluster.
-
-    Raises:
-        RunError: ``distributed`` is not installed, or the scheduler does not answer.
-    """
-    with raising(RunError, "a scheduler needs the package distributed", install_hint("cluster"), of=ImportError):
-        from distributed import Client
-    with raising(
-        RunError, f"no Dask scheduler answers at {address}", "for example tcp://host:8786", of=(OSError, ValueError)
-    ):
-        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # it logs a lost scheduler with a traceback
-        return Client(address, timeout="10s").get_executor()  # type: ignore[no-any-return]
+    records = run_many(specs, results=store, protocol=protocol, **how)
+    return [RunResult(run_id, store, protocol) for run_id in records.run_ids if run_id not in records.not_stored]
 
 
 def tune(

@@ -51,8 +51,6 @@ def open_frames(
             stride=stride,
             preprocessing=preprocessing,
         )
-    if stride < 1:
-        raise SequenceError(f"stride is {stride}, expected at least 1")
     if preprocessing is not None and preprocessing.changes_images:
         from dynslam_bench.sequences.preprocessing import Preprocessed
 

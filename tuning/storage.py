@@ -261,7 +261,8 @@ def open_database(url: str) -> BaseStorage:
     """
     for attempt in range(_ATTEMPTS):
         try:
-            return optuna.storages.get_storage(PatientStorage(url, engine_kwargs={"pool_pre_ping": True}))
+            how = {"pool_pre_ping": True, "pool_size": 1}  # a server takes few connections, e.g. 100
+            return optuna.storages.get_storage(PatientStorage(url, engine_kwargs=how))
         except (DBAPIError, StorageInternalError) as error:
             cause = str(error.__cause__ or error).lower()
             if attempt + 1 == _ATTEMPTS or not any(words in cause for words in _BEING_MADE):
@@ -381,6 +382,25 @@ class Heartbeats:
         if name not in self._seen or self._seen[name][0] != count:
             self._seen[name] = count, now
         return now - self._seen[name][1]
+
+    def running(self) -> dict[int, str]:
+        """The running trials, each with its worker and whether that is alive.
+
+        A worker elsewhere is silent if it does not count up while this waits, a little longer than `HEARTBEAT_S`.
+        """
+        trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+        workers = {trial.number: trial.user_attrs.get("worker", "") for trial in trials}
+        counts, deadline = self._study.user_attrs, time.monotonic() + 1.25 * HEARTBEAT_S
+        silent = {name for name in workers.values() if name.rpartition(":")[0] != _machine()}
+        while silent and time.monotonic() < deadline:
+            time.sleep(0.2)
+            silent -= {
+                name for name in silent if self._study.user_attrs.get(_ALIVE + name) != counts.get(_ALIVE + name)
+            }
+        return {
+            number: f"{name}, {'silent' if name in silent else 'dead' if self._has_ended(name) else 'alive'}"
+            for number, name in workers.items()
+        }
 
     def beat(self) -> None:
         """Count up once."""

@@ -56,13 +56,13 @@ def demo(
     store.prepare()  # before the rendering: an unwritable folder is reported at once
     specs = [
         spec.model_copy(update={"sequence": f"{spec.sequence}&frames={frames}", "frames": None})
-        for spec in load_suite("demo").specs()
+        for spec in load_suite("demo").specs(snapshots=True)
     ]
     study = study_spec(max(MIN_STUDY_FRAMES, int(STUDY_SHARE * frames)), trials)
     write(f"{len(specs)} runs of {frames} frames, and a study of {trials} trials: some minutes")
     with compiled_ahead():
         render({spec.sequence for spec in specs})
-    records = WatchedRuns(store, jobs, PROTOCOL).make(partial(run_specs, specs, results=store.root, jobs=jobs))
+    made = WatchedRuns(store, jobs, PROTOCOL).make(partial(run_specs, specs, results=store.root, jobs=jobs))
     note("making the report")
     paths = report(store.root, title="Demo: walking and sitting people, rendered")
     silence_optuna()
@@ -77,7 +77,7 @@ def demo(
     for line in (*tell(board.rows), f"The study: {tuned.summary.conclusion}"):
         write(wrapped(line))
     write(f"\nreport: {paths.html}\nstudy:  {tuned.page}")
-    if any(record.failed for record in records):
+    if any(run.record.failed for run in made):
         raise typer.Exit(SOME_RUNS_FAILED)
 
 

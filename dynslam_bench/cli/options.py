@@ -150,6 +150,12 @@ Frames = Annotated[
 Stride = Annotated[int, typer.Option("--stride", min=1, help="Take every so many frames.", rich_help_panel=FRAMES)]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda:N.", rich_help_panel=MACHINE)]
 Threads = Annotated[int, typer.Option("--threads", min=1, help="Threads of a run.", rich_help_panel=MACHINE)]
+Snapshots = Annotated[
+    bool,
+    typer.Option(
+        "--snapshots", help="Keep pictures, features and masks of some frames, for reports.", rich_help_panel=OUTPUT
+    ),
+]
 Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs at a time.", rich_help_panel=MACHINE)]
 Seeds = Annotated[
     Optional[list[int]],  # noqa: UP045

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from dynslam_bench.cli.output import (
     json_mode,
     note,
     progress,
+    table,
     warn,
     write_error,
 )
@@ -89,6 +90,7 @@ def run(
         bool,
         typer.Option("--cache", help="Take features and masks from the stage cache.", rich_help_panel=opts.MACHINE),
     ] = False,
+    snapshots: opts.Snapshots = False,
     video: Annotated[
         bool, typer.Option("--video", help="Write video.webm beside the run.", rich_help_panel=opts.OUTPUT)
     ] = False,
@@ -158,7 +160,8 @@ def run(
         tracker, sequences, settings=overrides, preset=preset, seeds=seed or [0], offsets=offset or [0],
         frames=frames, stride=stride, camera=camera, data_root=None if data_root is None else str(data_root),
         device=device, threads=threads, realtime=realtime, drop_share=drop, cache=cache, video=video, sheet=sheet,
-        rrd=rrd, save_map=save_map, label=label, degrade=opts.gather_settings(degrade),
+        snapshots=snapshots, rrd=rrd, save_map=save_map, label=label,
+        degrade=opts.gather_settings(degrade),
         limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )  # fmt: skip
     scored_under = protocol or default_protocol(tracker)
@@ -214,6 +217,7 @@ def bench(
             metavar="K/N", help="Only the K-th of N parts of the runs; see `runs merge`.", rich_help_panel=opts.MACHINE
         ),
     ] = "1/1",
+    snapshots: opts.Snapshots = False,
     retry: opts.Retry = None,
     time_limit: opts.TimeLimit = None,
     memory_limit: opts.MemoryLimit = None,
@@ -243,9 +247,16 @@ def bench(
         seeds=tuple(seed or ()),
         offsets=tuple(offset or ()),
         frames=None if frames is None else parse_frames(frames),
+        snapshots=snapshots,
         shard=parse_shard(shard),
+        on_workers=show_workers,
     )
     finish(make, results, jobs, protocol, yes)
+
+
+def show_workers(rows: Sequence[dict[str, object]]) -> None:
+    """What each worker of a scheduler has, on standard error."""
+    announce(table(list(rows[0]), [list(row.values()) for row in rows]) if rows else "the scheduler has no worker yet")
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -275,26 +286,26 @@ def finish(
     store = runs.RunStore(results)
     watched = WatchedRuns(store, jobs, protocol)
     try:
-        records = watched.make(make)
+        made = watched.make(make)
     except NetworkNotFetched as error:  # raised before the first run
         if not (yes or confirm_fetch(error.checkpoint)):
             raise
         fetch_checkpoint(error.checkpoint)
-        records = watched.make(make)
-    if not records:
+        made = watched.make(make)
+    if not made:
         raise typer.Exit(1)
-    show_runs(records, store, protocol, watched.reused)
-    missing = show_files(records, store, pictures)
-    if caution := training_scene_note(records):
+    rows = show_runs((run.record for run in made), store, protocol, watched.reused)
+    missing = show_files(rows, store, pictures)
+    if caution := training_scene_note(rows):
         note(caution)
-    unscored = [record for record in records if not record.sequence.ground_truth and not record.failed]
-    for record in unscored[:1]:
-        path = store.folder(record.run_id) / "trajectory_online.txt"
-        announce(f"{record.sequence.id} has no ground truth, so nothing is scored; the estimated trajectory: {path}")
-    if not json_mode() and (fault := recording_note(watched.specs, records, store, protocol)):
+    unscored = (row for row in rows if row["status"] in ("ok", "lost") and row["ate_rmse_m"] is None)
+    if (first := next(unscored, None)) and not store.read_whole(first["run_id"]).sequence.ground_truth:
+        path = store.folder(first["run_id"]) / "trajectory_online.txt"
+        announce(f"{first['sequence']} has no ground truth, so nothing is scored; the estimated trajectory: {path}")
+    if not json_mode() and (fault := recording_note(watched.opened, rows)):
         announce(fault)
-    note(f"{len(records)} runs in {store.root}; report them with: dynslam-bench report {results}")
-    if watched.faults or MAP_FILE in missing or any(record.failed or record.status == "lost" for record in records):
+    note(f"{len(rows)} runs in {store.root}; report them with: dynslam-bench report {results}")
+    if watched.faults or MAP_FILE in missing or any(row["status"] != "ok" for row in rows):
         raise typer.Exit(SOME_RUNS_FAILED)
 
 
@@ -320,37 +331,39 @@ class WatchedRuns:
         protocol: How their errors are evaluated.
 
     Attributes:
-        specs: What was asked for, by the runs' ids.
+        opened: Sequence, data root and camera that were asked for, by the runs' ids.
         reused: Ids of the runs that were stored already.
         faults: Messages of the runs that cannot be made, each of them written once.
     """
 
     def __init__(self, store: runs.RunStore, jobs: int, protocol: str) -> None:
         self.store, self.jobs, self.protocol = store, jobs, protocol
-        self.specs: dict[str, runs.RunSpec] = {}
+        self.opened: dict[str, tuple[str, str | None, str | None]] = {}
         self.reused: set[str] = set()
         self.faults: set[str] = set()
+        self._done = 0.0
         self._shares: dict[str, float] = {}
 
-    def make(self, make: Callable[..., list[RunResult]]) -> list[runs.RunRecord]:
+    def make(self, make: Callable[..., list[RunResult]]) -> list[RunResult]:
         """Call a function of `api` that makes runs, with a progress bar."""
         with progress("runs") as self._advance:
             self._advance(0, None, "opening sequences")
-            runs = make(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
-        return [run.record for run in runs]
+            return make(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
 
-    def _plan(self, runs: Collection[runs.ResolvedRun]) -> None:
-        announce(describe_plan(runs, self.store, self.jobs, self.protocol))
+    def _plan(self, plan: runs.Plan) -> None:
+        announce(describe_plan(plan, self.store, self.jobs, self.protocol))
 
     def _event(self, event: runs.RunEvent) -> None:
-        self.specs[event.run_id] = event.spec
-        if event.kind == "progress" and event.partial is not None:
-            self._shares[event.run_id] = event.partial["frames_done"] / max(event.partial["frames"], 1)
-        elif event.record is not None:
-            self._shares[event.run_id] = 1.0
+        before = self._shares.pop(event.run_id, 0.0)
+        if event.record is not None:
+            self.opened[event.run_id] = (event.spec.sequence, event.spec.data_root, event.spec.camera)
+            self._done += 1.0 - before
             self.reused |= {event.run_id} if event.kind == "reused" else set()
             note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
-        self._advance(sum(self._shares.values()), event.total, event_text(event))
+        elif event.partial is not None:
+            self._shares[event.run_id] = event.partial["frames_done"] / max(event.partial["frames"], 1)
+            self._done += self._shares[event.run_id] - before
+        self._advance(self._done, event.total, event_text(event))
 
     def _fault(self, _: runs.RunSpec, error: DynslamError) -> None:
         if str(error) not in self.faults:
@@ -369,14 +382,15 @@ def event_text(event: runs.RunEvent) -> str:
     return f"{text}, writing {', '.join(['trajectories', *runs.pictures_asked(event.spec)])}"
 
 
-def describe_plan(planned: Collection[runs.ResolvedRun], store: runs.RunStore, jobs: int, protocol: str) -> str:
+def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: str) -> str:
     """How many frames will be tracked, and the expected time by stored runs of the same trackers."""
-    text = f"{len(planned)} run{'s' * (len(planned) != 1)}, {sum(len(run.sequence) for run in planned)} frames"
+    text = f"{plan.runs} run{'s' * (plan.runs != 1)}, {plan.frames.total()} frames"
     times_ms = defaultdict[str, list[float]](list)
     for row in runs.list_runs(store, protocol)[0]:
         if row["frame_ms"]:
             times_ms[row["tracker"]].append(row["frame_ms"])
-    if not {run.tracker.id for run in planned} <= times_ms.keys():
+    if not plan.frames.keys() <= times_ms.keys():
         return text
-    expected_ms = sum(len(run.sequence) * median(times_ms[run.tracker.id]) for run in planned) / min(jobs, len(planned))
-    return f"{text}, about {timedelta(seconds=round(expected_ms / 1000))} by the frame times of stored runs"
+    expected_ms = sum(frames * median(times_ms[tracker]) for tracker, frames in plan.frames.items())
+    seconds = round(expected_ms / min(jobs, plan.runs) / 1000)
+    return f"{text}, about {timedelta(seconds=seconds)} by the frame times of stored runs"

@@ -1,11 +1,11 @@
-"""``runs list|show|rescore|merge|rm``, and runs as the rows of a table."""
+"""``runs list|show|rescore|merge|export|rm``, and runs as the rows of a table."""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
@@ -33,8 +33,10 @@ from dynslam_bench.cli.output import (
     warn,
     write,
 )
-from dynslam_bench.core.errors import RunError, did_you_mean
+from dynslam_bench.core.errors import RunError, did_you_mean, raising
+from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.toml import assignments, label_text
+from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:
     from dynslam_bench.runs.store import Merged
@@ -188,6 +190,21 @@ def merge(
 
 
 @app.command()
+def export(
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="A .csv, or a .parquet (extra [parquet]).")],
+    results: Results = Path("results"),
+    protocol: ProtocolId = "tum-rgbd/v1",
+) -> None:
+    """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it."""
+    if output.suffix not in (".csv", ".parquet"):
+        raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
+    frame = _open(results).frame(protocol)
+    with raising(RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError):
+        write_atomic(output, frame.to_csv(index=False) if output.suffix == ".csv" else frame.to_parquet())
+    write(str(output))
+
+
+@app.command()
 def rm(
     runs: Annotated[Optional[list[str]], typer.Argument(help="Ids or their first digits.")] = None,  # noqa: UP045
     results: Results = Path("results"),
@@ -249,11 +266,20 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
 
 
 def show_runs(
-    records: Sequence[stored.RunRecord], store: stored.RunStore, protocol: str, reused: Collection[str] = ()
-) -> None:
-    """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are marked as from the store."""
-    scored = [(record, None if record.status == "stopped" else store.score(record, protocol)) for record in records]
-    show_rows([stored.run_row(*pair) | {"from_store": pair[0].run_id in reused} for pair in scored], store, protocol)
+    records: Iterable[stored.RunRecord], store: stored.RunStore, protocol: str, reused: Collection[str] = ()
+) -> list[dict[str, Any]]:
+    """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are marked as from the store.
+
+    Returns:
+        The table's rows, see `run_row`.
+    """
+    rows = [
+        stored.run_row(record, None if record.status == "stopped" else store.score(record, protocol))
+        | {"from_store": record.run_id in reused}
+        for record in records
+    ]
+    show_rows(rows, store, protocol)
+    return rows
 
 
 def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: str) -> None:
@@ -289,65 +315,58 @@ def shown_cell(name: str, value: Any) -> Any:
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 
-def show_files(records: Sequence[stored.RunRecord], store: stored.RunStore, names: Sequence[str]) -> set[str]:
+def show_files(rows: Sequence[dict[str, Any]], store: stored.RunStore, names: Sequence[str]) -> set[str]:
     """Write the paths of the requested pictures and maps, and to standard error why a run has none.
 
     Returns:
         The names of which a run has none.
     """
     missing = set[str]()
-    by_id = {record.run_id: record for record in records}
-    for (run_id, record), name in product(by_id.items(), names):
+    statuses = {row["run_id"]: row["status"] for row in rows}
+    for (run_id, status), name in product(statuses.items(), names):
         path = store.folder(run_id) / name
         if not path.is_file():
             missing.add(name)
-            reasons = [text for text in record.notes if text.startswith(f"no {name}")]
-            warn(f"{[*reasons, f'no {name}: the run ended early, {record.status}'][0]} ({run_id})")
+            reasons = [text for text in store.read_whole(run_id).notes if text.startswith(f"no {name}")]
+            warn(f"{[*reasons, f'no {name}: the run ended early, {status}'][0]} ({run_id})")
         elif not json_mode():
             write(str(path))
     return missing
 
 
-def training_scene_note(records: Sequence[stored.RunRecord]) -> str:
+def training_scene_note(rows: Sequence[dict[str, Any]]) -> str:
     """One line on the runs on scenes that the segmentation network was trained on; empty without any."""
-    from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
-
-    ids = [r.sequence.id for r in records if seen_in_training(r.segmentation, r.sequence.id)]
+    ids = [row["sequence"] for row in rows if row["seen_in_training"]]
     if not ids:
         return ""
     return (
-        f"{len(ids)} of {len(records)} runs have masks of a network that was trained on their scene, the first on "
+        f"{len(ids)} of {len(rows)} runs have masks of a network that was trained on their scene, the first on "
         f"{ids[0]}: a best case, which reports mark and do not rank; scenes 100-199 are held out, e.g. "
         f"{ids[0].partition('?')[0].partition('@')[0]}?scene=100"
     )
 
 
-def recording_note(
-    specs: Mapping[str, stored.RunSpec], records: Sequence[stored.RunRecord], store: stored.RunStore, protocol: str
-) -> str:
+def recording_note(opened: Mapping[str, tuple[str, str | None, str | None]], rows: Sequence[dict[str, Any]]) -> str:
     """One line on a fault of the first recording whose run failed, was lost or was no better than a static camera.
 
     Empty without such a run, or where a short check of the recording finds no fault.
 
     Args:
-        specs: What was asked for, by the runs' ids.
-        records: The runs.
-        store: Where they are.
-        protocol: How their errors are evaluated.
+        opened: Sequence, data root and camera that were asked for, by the runs' ids.
+        rows: The runs.
     """
     from dynslam_bench.sequences.doctor import diagnose
 
-    for record in records:
-        spec = specs[record.run_id]
-        metrics = {} if record.status == "stopped" else store.score(record, protocol).metrics
-        error, bound = metrics.get("ate_rmse_m"), metrics.get("static_camera_ate_rmse_m")
-        static = record.tracker.id != "never-move" and error is not None and bound is not None and error >= bound
-        static = static and "false_motion_max_m" not in metrics
-        if spec.sequence.startswith("synthetic/") or not (record.failed or record.status == "lost" or static):
+    for row in rows:
+        sequence, data_root, camera = opened[row["run_id"]]
+        error, bound = row["ate_rmse_m"], row["static_camera_ate_rmse_m"]
+        static = row["tracker"] != "never-move" and error is not None and bound is not None and error >= bound
+        static = static and row["false_motion_max_m"] is None
+        if sequence.startswith("synthetic/") or not (row["status"] != "ok" or static):
             continue
-        diagnosis = diagnose(spec.sequence, data_root=spec.data_root, camera=spec.camera, most_frames=HINT_FRAMES)
+        diagnosis = diagnose(sequence, data_root=data_root, camera=camera, most_frames=HINT_FRAMES)
         if diagnosis.ok:
             return ""
-        how = f"dynslam-bench sequences doctor {spec.sequence}{f' --camera {spec.camera}' if spec.camera else ''}"
-        return f"{record.sequence.id} has a fault: {diagnosis.findings[0].text}; more by: {how}"
+        how = f"dynslam-bench sequences doctor {sequence}{f' --camera {camera}' if camera else ''}"
+        return f"{row['sequence']} has a fault: {diagnosis.findings[0].text}; more by: {how}"
     return ""

@@ -93,12 +93,13 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
     from dynslam_bench.tuning.judgement import StudySummary
-    from dynslam_bench.tuning.storage import best_trials, count_states, extension_of
+    from dynslam_bench.tuning.storage import Heartbeats, best_trials, count_states, extension_of
 
     stored = tuning.Study.open(study, results)
     asked_for = stored.spec.trials + extension_of(stored.study)["trials"]
     facts: dict[str, Any] = {"study": stored.spec.name, "folder": stored.folder, "asked_for": asked_for}
     facts |= count_states(stored.study)
+    facts["running_trials"] = [f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()]
     settings: dict[str, Any] = {}
     summary = stored.folder / "summary.json"
     conclusion = StudySummary.read(summary) if summary.is_file() else None

@@ -93,10 +93,10 @@ def replace_folder(work: Path, target: Path) -> None:
                 raise
         try:
             _exchange(work, target)
-        except FileNotFoundError:
-            if not work.exists():
+        except OSError as error:
+            if error.errno not in (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST) or not work.exists():
                 raise
-            continue  # another process has just removed the target
+            continue  # another process has just removed or replaced the target
         shutil.rmtree(work, ignore_errors=True)
         return
 
@@ -116,7 +116,10 @@ def _exchange(one: Path, other: Path) -> None:
     try:
         one.rename(other)
     except OSError:
-        aside.rename(other)
+        with contextlib.suppress(OSError):  # another process has just put its own there
+            aside.rename(other)
+        if other.exists():
+            shutil.rmtree(aside, ignore_errors=True)
         raise
     aside.rename(one)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
-    from dynslam_bench.runs.running import RunEvent, pictures_asked, run_many, run_one
+    from dynslam_bench.runs.running import Plan, RunEvent, pictures_asked, run_many, run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
     from dynslam_bench.runs.store import (
         DEFAULT_PROTOCOL,
@@ -44,6 +44,7 @@ _HOMES = {
     "read_trajectory": "exchange.formats",
     "rescore": "store",
     "resolve": "identity",
+    "Plan": "running",
     "ResolvedRun": "identity",
     "run_many": "running",
     "run_one": "running",
@@ -61,6 +62,7 @@ __all__ = [
     "Exported",
     "Limits",
     "MetricRecord",
+    "Plan",
     "ResolvedRun",
     "RunEvent",
     "RunRecord",

@@ -41,7 +41,7 @@ from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-_PACKAGES = (
+CODE_PACKAGES = (
     *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
     *("culling", "slam", "trackers", "envs"),
 )
@@ -97,7 +97,8 @@ class Resolver:
     """
 
     def __init__(self) -> None:
-        self._opened = lru_cache(maxsize=None)(_opened)
+        self._whole = lru_cache(maxsize=None)(open_frames)
+        self._part = lru_cache(maxsize=None)(self._open_part)
         self._device = lru_cache(maxsize=None)(resolve_device)
         self._configured: dict[str, tuple[TrackerSpec, Settings, dict[str, Any]]] = {}
         self._code: dict[tuple[str, str], dict[str, Any]] = {}
@@ -109,8 +110,8 @@ class Resolver:
         if configuration not in self._configured:
             self._configured[configuration] = _configured(spec)
         tracker, settings, flat = self._configured[configuration]
-        where = (spec.sequence, spec.data_root, spec.camera, spec.frames_seen, spec.stride)
-        sequence, part, sequence_plugin = self._opened(*where, spec.offset, preprocessing_of(settings))
+        where = (spec.sequence, spec.data_root, spec.camera, preprocessing_of(settings))
+        sequence, part, sequence_plugin = self._part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)
         strengths = set(Degradation.__dataclass_fields__) - {"seed"}
         for unknown in sorted(set(spec.degrade) - strengths):
@@ -148,6 +149,22 @@ class Resolver:
         }
         return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
 
+    def _open_part(
+        self,
+        where: tuple[str, str | None, str | None, PreprocessingSettings | None],
+        frames: tuple[int, int | None] | None,
+        stride: int,
+        offset: int,
+    ) -> tuple[Sequence, Part, str]:
+        """Checked frames of a sequence, what part of it they are, and the digest of the plug-in that reads it."""
+        name, data_root, camera, preprocessing = where
+        whole = self._whole(name, data_root, camera, None, 1, preprocessing)
+        sequence = open_frames(whole, None, None, frames, stride)
+        check_frames(sequence)
+        datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
+        dataset = datasets.get(name.partition("/")[0])
+        return sequence, part_of(sequence, offset), "" if dataset is None else plugin_digest(dataset.entry_point)
+
 
 def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
     """The tracker of a run, its complete settings, and these by dotted name."""
@@ -156,23 +173,6 @@ def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
         raise RunError(f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing))
     settings = resolve_settings(tracker, spec.settings)
     return tracker, settings, flatten(settings)
-
-
-def _opened(
-    sequence: str,
-    data_root: str | None,
-    camera: str | None,
-    frames: tuple[int, int | None] | None,
-    stride: int,
-    offset: int,
-    preprocessing: PreprocessingSettings | None,
-) -> tuple[Sequence, Part, str]:
-    """A checked sequence, the part of it, and the digest of the plug-in that reads it, if one does."""
-    opened = open_frames(sequence, data_root, camera, frames, stride, preprocessing)
-    check_frames(opened)
-    datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
-    dataset = datasets.get(sequence.partition("/")[0])
-    return opened, part_of(opened, offset), "" if dataset is None else plugin_digest(dataset.entry_point)
 
 
 def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> dict[str, Any]:
@@ -217,7 +217,7 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
     prefix, _, segmenter = source.partition(":")
     if prefix == "plugin":
         plugins["segmentation.source"] = plugin_digest(SEGMENTERS.get(segmenter).entry_point)
-    return digest([code_digest(tracker.entry_point, _PACKAGES), plugins])
+    return digest([code_digest(tracker.entry_point, CODE_PACKAGES), plugins])
 
 
 def weights_of(settings: Settings, source: str) -> dict[str, str]:

@@ -153,7 +153,7 @@ class _Recorder:
         self._title = f"{env.tracker_spec.label} on {env.sequence.id}"
         self._log = (folder / FRAMES_FILE).open("w")
         self._logged = 0
-        self._snapshots = SnapshotWriter(folder, len(env.sequence))
+        self._snapshots = SnapshotWriter(folder, len(env.sequence)) if spec.snapshots else None
         self._video = VideoWriter(folder, env) if spec.video else None
         self._sheet = SheetWriter(folder / SHEET_FILE, env) if spec.sheet else None
         self._recorded: list[RecordedFrame] = []
@@ -170,7 +170,8 @@ class _Recorder:
         self._log.flush()
         self._logged = len(outcomes)
         outcome = outcomes[-1]
-        self._snapshots.add(outcome, env.frame.rgb, result)
+        if self._snapshots is not None:
+            self._snapshots.add(outcome, env.frame.rgb, result)
         if self._video is not None:
             self._video.add()
         if self._sheet is not None:
@@ -217,7 +218,8 @@ class _Recorder:
     def close(self) -> None:
         """Finish the files, also those of a run that ends early."""
         self._log.close()
-        self._snapshots.write()
+        if self._snapshots is not None:
+            self._snapshots.write()
         if self._video is not None:
             self._video.close()
 

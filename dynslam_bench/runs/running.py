@@ -12,7 +12,7 @@ import threading
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -37,7 +37,7 @@ from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
-from dynslam_bench.runs.artifacts import SHEET_FILE, VIDEO_FILE
+from dynslam_bench.runs.artifacts import PICTURE, SHEET_FILE, VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
@@ -47,6 +47,7 @@ from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verd
 from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, StageTime, Status, TrackerInfo
 from dynslam_bench.runs.spec import RunSpec, place_of
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
+from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
 from dynslam_bench.sequences.tags import sequence_tags
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.slam.map_files import MAP_FILE
@@ -262,7 +263,9 @@ def judge_coverage(tracked: int, due: int, lost_at_end: int, total: int) -> tupl
 
 OnFault = Callable[[RunSpec, DynslamError], None]
 """Called as ``on_fault(spec, error)`` for a run that cannot be made; nothing of it is stored."""
-_CLAIM_AGAIN_S = 0.2
+_LOOK_AGAIN_S = 0.2
+_LOOKED_UP_FIRST = 1000
+"""Runs that are looked up before the first one begins."""
 _SENT = 1000
 """Runs that an executor is given at a time."""
 EventKind = Literal["reused", "started", "progress", "finished"]
@@ -276,7 +279,7 @@ class RunEvent:
         kind: ``reused`` (it was stored already), ``started``, ``progress`` or ``finished``.
         run_id: The run.
         spec: What was asked for.
-        total: How many runs there are.
+        total: How many runs there are, of those looked up so far.
         record: The outcome, with ``reused`` and ``finished``.
         partial: The partial metrics, with ``progress``.
     """
@@ -289,6 +292,43 @@ class RunEvent:
     partial: dict[str, Any] | None = None
 
 
+@dataclass
+class Plan:
+    """What is to be made.
+
+    Attributes:
+        runs: How many runs.
+        frames: Frames of their parts of sequences, by the tracker's id.
+    """
+
+    runs: int = 0
+    frames: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True, eq=False)
+class Records(Sequence[RunRecord]):
+    """The records of many runs; each is read from the store when it is asked for.
+
+    Attributes:
+        store: The store.
+        run_ids: The runs.
+        not_stored: The records of those that were stopped.
+    """
+
+    store: RunStore
+    run_ids: list[str]
+    not_stored: dict[str, RunRecord]
+
+    def __len__(self) -> int:
+        return len(self.run_ids)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[at] for at in range(len(self))[index]]
+        run_id = self.run_ids[index]
+        return self.not_stored.get(run_id) or self.store.read_whole(run_id)
+
+
 def run_many(
     specs: Iterable[RunSpec],
     *,
@@ -296,20 +336,20 @@ def run_many(
     jobs: int = 1,
     executor: Executor | None = None,
     retry: Collection[str] = (),
-    on_plan: Callable[[Collection[ResolvedRun]], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
     cancelled: Callable[[], bool] = lambda: False,
     on_fault: OnFault | None = None,
-) -> list[RunRecord]:
-    """Make the runs that are not stored yet, and score all of them.
+) -> Records:
+    """Make the runs that are not stored yet, and score them.
 
-    Everything is looked up before the first run begins. A stored run is made again if a video, a sheet or its map is
-    asked for that it lacks. One that is given another label gets that. One that a study made is an ordinary run once it
-    is asked for without the study. A failure is a record and stops nothing; after an interrupt the call goes on. A run
-    whose sequence or files cannot be read stops no other, and nothing of it is stored. Several processes may share a
-    results folder (without `executor`): each run is made by one of them.
+    The first runs begin once a thousand are looked up, while the others are. A stored run is made again if snapshots, a
+    video, a sheet or its map are asked for that it lacks. One that is given another label gets that. One that a study
+    made is an ordinary run once it is asked for without the study. A failure is a record and stops nothing; after an
+    interrupt the call goes on. A run that cannot be made stops no other, and nothing of it is stored. Several processes
+    may share a results folder (without `executor`): each run is made by one of them.
 
     Args:
         specs: What to run; runs that are the same are made once.
@@ -318,23 +358,22 @@ def run_many(
         executor: Where to make them instead, e.g. Dask's ``client.get_executor()``. Its workers return records as bytes
             and need the sequences, not the results folder; partial metrics stay there: `on_progress` is not called.
         retry: Statuses to run again although they are stored; ``failed`` stands for all of `FAILED`.
-        on_plan: Called once, before the first run, which runs will be made, if any.
+        on_plan: Called once, when all are looked up, with the runs that are to be made, if any.
         on_event: Told of everything that happens, from several threads but never two at a time.
         on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
         protocol: Protocol to score under.
         cancelled: Asked many times a second; True ends the runs on this machine at once, as stopped.
         on_fault: Told of every run that cannot be made, by one thread at a time. Without it the first such fault is
-            raised when all other runs are stored.
+            raised when all other runs are stored, and at once where a name or a setting is wrong.
 
     Returns:
         The records in the order of `specs`, without those of runs that cannot be made.
 
     Raises:
-        DynslamError: A spec names something unknown or unfit, or the results folder cannot be written, and nothing ran;
-            or, without `on_fault`, a run could not be made.
+        DynslamError: The results folder cannot be written, what runs need broke, a network has to be fetched first, or,
+            without `on_fault`, a run cannot be made.
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
-    protocol = get_protocol(protocol)
     again = set(FAILED).union(retry) - {"failed"} if "failed" in retry else set(retry)
     outcomes = {"ok", "lost", *FAILED}
     if not again <= outcomes:
@@ -342,36 +381,8 @@ def run_many(
         raise RunError(f"unknown status '{min(again - outcomes)}' to retry", f"known: failed, {statuses}")
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
-    resolved: list[ResolvedRun] = []
-    faults: list[tuple[RunSpec, DynslamError]] = []
-    look_up = Resolver()
-    for spec in specs:
-        try:
-            resolved.append(look_up(spec))
-        except (SequenceError, TrajectoryError) as error:
-            faults.append((spec, error))
-    if resolved:
-        store.prepare()
-    bench = _Bench(store, protocol, len(resolved), jobs, on_event, on_progress, cancelled, on_fault)
-    for spec, fault in faults:
-        bench.fault(spec, fault)
-    todo: dict[str, ResolvedRun] = {}
-    done: dict[str, RunRecord] = {}
-    for run in resolved:
-        if run.run_id in todo or run.run_id in done:
-            continue
-        stored = store.get(run.run_id)
-        if stored is not None and stored.status not in again and not _lacks_pictures(store, run, stored):
-            done[run.run_id] = bench.reuse(run, stored)
-        else:
-            todo[run.run_id] = run
-            bench.before[run.run_id] = stored
-    if todo and on_plan is not None:
-        on_plan(todo.values())
-    done |= bench.run_here(todo) if executor is None else bench.run_remotely(todo, executor)
-    if bench.faults and on_fault is None:
-        raise bench.faults[0]
-    return [done[run.run_id] for run in resolved if run.run_id in done]
+    bench = _Bench(store, get_protocol(protocol), jobs, executor, on_plan, on_event, on_progress, cancelled, on_fault)
+    return bench.make(specs, again)
 
 
 @dataclass
@@ -380,62 +391,113 @@ class _Bench:
 
     store: RunStore
     protocol: Protocol
-    total: int
     jobs: int
+    executor: Executor | None
+    on_plan: Callable[[Plan], None] | None
     on_event: Callable[[RunEvent], None] | None
     on_progress: OnProgress | None
     cancelled: Callable[[], bool]
     on_fault: OnFault | None
-    before: dict[str, RunRecord | None] = field(default_factory=dict)
-    """The records of the runs that are to be made, when the call began."""
-    faults: list[DynslamError] = field(default_factory=list)
+    run_ids: list[str] = field(default_factory=list)
+    """Of the runs that were looked up, in their order."""
+    waiting: list[tuple[ResolvedRun, RunRecord | None]] = field(default_factory=list)
+    """Runs that are to be made, each with the record that is stored."""
+    done: set[str] = field(default_factory=set)
+    not_stored: dict[str, RunRecord] = field(default_factory=dict)
+    first_fault: DynslamError | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
+    looked_up: threading.Event = field(default_factory=threading.Event)
     aborted: threading.Event = field(default_factory=threading.Event)
 
-    def reuse(self, run: ResolvedRun, record: RunRecord) -> RunRecord:
+    def make(self, specs: Iterable[RunSpec], again: Collection[str]) -> Records:
+        makers: list[Future[None]] = []
+        with ThreadPoolExecutor(self.jobs, thread_name_prefix="dynslam-run") as pool:
+            try:
+                looking_up = self._look_up(specs, again)
+                for _ in islice(looking_up, _LOOKED_UP_FIRST):
+                    pass
+                if self.executor is None:
+                    makers += [pool.submit(self._make_here) for _ in range(self.jobs)]
+                else:
+                    makers.append(pool.submit(self._make_remotely, self.executor))
+                for _ in looking_up:
+                    if any(maker.done() for maker in makers):  # it failed
+                        break
+                for maker in as_completed(makers):
+                    maker.result()
+            except BaseException:
+                self.aborted.set()
+                raise
+        if self.first_fault is not None and self.on_fault is None:
+            raise self.first_fault
+        return Records(self.store, [run_id for run_id in self.run_ids if run_id in self.done], self.not_stored)
+
+    def _look_up(self, specs: Iterable[RunSpec], again: Collection[str]) -> Iterator[None]:
+        """Look the runs up, one a step: take what is stored, let the others wait to be made."""
+        look_up, plan, run_ids = Resolver(), Plan(), set[str]()
+        for spec in specs:
+            yield
+            try:
+                run = look_up(spec)
+            except (NetworkNotFetched, InfrastructureError):
+                raise
+            except DynslamError as error:
+                if self.on_fault is None and not isinstance(error, (SequenceError, TrajectoryError)):
+                    raise
+                self._fault(spec, error)
+                continue
+            if not run_ids:
+                self.store.prepare()
+            self.run_ids.append(run.run_id)
+            if run.run_id in run_ids:
+                continue
+            run_ids.add(run.run_id)
+            stored = self.store.get(run.run_id)
+            if stored is not None and stored.status not in again and not _lacks_pictures(self.store, run, stored):
+                self._reuse(run, stored)
+                continue
+            plan.runs += 1
+            plan.frames[run.tracker.id] += len(run.sequence)
+            self.waiting.append((run, stored))
+        if plan.runs and self.on_plan is not None:
+            self.on_plan(plan)
+        self.looked_up.set()
+
+    def _is_over(self) -> bool:
+        return self.aborted.is_set() or (self.looked_up.is_set() and not self.waiting)
+
+    def _reuse(self, run: ResolvedRun, record: RunRecord) -> None:
         if run.spec.label not in ("", record.tracker.label):
             labelled = record.tracker.model_copy(update={"label": run.spec.label})
             record = self.store.rewrite(record, tracker=labelled)
         if record.study and not run.spec.study:
             record = self.store.rewrite(record, study="")
-        self.store.score(record, self.protocol)
-        self._report("reused", run, record=record)
-        return record
+        self._take_in(run, record, "reused")
 
-    def run_here(self, todo: dict[str, ResolvedRun]) -> dict[str, RunRecord]:
-        waiting = list(todo.values())
-        with ThreadPoolExecutor(self.jobs, thread_name_prefix="dynslam-run") as pool:
-            futures = [pool.submit(self._next, waiting) for _ in todo]
-            try:
-                records = [future.result() for future in as_completed(futures)]
-            except BaseException:
-                self.aborted.set()
-                for future in futures:
-                    future.cancel()
-                raise
-        return {record.run_id: record for record in records if record is not None}
-
-    def _next(self, waiting: list[ResolvedRun]) -> RunRecord | None:
-        """Make the first run that no other process is making, or take what another one has made of it meanwhile.
+    def _make_here(self) -> None:
+        """Make the waiting runs, or take what another process has made of them meanwhile.
 
         While all that are left are claimed elsewhere it waits.
         """
-        with ExitStack() as claims:
-            while (run := self._claim(waiting, claims)) is None:
-                time.sleep(_CLAIM_AGAIN_S)
-            stored = self.store.get(run.run_id)
-            if stored is not None and stored != self.before[run.run_id]:
-                return self.reuse(run, stored)
-            return self._attempt(run, self._make)
+        while not self._is_over():
+            with ExitStack() as claims:
+                if (claimed := self._claim(claims)) is None:
+                    time.sleep(_LOOK_AGAIN_S)
+                    continue
+                run, before = claimed
+                stored = self.store.get(run.run_id)
+                if stored is not None and stored != before:
+                    self._reuse(run, stored)
+                else:
+                    self._attempt(run, self._make)
 
-    def _claim(self, waiting: list[ResolvedRun], claims: ExitStack) -> ResolvedRun | None:
+    def _claim(self, claims: ExitStack) -> tuple[ResolvedRun, RunRecord | None] | None:
         with self.lock:
-            for run in waiting:
+            for at, (run, _) in enumerate(self.waiting):
                 with ExitStack() as attempt:
                     if attempt.enter_context(self.store.claim(run.run_id)) or self._is_cancelled():
                         claims.enter_context(attempt.pop_all())
-                        waiting.remove(run)
-                        return run
+                        return self.waiting.pop(at)
         return None
 
     def _make(self, run: ResolvedRun) -> RunRecord:
@@ -445,7 +507,7 @@ class _Bench:
             self._report("progress", run, partial=partial)
             return self.on_progress is None or self.on_progress(run_id, partial)
 
-        record = run_one(
+        return run_one(
             run,
             self.store,
             on_progress=progress,
@@ -453,52 +515,53 @@ class _Bench:
             cancelled=self._is_cancelled,
             at_a_time=self.jobs,
         )
-        return self._finished(run, record)
 
-    def run_remotely(self, todo: dict[str, ResolvedRun], executor: Executor) -> dict[str, RunRecord]:
-        waiting, protocol = iter(todo.values()), self.protocol.model_dump_json()
+    def _make_remotely(self, executor: Executor) -> None:
+        protocol = self.protocol.model_dump_json()
         sent: dict[Future[Any], ResolvedRun] = {}  # a future holds all bytes of its run, so few are kept
-        records: dict[str, RunRecord] = {}
         try:
-            while True:
-                for run in islice(waiting, _SENT - len(sent)):
+            while sent or not self._is_over():
+                for _ in range(min(_SENT - len(sent), len(self.waiting))):
+                    run, _ = self.waiting.pop(0)
                     self._report("started", run)
                     spec = run.spec.model_copy(update={"device": run.device})
                     asked = (spec.model_dump_json(), protocol, json.dumps(run.identity, default=str))
                     sent[_asked(executor.submit, run_packed, *asked)] = run
                 if not sent:
-                    return records
-                for future in wait(sent, return_when=FIRST_COMPLETED).done:
-                    run = sent.pop(future)
-                    record = self._attempt(run, partial(self._take, future))
-                    records |= {} if record is None else {run.run_id: record}
-        except BaseException:
+                    time.sleep(_LOOK_AGAIN_S)
+                for future in wait(sent, _LOOK_AGAIN_S, FIRST_COMPLETED).done:
+                    self._attempt(sent.pop(future), partial(self._take, future))
+                if self.aborted.is_set():
+                    return
+        finally:
             for future in sent:
                 future.cancel()
-            raise
 
     def _take(self, future: Future[Any], run: ResolvedRun) -> RunRecord:
-        return self._finished(run, unpack(_asked(future.result), self.store))
+        return unpack(_asked(future.result), self.store)
 
-    def _attempt(self, run: ResolvedRun, make: Callable[[ResolvedRun], RunRecord]) -> RunRecord | None:
-        """The run's record; None, once that is reported, if it cannot be made although nothing is broken here."""
+    def _attempt(self, run: ResolvedRun, make: Callable[[ResolvedRun], RunRecord]) -> None:
+        """Make a run; one that cannot be made although nothing is broken here is set aside."""
         try:
-            return make(run)
+            record = make(run)
         except InfrastructureError:
             raise
         except RunError as error:
-            self.fault(run.spec, error)
-            return None
+            self._fault(run.spec, error)
+        else:
+            self._take_in(run, record, "finished")
 
-    def _finished(self, run: ResolvedRun, record: RunRecord) -> RunRecord:
-        if record.status != "stopped":
+    def _take_in(self, run: ResolvedRun, record: RunRecord, kind: EventKind) -> None:
+        self.done.add(run.run_id)
+        if record.status == "stopped":
+            self.not_stored[run.run_id] = record
+        elif kind == "finished":
             self.store.score(record, self.protocol)
-        self._report("finished", run, record=record)
-        return record
+        self._report(kind, run, record=record)
 
-    def fault(self, spec: RunSpec, error: DynslamError) -> None:
+    def _fault(self, spec: RunSpec, error: DynslamError) -> None:
         with self.lock:
-            self.faults.append(error)
+            self.first_fault = self.first_fault or error
             if self.on_fault is not None:
                 self.on_fault(spec, error)
 
@@ -508,7 +571,7 @@ class _Bench:
     def _report(self, kind: EventKind, run: ResolvedRun, **details: Any) -> None:
         if self.on_event is not None:
             with self.lock:
-                self.on_event(RunEvent(kind, run.run_id, run.spec, self.total, **details))
+                self.on_event(RunEvent(kind, run.run_id, run.spec, len(self.run_ids), **details))
 
 
 def _asked(ask: Callable[..., T], *arguments: object) -> T:
@@ -526,7 +589,8 @@ def _asked(ask: Callable[..., T], *arguments: object) -> T:
 
 def pictures_asked(spec: RunSpec) -> list[str]:
     """The files beside a run that it was asked for."""
-    asked = ((VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet), (RECORDING_FILE, spec.rrd), (MAP_FILE, spec.save_map))
+    asked = [(PICTURE.format(0), spec.snapshots), (VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet)]
+    asked += [(RECORDING_FILE, spec.rrd), (MAP_FILE, spec.save_map)]
     return [name for name, wanted in asked if wanted]
 
 
@@ -543,13 +607,14 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
 _ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16})/([A-Za-z0-9_]+\.[a-z0-9]+)")
 
 
-def run_packed(spec_json: str, protocol_json: str, identity_json: str) -> bytes:
+def run_packed(spec_json: str, protocol_json: str, identity_json: str, *, at_a_time: int = 1) -> bytes:
     """Make a run on a worker that does not share the results folder; the function that executors are handed.
 
     Args:
         spec_json: A `RunSpec` as JSON.
         protocol_json: The protocol of the partial metrics as JSON.
         identity_json: The run's identity where it was asked for, as JSON.
+        at_a_time: Runs that share this machine.
 
     Returns:
         A zip archive with the run's folder and its sequence's stamps and ground truth, for `unpack`.
@@ -569,10 +634,12 @@ def run_packed(spec_json: str, protocol_json: str, identity_json: str) -> bytes:
             f"{name} would make another run: {', '.join(differing)} differ",
             "give all workers the same code, packages and data",
         )
-    with contextlib.closing(TemporaryFolder()) as folder:
+    no_space = raising(InfrastructureError, f"{name} cannot write its temporary files", "check the free space")
+    with no_space, contextlib.closing(TemporaryFolder()) as folder:
         store = RunStore(folder.path)
         store.prepare()
-        return pack(store, run_one(resolved, store, protocol=Protocol.model_validate_json(protocol_json)))
+        protocol = Protocol.model_validate_json(protocol_json)
+        return pack(store, run_one(resolved, store, protocol=protocol, at_a_time=at_a_time))
 
 
 def pack(store: RunStore, record: RunRecord) -> bytes:
@@ -591,10 +658,12 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     Raises:
         RunError: The bytes are no packed run, or hold names that do not belong there.
     """
-    with contextlib.closing(TemporaryFolder()) as folder:
+    no_space = raising(InfrastructureError, "cannot unpack a run that a worker has made", "check the free space")
+    with no_space, contextlib.closing(TemporaryFolder()) as folder:
         sent = RunStore(folder.path)
         with (  # zipfile raises almost anything over damaged archives
             raising(RunError, f"{len(data)} bytes from a worker are no packed run", of=Exception),
+            raising(InfrastructureError, f"cannot write {folder.path}", "check the free space"),
             zipfile.ZipFile(io.BytesIO(data)) as archive,
         ):
             odd = [name for name in archive.namelist() if not _ENTRY.fullmatch(name)]

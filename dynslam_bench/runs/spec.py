@@ -55,6 +55,7 @@ class RunSpec(Record):
         degrade: Strengths of `DegradeFrames`, e.g. ``{"blur": 0.5}``.
         data_root: Folder of the recorded sequences; None for the default one.
         camera: Camera of a folder that does not say its own.
+        snapshots: Whether to keep some frames as the tracker saw them: ``frame_*.webp`` and ``snapshots.npz``.
         video: Whether to write ``video.webm``.
         sheet: Whether to write ``sheet.png``: input, frames, keyframes, map and track on one page.
         rrd: Whether to write ``recording.rrd`` for rerun's viewer.
@@ -81,6 +82,7 @@ class RunSpec(Record):
     degrade: dict[str, float] = Field(default_factory=dict)
     data_root: str | None = None
     camera: str | None = None
+    snapshots: bool = False
     video: bool = False
     sheet: bool = False
     rrd: bool = False

@@ -164,15 +164,9 @@ def open_sequence(
 
         sequence = cast("Sequence", Preprocessed(sequence, settings))
     start, stop = parse_frames(frames)
-    if stride < 1:
-        raise SequenceError(f"stride is {stride}, expected at least 1")
     if (start, stop, stride) == (0, None, 1):
         return sequence
-    view = SequenceView(sequence, start, stop, stride)
-    if not len(view):
-        end = "" if stop is None else stop
-        raise SequenceError(f"frames {start}:{end} hold none of the {len(sequence)} frames of '{sequence.id}'")
-    return cast("Sequence", view)
+    return cast("Sequence", SequenceView(sequence, start, stop, stride))
 
 
 def open_public(sequence_id: str, *, data_root: Path, **how: Any) -> Sequence:

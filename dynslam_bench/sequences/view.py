@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource, Sequence, timestamps_ns
+from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.records import digest
 
 
@@ -32,11 +33,19 @@ class SequenceView(Wrapped):
         start: First frame.
         stop: One past the last frame; None for the end.
         stride: Step between frames.
+
+    Raises:
+        SequenceError: The stride is none, or no frame is left.
     """
 
     def __init__(self, base: Sequence, start: int = 0, stop: int | None = None, stride: int = 1) -> None:
+        if stride < 1:
+            raise SequenceError(f"stride is {stride}, expected at least 1")
         self.base = base
         self.range = range(len(base))[start:stop:stride]
+        if not self.range:
+            end = "" if stop is None else stop
+            raise SequenceError(f"frames {start}:{end} hold none of the {len(base)} frames of '{base.id}'")
 
     @property
     def timestamps(self) -> NDArray[np.float64]:

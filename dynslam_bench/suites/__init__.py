@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,7 +107,8 @@ class Suite(Record):
         seeds: tuple[int, ...] = (),
         offsets: tuple[int, ...] = (),
         frames: tuple[int, int | None] | None = None,
-    ) -> list[RunSpec]:
+        snapshots: bool = False,
+    ) -> Iterator[RunSpec]:
         """The runs of the suite, sequence by sequence so that rendered frames are shared while they are fresh.
 
         Args:
@@ -117,16 +119,22 @@ class Suite(Record):
             seeds: In place of the suite's seeds.
             offsets: In place of the suite's start offsets.
             frames: In place of the suite's frames.
+            snapshots: See `RunSpec.snapshots`.
 
         Raises:
             PluginError: A tracker is not known (with a did-you-mean).
             RunError: A tracker is given settings but is no part of the suite.
         """
         shared: dict[str, Any] = {"frames": frames or self.frames, "stride": self.stride, "device": device}
-        shared |= {"threads": threads or self.threads, "cache": self.cache, "limits": self.limits}
+        shared |= {
+            "snapshots": snapshots,
+            "threads": threads or self.threads,
+            "cache": self.cache,
+            "limits": self.limits,
+        }
         shared |= {"data_root": None if data_root is None else str(data_root)}
         entries = self._entries(trackers)
-        return [
+        return (
             RunSpec(
                 tracker=tracker,
                 sequence=sequence,
@@ -143,7 +151,7 @@ class Suite(Record):
             for tracker, settings in entries
             for seed in seeds or self.seeds
             for offset in offsets or self.offsets
-        ]
+        )
 
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""

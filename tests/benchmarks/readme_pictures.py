@@ -3,7 +3,7 @@
     python tests/benchmarks/readme_pictures.py SITE RESULTS [-o docs/pictures]
 
 `SITE` is a published site (`dynslam-bench report publish`); `RESULTS` holds one run of a tracker that culls, e.g. with
-`dynslam-bench run emfoa-oft 'synthetic/walking_xyz?scene=100' --frames 0:60`. Headless Chromium draws both.
+`dynslam-bench run emfoa-oft 'synthetic/walking_xyz?scene=100' --frames 0:60 --snapshots`. Headless Chromium draws both.
 """
 
 import argparse

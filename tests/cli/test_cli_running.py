@@ -110,7 +110,7 @@ def test_bench_has_limits(cli, walk, tmp_path):
 
 def test_pictures_of_a_stored_run_are_made(facts, walk):
     folder = Path(facts("run", "orb-slam2", walk)[0]["folder"])
-    for option, name in (("--sheet", "sheet.png"), ("--video", "video.webm")):
+    for option, name in (("--snapshots", "frame_000000.webp"), ("--sheet", "sheet.png"), ("--video", "video.webm")):
         assert not (folder / name).exists()
         for from_store in (False, True):
             (row,) = facts("run", "orb-slam2", walk, option)

@@ -7,13 +7,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from cli_helpers import one_line
 
 from dynslam_bench.cli import output, runs
 from dynslam_bench.cli.output import report_table, table
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
-from dynslam_bench.runs import RunSpec, run_many
+from dynslam_bench.runs import RunSpec, RunStore, run_many
 
 ROWS = [
     ["run", "tracker", "sequence", "ATE (m)", "masks"],
@@ -205,3 +206,21 @@ def test_one_unreadable_record_is_named_and_the_others_are_listed(cli, results: 
 def test_half_characters_of_the_command_line_end_in_one_line(cli, results: Path) -> None:
     code, _, err = cli("run", "caf\udce9", "synthetic/walking_xyz", "--results", results)
     assert code == 1 and "caf\\udce9" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_all_runs_are_written_as_one_table(cli, stored: Path, tmp_path: Path, suffix: str) -> None:
+    target, frame = tmp_path / f"runs.{suffix}", RunStore(stored).frame()
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow")
+    assert cli("runs", "export", target, "--results", stored) == (0, f"{target}\n", "")
+    read = pd.read_csv(target) if suffix == "csv" else pd.read_parquet(target)
+    assert list(read.columns) == list(frame.columns) and read["ate_rmse_m"].tolist() == frame["ate_rmse_m"].tolist()
+    assert suffix == "csv" or read.dtypes.equals(frame.dtypes)
+
+
+def test_a_table_without_pyarrow_or_of_another_kind_is_one_line(cli, stored: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    for name, words in (("runs.parquet", "[parquet]"), ("runs.xlsx", ".csv or .parquet")):
+        code, _, err = cli("runs", "export", tmp_path / name, "--results", stored)
+        assert code == 1 and words in err and err.count("\n") == 1 and not (tmp_path / name).exists()

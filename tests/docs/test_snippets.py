@@ -132,7 +132,7 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(text)
     suite = load_suite(tmp_path / "mine.toml")
     trackers = {"orb-slam2", "emfoa-oft", "never-move"}
-    specs = suite.specs(trackers=tuple(sorted(trackers)))
+    specs = list(suite.specs(trackers=tuple(sorted(trackers))))
     assert len(specs) == 4 * 2 * 2 * 3, "three trackers and a row, two sequences, two variants, three offsets"
     assert {spec.tracker for spec in specs} == trackers
 

@@ -296,7 +296,7 @@ def test_a_recording_that_cannot_be_written_says_so(tmp_path: Path) -> None:
 @needs_rerun
 def test_the_recording_of_a_stored_run(store: RunStore, tmp_path: Path) -> None:
     folder = str(write_folder(tmp_path / "toy", 40))
-    record = run_one(RunSpec(tracker=TARGET, sequence=folder), store)
+    record = run_one(RunSpec(tracker=TARGET, sequence=folder, snapshots=True), store)
     rng = np.random.default_rng(0)
     colours = rng.integers(0, 255, (7, 3), np.uint8)
     outputs = MapOutputs((), np.arange(7), rng.normal(size=(7, 3)), colours, np.ones(7, np.int64))

@@ -1,5 +1,6 @@
 """Trackers that exit, hang, leave processes or hoard memory, and faults around a run: one clear end, none survives."""
 
+import errno
 import json
 import os
 import shlex
@@ -265,13 +266,27 @@ def test_the_time_limit_begins_when_the_run_does(tmp_path: Path) -> None:
         supervise(_Slow(60), {}, Limits(time_s=0.1, start_s=0.3))
 
 
+def test_several_on_one_folder_without_locks_lose_nothing(
+    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.setattr("fcntl.flock", flock)  # as on some network file systems
+    specs = [RunSpec(tracker="never-move", sequence=toy_folder, frames=(0, 4), stride=s) for s in (1, 2)]
+    with ThreadPoolExecutor(2) as pool:
+        for records in pool.map(lambda _: run_many(specs, results=RunStore(store.root)), range(2)):
+            assert [record.status for record in records] == ["ok", "ok"]
+    assert len(store.ids()) == 2 and store.all()[1] == [] and not list(store.runs.glob(".*"))
+
+
 def test_several_on_one_folder_share_the_work(store: RunStore, toy_folder: str) -> None:
     specs = [RunSpec(tracker="never-move", sequence=toy_folder, frames=(0, 4), stride=s) for s in (1, 2, 3)]
     made: list[str] = []
 
     def bench(_: int) -> list[RunRecord]:
         events = {"on_event": lambda event: made.append(event.run_id) if event.kind == "finished" else None}
-        return run_many(specs, results=RunStore(store.root), **events)
+        return list(run_many(specs, results=RunStore(store.root), **events))
 
     with ThreadPoolExecutor(3) as pool:
         first, second, third = pool.map(bench, range(3))

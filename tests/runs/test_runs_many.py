@@ -1,26 +1,33 @@
 """Many runs: resuming, retrying, parallel and elsewhere, under a jumping clock; imported trajectories; suites."""
 
+import errno
 import io
 import json
 import multiprocessing
+import os
 import subprocess
 import sys
+import threading
 import time
 import zipfile
+from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from itertools import cycle
 from pathlib import Path
 
+import envs_toys
 import numpy as np
 import pytest
-from envs_toys import TARGET, truth
+from envs_toys import TARGET, truth, write_folder
 from hostile import until
 
-from dynslam_bench.api import dask_executor
+from dynslam_bench.api import bench
+from dynslam_bench.cli.running import show_workers
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
 from dynslam_bench.runs import RunEvent, RunSpec, RunStore, import_trajectory, resolve, run_many, run_one, score
+from dynslam_bench.runs.cluster import DaskWorkers
 from dynslam_bench.runs.running import pack, unpack
 from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -43,7 +50,7 @@ def kinds(events: list) -> dict[str, int]:
 
 def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
     events: list = []
-    first = run_many(specs(toy_folder, range(2)), results=store, **follow(events))
+    first = list(run_many(specs(toy_folder, range(2)), results=store, **follow(events)))
     assert kinds(events) == {"finished": 2, "started": 2}
     events.clear()
     second = run_many(specs(toy_folder, range(4)), results=store, jobs=2, **follow(events))
@@ -55,10 +62,10 @@ def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
 def test_a_run_of_a_study_is_an_ordinary_one_once_it_is_asked_for_without(store: RunStore, toy_folder: str) -> None:
     (made,) = run_many(specs(toy_folder, range(1), study="mine"), results=store)
     assert made.study == "mine"
-    assert run_many(specs(toy_folder, range(1), study="other"), results=store) == [made]
+    assert list(run_many(specs(toy_folder, range(1), study="other"), results=store)) == [made]
     (asked,) = run_many(specs(toy_folder, range(1)), results=store)
     assert asked.study == "" and asked.run_id == made.run_id
-    assert run_many(specs(toy_folder, range(1), study="mine"), results=store) == [asked]
+    assert list(run_many(specs(toy_folder, range(1), study="mine"), results=store)) == [asked]
     assert store.get(made.run_id) == asked
 
 
@@ -82,12 +89,40 @@ def test_a_wrong_name_is_refused_before_anything_runs(store: RunStore, toy_folde
         run_many(specs(toy_folder, range(1)), results=store, jobs=0)
 
 
+def test_what_cannot_be_looked_up_is_set_aside_where_somebody_is_told(store: RunStore, toy_folder: str) -> None:
+    wrong = {"tracker": "orb-slam"}, {"settings": {"speed": 1}}, {"sequence": "nowhere/x"}, {"frames": (5, 6)}
+    asked = [spec.model_copy(update=change) for spec in specs(toy_folder, range(1)) for change in (*wrong, {})]
+    faults: list[str] = []
+    records = run_many(asked, results=store, on_fault=lambda spec, error: faults.append(str(error)))
+    assert [record.status for record in records] == ["ok"] and len(faults) == len(wrong)
+
+
+def test_the_first_runs_are_made_while_others_are_looked_up(
+    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dynslam_bench.runs.running._LOOKED_UP_FIRST", 1)
+    finished = threading.Event()
+
+    def endless() -> Iterator[RunSpec]:
+        yield from specs(toy_folder, range(2))
+        assert finished.wait(300), "no run was made before the last one was known"
+        yield from specs(toy_folder, range(1, 3))
+
+    def told(event: RunEvent) -> None:
+        if event.kind == "finished":
+            finished.set()
+
+    records = run_many(endless(), results=store, on_event=told)
+    assert [record.seed for record in records] == [0, 1, 1, 2] and len(store.ids()) == 3
+
+
 def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:
     whole = [RunSpec(tracker=TARGET, sequence=toy_folder, seed=seed) for seed in range(2)]
     keep = resolve(whole[0]).run_id
     records = run_many(whole, results=store, on_progress=lambda run_id, partial: run_id == keep)
-    assert records[0].status == "ok" and store.ids() == [keep]
-    assert records[1].status in ("stopped", "ok")
+    assert records[0].status == "ok" and records[1].status in ("stopped", "ok")
+    stored = {keep} if records[1].status == "stopped" else {record.run_id for record in records}
+    assert set(store.ids()) == stored, "it may have ended before it heard"
 
 
 def _be_daemonic() -> None:
@@ -152,6 +187,22 @@ def test_packed_runs_that_are_none(store: RunStore, toy_folder: str, tmp_path: P
             unpack(buffer.getvalue(), other)
     assert other.ids() == [] and not list(tmp_path.rglob("evil*"))
     assert unpack(good, other) == record and other.ids() == [record.run_id]
+
+
+@pytest.mark.parametrize("place", ["worker", "head"])
+def test_a_full_disk_of_a_worker_or_of_the_head_is_one_clear_line(
+    tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if place == "worker":
+        monkeypatch.setattr("dynslam_bench.runs.running.TemporaryFolder", full)
+    else:
+        monkeypatch.setattr("zipfile.ZipFile.extractall", full)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(InfrastructureError, match=r"No space left") as error:
+        run_many(specs(toy_folder, range(1)), results=tmp_path, executor=executor)
+    assert "\n" not in str(error.value) and RunStore(tmp_path).ids() == []
 
 
 # -- imported trajectories -------------------------------------------------------------------------------------------
@@ -248,7 +299,7 @@ def test_every_suite_names_only_what_exists(name: str) -> None:
         assert whole in sequence_ids() or entry_of(sequence) is not None
         if sequence.startswith("synthetic/"):
             assert parse_synthetic_id(sequence).split == "held-out", "the embedded network was trained on the others"
-    specs = suite.specs()
+    specs = list(suite.specs())
     assert len(specs) == len({spec.model_dump_json() for spec in specs}) > 0
 
 
@@ -290,7 +341,7 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
         degrade = { blur = 0.5 }
         """,
     )
-    specs = load_suite(path).specs(data_root="/data", device="cpu", threads=2)
+    specs = list(load_suite(path).specs(data_root="/data", device="cpu", threads=2))
     assert (
         len(specs) == 8 and {spec.threads for spec in specs} == {2} and {spec.data_root for spec in specs} == {"/data"}
     )
@@ -345,37 +396,118 @@ def test_rows_are_of_trackers_of_the_suite(tmp_path: Path) -> None:
 # A real Dask cluster: runs come back as bytes, and its end is one clear line. Skipped without `distributed`.
 
 
-def start(program: str, *arguments: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", f"distributed.cli.{program}", "--no-dashboard", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+class Cluster:
+    """A Dask scheduler and its workers, each a process of one thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.place, self.workers = folder, folder / "scheduler.json", []
+        self.scheduler = self.start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+        deadline = time.monotonic() + 300
+        while not (self.place.is_file() and self.place.read_text()):
+            assert self.scheduler.poll() is None and time.monotonic() < deadline
+            time.sleep(0.02)
+        self.address = json.loads(self.place.read_text())["address"]
+
+    def start(self, program: str, *arguments: str, **environment: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", str(self.place), *arguments]
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return subprocess.Popen([*command, "--no-dashboard"], env=os.environ | environment, **silent)
+
+    def add(self, **environment: str) -> subprocess.Popen:
+        """A worker on a host of its own, with these variables of the environment."""
+        host = ("--host", f"127.0.0.{len(self.workers) + 2}") if sys.platform == "linux" else ()
+        private = (*host, "--nthreads", "1", "--no-nanny", "--local-directory", str(self.folder))
+        self.workers.append(self.start("dask_worker", *private, **environment))
+        return self.workers[-1]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    pytest.importorskip("distributed")
+    monkeypatch.setenv("PYTHONPATH", ":".join(path for path in sys.path if path))
+    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")  # no fork server for few runs in a worker
+    started = Cluster(tmp_path)
+    yield started
+    for process in (*started.workers, started.scheduler):
+        process.kill()
+        process.wait()
 
 
 def test_a_scheduler_that_is_killed_in_the_middle_is_one_clear_line(
-    tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, toy_folder: str, cluster: Cluster, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("distributed")
-    monkeypatch.setenv("PYTHONPATH", ":".join(path for path in sys.path if path))
-    monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")  # no fork server for one run in the worker
-    place, store = tmp_path / "scheduler.json", RunStore(tmp_path / "results")
-    file = ("--scheduler-file", str(place))
-    with start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", *file) as scheduler:
-        deadline = time.monotonic() + 300
-        while not (place.is_file() and place.read_text()):
-            assert scheduler.poll() is None and time.monotonic() < deadline
-            time.sleep(0.02)
-        executor = dask_executor(json.loads(place.read_text())["address"])
-        private = ("--local-directory", str(tmp_path))
-        with start("dask_worker", *file, "--nthreads", "1", "--no-nanny", *private) as worker:
+    store, executor = RunStore(tmp_path / "results"), DaskWorkers(cluster.address)
+    cluster.add()
 
-            def told(event: RunEvent) -> None:
-                if event.kind == "finished":
-                    scheduler.kill()
+    def told(event: RunEvent) -> None:
+        if event.kind == "finished":
+            cluster.scheduler.kill()
 
-            specs = [RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(9)]
-            with pytest.raises(InfrastructureError, match=r"^the executor gave up: CancelledError") as error:
-                run_many(specs, results=store, executor=executor, on_event=told)
-            worker.kill()
+    asked = specs(toy_folder, range(9))
+    with pytest.raises(InfrastructureError, match=r"^the executor gave up: CancelledError") as error:
+        run_many(asked, results=store, executor=executor, on_event=told)
     assert "\n" not in str(error.value) and "Traceback" not in capfd.readouterr().err
     records, unreadable = store.all()
-    assert 1 <= len(records) < len(specs) and unreadable == []  # what came back stays
+    assert 1 <= len(records) < len(asked) and unreadable == []  # what came back stays
     assert {record.status for record in records} == {"ok"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a host for each worker")
+def test_runs_are_made_by_the_workers_that_can_make_them(
+    tmp_path: Path, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = write_folder(tmp_path / "data" / "rgbd_dataset_freiburg1_xyz", 8)
+    (tmp_path / "none").mkdir()
+    for name, more in (("same", ""), ("other", "\n\ndef more() -> int:\n    return 1\n")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "toy_of_mine.py").write_text(Path(envs_toys.__file__).read_text() + more)
+    monkeypatch.syspath_prepend(tmp_path / "same")
+    monkeypatch.setenv("DYNSLAM_BENCH_DATA", str(data.parent))
+    path = os.environ["PYTHONPATH"]
+    same, other = ({"PYTHONPATH": f"{tmp_path / name}:{path}"} for name in ("same", "other"))
+    cluster.add(**same)
+    victim = cluster.add(**same)
+    cluster.add(**other)
+    cluster.add(**same, DYNSLAM_BENCH_DATA=str(tmp_path / "none"))
+    (tmp_path / "fake" / "dynslam_bench").mkdir(parents=True)
+    (tmp_path / "fake" / "dynslam_bench" / "__init__.py").touch()
+    cluster.add(PYTHONPATH=f"{tmp_path}/fake:{path}")
+
+    def told(event: RunEvent) -> None:
+        if event.kind == "finished":
+            victim.kill()
+
+    asked = [
+        RunSpec(tracker="toy_of_mine:SPEC", sequence="tum/fr1/xyz", camera=str(data / "camera.toml"), seed=seed)
+        for seed in range(8)
+    ]
+    here, there = RunStore(tmp_path / "here"), RunStore(tmp_path / "there")
+    with DaskWorkers(cluster.address) as executor:
+        executor._client.wait_for_workers(5)
+        rows = executor.describe(["tum/fr1/xyz"])
+        assert sorted(str(row["lacks"]) for row in rows) == ["['tum/fr1/xyz']", "[]", "[]", "[]", "[]"]
+        assert sorted(str(row["code"]) for row in rows) == ["none", *["the same"] * 4]
+        records = run_many(asked, results=there, executor=executor, on_event=told)
+        (refusals,) = executor._refused.values()
+    assert [record.status for record in records] == ["ok"] * len(asked)
+    reasons = sorted(str(reason) for reason in refusals.values())
+    assert len(reasons) == 2 and "is not at" in reasons[0] and "source differ" in reasons[1]
+    run_many(asked, results=here)
+    assert here.ids() == there.ids()
+    for run_id in here.ids():
+        one, other_one = (store.folder(run_id) / "trajectory_online.txt" for store in (here, there))
+        assert one.read_bytes() == other_one.read_bytes()
+
+
+def test_a_suite_on_a_scheduler_begins_with_what_its_workers_have(
+    tmp_path: Path, toy_folder: str, cluster: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suite = write(tmp_path / "toys.toml", f'trackers = ["{TARGET}"]\nsequences = ["{toy_folder}"]\nframes = [0, 8]\n')
+    cluster.add()
+    with DaskWorkers(cluster.address) as executor:
+        executor._client.wait_for_workers(1)
+    (run,) = bench(suite, results=tmp_path / "results", scheduler=cluster.address, on_workers=show_workers)
+    heading, row = capsys.readouterr().err.splitlines()[:2]
+    assert heading.startswith("worker ") and "the same" in row and run.record.status == "ok"
+    with pytest.raises(RunError, match="no Dask scheduler answers at nowhere:1"):
+        bench(suite, results=tmp_path / "results", scheduler="nowhere:1")

@@ -8,12 +8,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import optuna
 import pytest
 import toy_tracker
 from optuna.trial import TrialState
+from simulated import SimulatedTuner, make_spec, valley
 from sqlalchemy.exc import OperationalError
 
 from dynslam_bench.core.errors import StudyError
@@ -73,6 +75,23 @@ def test_a_worker_elsewhere_is_dead_once_it_counts_no_more(quick: None, monkeypa
     with other.beating():
         assert dead_after(2.5) == {silent.number}, "the nameless trial may be that worker's"
     assert dead_after(2.5) == {alive.number, silent.number, nameless.number}
+
+
+def test_running_trials_are_shown_with_their_workers(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = optuna.create_study()
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    names = [worker_name(), f"{worker_name().rpartition(':')[0]}:{ended.pid}", "there:1", "there:2"]
+    for name in names:
+        running(study, name)
+    heartbeats = Heartbeats(study)
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "worker_name", lambda: "there:1")
+        other = Heartbeats(study)
+    with other.beating():
+        states = heartbeats.running()
+    ends = zip(names, ("alive", "dead", "alive", "silent"), strict=True)
+    assert states == {number: f"{name}, {end}" for number, (name, end) in enumerate(ends)}
 
 
 def test_a_worker_here_is_dead_with_its_process() -> None:
@@ -199,3 +218,17 @@ def test_a_killed_worker_and_a_restarted_database_lose_no_trial(
     assert states.count(TrialState.COMPLETE) == 10
     assert all(trial.user_attrs["reason"] == CRASHED_WORKER for trial in trials if trial.state == TrialState.FAIL)
     assert len(trials) <= 12
+
+
+def test_fifty_workers_of_one_database_lose_repeat_and_double_no_trial(tmp_path: Path, postgres: Postgres) -> None:
+    spec = make_spec(trials=80, storage=postgres.url, pruner="none")
+
+    def work(number: int) -> Study:
+        return SimulatedTuner(spec, tmp_path / str(number), effect=valley, in_memory=False).run()
+
+    with ThreadPoolExecutor(50) as pool:  # each with connections of its own; PostgreSQL takes 100 unless told otherwise
+        trials = next(iter(pool.map(work, range(50)))).study.get_trials()
+    assert [trial.number for trial in trials] == list(range(len(trials)))
+    assert {trial.state for trial in trials} == {TrialState.COMPLETE}
+    assert len({tuple(sorted(trial.params.items())) for trial in trials}) == len(trials)
+    assert 80 <= len(trials) < 80 + 50, "workers that ask at the same time may each begin one more"

@@ -352,6 +352,7 @@ SVO = TrackerSpec(
     label="SVO",
     settings=SvoSettings,
     summary="The real SVO (monocular, semi-direct), untouched, in a process of its own.",
+    presets={"handheld": {"init_disparity_px": 15.0, "max_lost_features": 200}},
     sensors="rgb",
     deterministic=False,
     provenance="external",
