@@ -183,11 +183,6 @@ class Candidate(Record):
         """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the baseline, if that is asked."""
         return self.ate_margin is None or _bound(ratios.get("accuracy")) < 1 + self.ate_margin
 
-    @property
-    def worse_on_recordings(self) -> bool:
-        """Whether the whole interval on the recordings, over starts if need be, lies above 1."""
-        return self.recorded is not None and self.recorded.low is not None and self.recorded.low > 1
-
 
 class StudySummary(Record):
     """What came out of a study; `summary.json` in its folder.
@@ -278,7 +273,7 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None) -> tuple[Ver
     numbers += f" (where it was chosen {', '.join(map(str, best.on_confirm.values()))})" if best.ate_margin else ""
     if not best.feasible:
         return Verdict.WORSE, f"{name} violates a constraint when it is run again ({numbers})"
-    if best.worse_on_recordings:
+    if best.recorded is not None and (best.recorded.low or 0.0) > 1:  # over starts, if need be
         return Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"
     if ratio.shows_loss:
         return Verdict.WORSE, f"{name} has {100 * (ratio.ratio - 1):.1f} % more {ratio.what}: {numbers}"
@@ -474,8 +469,8 @@ def read_preset_text(spec: StudySpec, results: Path | str = "results", trial: in
     if trial is not None:
         trials = [one for one in stored.study.get_trials(deepcopy=False) if one.number == trial]
     if not trials:
-        what = "finished trial" if trial is None else f"trial {trial}"
-        raise StudyError(f"study '{spec.name}' has no {what}", "dynslam-bench tune status STUDY.toml")
+        absent = "finished trial" if trial is None else f"trial {trial}"
+        raise StudyError(f"study '{spec.name}' has no {absent}", "dynslam-bench tune status STUDY.toml")
     remark = f"Trial {trials[0].number}{', the best so far' * (trial is None)}; not judged on scenes that no trial saw."
     return preset_text(spec, trials[0].params, remark)
 

@@ -129,8 +129,7 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
             )
     blocks = []
     for title, figure in figures.items():
-        rows = 1 + max((int(axis._plotly_name[5:] or 1) - 1 for axis in figure.select_yaxes()), default=0)
-        height = 60 + 170 * round(math.sqrt(rows)) if title == "Contours" else 450
+        height = 60 + 170 * min(len(params), _CONTOURS) if title == "Contours" else 450
         figure.update_layout(title=None, template={}, height=figure.layout.height or height)
         if title in ("Contours", "Slices"):  # whole names of settings overlap
             for axis in (*figure.select_xaxes(), *figure.select_yaxes()):
@@ -220,9 +219,10 @@ def warnings_of(tuner: Study) -> list[str]:
         notes.append(f"Only {len(complete)} trials were finished: the best value is partly luck.")
     infeasible = sum(not is_feasible(trial) for trial in complete)
     if infeasible:
-        least_bad = "the least bad were judged on unseen instances, and have to fulfil the constraints there"
-        what = least_bad if infeasible == len(complete) else "they are not candidates"
-        notes.append(f"{infeasible} of {len(complete)} trials violate a constraint: {what}.")
+        notes.append(
+            f"{infeasible} of {len(complete)} trials violate a constraint. They are candidates only where all do, and "
+            "then have to fulfil it on unseen instances."
+        )
     if "speed" in tuner.spec.objectives:
         notes.append(
             "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On "

@@ -187,11 +187,13 @@ class Preview(Record):
     @property
     def proposal(self) -> list[str]:
         """The settings that are not used here, and the space without them; it takes runs of the baseline to know."""
-        lines = [f"{name} is not used here: {why}." for name, why in self.unused.items()]
-        if self.unused:
-            left = f"The space without them: include = {self.include}".replace("'", '"')
-            lines.append(left if self.include else "Nothing would be left of the space without them.")
-        return lines
+        if not self.unused:
+            return []
+        left = f"The space without them: include = {self.include}".replace("'", '"')
+        return [
+            *(f"{name} is not used here: {why}." for name, why in self.unused.items()),
+            left if self.include else "Nothing would be left of the space without them.",
+        ]
 
 
 class Plan:

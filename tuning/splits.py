@@ -81,8 +81,7 @@ def design_of(spec: StudySpec, *, further: int = 0) -> Design:
         splits = {"tune": [*tune, *confirm], "held_out": recorded}
         check_splits(spec.name, splits, data_root=spec.data_root)
     tune = running_order(tune, spec.sampler_seed)
-    reference = with_more_starts(tune)
-    return Design(tuple(tune), tuple(reference), tuple(confirm), tuple(held_out), tuple(recorded))
+    return Design(tuple(tune), tuple(with_more_starts(tune)), tuple(confirm), tuple(held_out), tuple(recorded))
 
 
 def running_order(instances: PySequence[ProblemInstance], seed: int) -> list[ProblemInstance]:
@@ -183,9 +182,8 @@ def _drawn(instance: ProblemInstance) -> tuple[object, ...]:
 
 
 def _misplaced(name: str, used: str, own: str) -> str:
-    scenes_of_split = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
-    of_scene = f"its scene ({scenes_of_split.start}-{scenes_of_split.stop - 1})"
-    who = of_scene if name.startswith("synthetic/") else "the catalogue"
+    numbers = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
+    who = f"its scene ({numbers.start}-{numbers.stop - 1})" if name.startswith("synthetic/") else "the catalogue"
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
 

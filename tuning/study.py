@@ -512,10 +512,9 @@ class Study(Plan):
             raise StudyError(
                 f"the storage holds a study '{self.spec.name}' that is none of this toolkit", "give yours another name"
             )
-        identity = self._identity
-        changed = [key for key in identity if stored.get(key) != identity[key]]
+        changed = [key for key, value in self._identity.items() if stored.get(key) != value]
         if changed:
-            there, here = (json.dumps(values.get(changed[0]))[:80] for values in (stored, identity))
+            there, here = (json.dumps(values.get(changed[0]))[:80] for values in (stored, self._identity))
             more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
             raise StudyError(
                 f"study '{self.spec.name}' is stored with other {changed[0]}{more}: {there} there, {here} here",
