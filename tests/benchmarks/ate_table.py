@@ -30,6 +30,7 @@ COLUMNS = {
     "coverage": ("coverage %", "coverage", 1e2),
     "skipped": ("F not used %", "epipolar_skipped", 1e2),
     "frame": ("frame ms", "frame_ms", 1),
+    "memory": ("memory MB", "peak_memory_mb", 1),
     "keyframes": ("keyframes", "keyframes", 1),
 }
 

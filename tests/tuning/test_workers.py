@@ -227,7 +227,8 @@ def test_fifty_workers_of_one_database_lose_repeat_and_double_no_trial(tmp_path:
         return SimulatedTuner(spec, tmp_path / str(number), effect=valley, in_memory=False).run()
 
     with ThreadPoolExecutor(50) as pool:  # each with connections of its own; PostgreSQL takes 100 unless told otherwise
-        trials = next(iter(pool.map(work, range(50)))).study.get_trials()
+        studies = list(pool.map(work, range(50)))
+    trials = studies[0].study.get_trials()
     assert [trial.number for trial in trials] == list(range(len(trials)))
     assert {trial.state for trial in trials} == {TrialState.COMPLETE}
     assert len({tuple(sorted(trial.params.items())) for trial in trials}) == len(trials)
