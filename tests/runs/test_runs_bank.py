@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_helpers import PROGRAM
-from click.testing import CliRunner
 from envs_toys import TARGET
+from typer.testing import CliRunner
 
 from dynslam_bench import api as db
+from dynslam_bench.cli.app import app
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.geometry import Trajectory, se3, write_tum
 from dynslam_bench.runs import RunSpec, RunStore, bank, import_trajectory, run_many
@@ -25,7 +25,7 @@ PUBLISHED = Path(__file__).resolve().parents[3] / "shared" / "data" / "trajector
 
 
 def invoke(*words):
-    return CliRunner().invoke(PROGRAM, [str(word) for word in words])
+    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 @pytest.fixture(scope="module")
