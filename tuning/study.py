@@ -405,7 +405,7 @@ class Study(Plan):
         violates one takes no part in the comparison of successive halving.
         """
         objective, reference = self.objectives[0], self._reference
-        if len(self.objectives) > 1 or not objective.counts(last):
+        if self.spec.pruner == "none" or len(self.objectives) > 1 or not objective.counts(last):
             return False
         if self.spec.pruner == "wilcoxon":
             (value,) = objective.by_start({last: outcomes[last]}, reference)
