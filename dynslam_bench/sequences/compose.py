@@ -168,7 +168,7 @@ def cut_out(people: Sequence) -> tuple[list[Cutout], NDArray[np.float64]]:
         if mask.mean() < _LEAST_PX or border:
             continue
         measured_there = np.where(nearer & mask, frame.depth, 0).astype(np.float32)
-        depth = cv2.medianBlur(_filled(measured_there), 5)
+        depth = _smoothed(_filled(measured_there))
         rows, columns = np.nonzero(mask)
         points = people.camera.unproject(np.stack([columns, rows], axis=1), depth[mask])
         cutouts.append(Cutout(frame.rgb, depth, mask, np.median(points, axis=0)))
@@ -190,8 +190,9 @@ def _person(nearer: NDArray[np.bool_], rgb: NDArray[np.uint8]) -> NDArray[np.boo
     trimap[region > 0] = cv2.GC_PR_FGD
     trimap[cv2.erode(region, _DISC, iterations=2) > 0] = cv2.GC_FGD
     cv2.setRNGSeed(0)
-    cv2.grabCut(np.ascontiguousarray(rgb[..., ::-1]), trimap, None, np.zeros((1, 65)), np.zeros((1, 65)), 2)
-    return (trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)
+    models, image = (np.zeros((1, 65)), np.zeros((1, 65))), np.ascontiguousarray(rgb[..., ::-1])
+    cv2.grabCut(image, trimap, (0, 0, 1, 1), *models, 2, cv2.GC_INIT_WITH_MASK)
+    return np.isin(trimap, (cv2.GC_FGD, cv2.GC_PR_FGD))
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -201,6 +202,11 @@ def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     values = np.zeros(labels.max() + 1, np.float32)
     values[labels[depth > 0]] = depth[depth > 0]
     return values[labels]
+
+
+def _smoothed(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The median of 5x5 pixels."""
+    return np.asarray(cv2.medianBlur(depth, 5), dtype=np.float32)
 
 
 def _poses(truth: Trajectory, stamps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -355,8 +361,8 @@ def paste(
     Returns:
         Colour, depth, and where people are seen, bool ``[H, W]``.
     """
-    everywhere = cv2.medianBlur(_filled(depth), 5)
-    in_front = ((z > 0) & (cv2.medianBlur(z, 5) < everywhere)).astype(np.uint8)
+    everywhere = _smoothed(_filled(depth))
+    in_front = ((z > 0) & (_smoothed(z) < everywhere)).astype(np.uint8)
     shown = cv2.morphologyEx(in_front, cv2.MORPH_OPEN, _LEAST_DISC) > 0
     alpha = cv2.GaussianBlur(shown.astype(np.float32), (3, 3), 0.6)[..., None]
     spread = cv2.blur(shown.astype(np.float32), (3, 3))[..., None]

@@ -205,7 +205,7 @@ class RecordedSequence:
         if people.dtype != np.uint8 or people.ndim != 2:
             raise SequenceError(f"mask {path} has another form than 8 bits in one channel")
         ids = frozenset(np.unique(people[people > 0]).tolist())
-        return FrameMasks(people, dict.fromkeys(ids, "person"), ids)
+        return FrameMasks(people.astype(np.uint8), dict.fromkeys(ids, "person"), ids)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
