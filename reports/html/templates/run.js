@@ -64,7 +64,7 @@ class RunView {
       this.move(this.at + (event.key === "ArrowRight" ? 1 : -1));
     };
     byId("worst").replaceChildren(...(run.worst.length ? ["worst frames: "] : []), ...run.worst.map(([frame, error]) => make("button", { type: "button", textContent: `${frame} (${error} mm)`, onclick: () => this.move(nearest(this.frames, frame)) })));
-    for (const [name, there] of [["picture", run.pictures.length], ["track", run.figures.track], ["time", run.figures.time]]) byId(name).hidden = !there;
+    for (const [name, there] of [["image", run.pictures.length], ["track", run.figures.track], ["time", run.figures.time]]) byId(name).hidden = !there;
     const wanted = address.read().get("frame");
     this.at = wanted ? nearest(this.frames, +wanted) : run.worst.length ? nearest(this.frames, run.worst[0][0]) : 0;
     await this.drawTrack();
@@ -94,12 +94,12 @@ class RunView {
     const { run } = this;
     this.at = Math.max(0, Math.min(this.times.length - 1, at));
     byId("frame").value = this.at;
-    const t = this.times[this.at], frame = run.series.index?.[this.at];
+    const t = this.times[this.at], frame = run.series.index?.[this.at], caption = document.querySelector("#picture figcaption");
+    caption.textContent = "No pictures: they are kept with --snapshots";
     if (run.pictures.length) {
-      const shown = run.pictures[nearest(run.pictures, frame ?? 0)], image = document.querySelector("#picture img");
-      image.src = pictureOf(run.id, shown);
-      image.alt = `Frame ${shown} as the tracker saw it`;
-      document.querySelector("#picture figcaption").textContent = `Frame ${frame} at ${t.toFixed(2)} s${shown === frame ? "" : `; the nearest picture is of frame ${shown}`}`;
+      const shown = run.pictures[nearest(run.pictures, frame ?? 0)];
+      Object.assign(byId("image"), { src: pictureOf(run.id, shown), alt: `Frame ${shown} as the tracker saw it` });
+      caption.textContent = `Frame ${frame} at ${t.toFixed(2)} s${shown === frame ? "" : `; the nearest picture is of frame ${shown}`}`;
     }
     if (run.figures.time && byId("time").layout) {
       const cursor = run.figures.time.layout.shapes.length, place = `shapes[${cursor}]`;
