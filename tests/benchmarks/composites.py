@@ -3,8 +3,9 @@
     python tests/benchmarks/composites.py ./excerpts/rgbd_dataset_freiburg1_xyz --with ./excerpts/man_130 --instances 10
 
 The first table has a row a tracker: the median hold-last-pose ATE over instances with a 95 % interval (bootstrap), the
-ratio to the tracker's error on the host of each instance (geometric mean), and the worst instance. The second one has
-the error of the last tracker by the share of the pixels that people fill.
+ratio to the tracker's error on the host of each instance (geometric mean; that of orb-slam2 where a tracker needs
+masks), and the worst instance. The second one has the error of the last tracker by the share of the pixels that people
+fill.
 """
 
 import argparse
@@ -49,9 +50,8 @@ def main() -> None:
     lines, errors = [], pd.Series(dtype=float)
     for text in chosen.trackers:
         tracker, *assignments = text.split()
-        alone = [f"{name}=none" if name == "segmentation.source" else f"{name}={value}" for name, value in
-                 (part.split("=", 1) for part in assignments)]  # fmt: skip
-        base = errors_of(tracker, alone, chosen.hosts, chosen)
+        masked = any(part.startswith("segmentation.source") for part in assignments)
+        base = errors_of(*(("orb-slam2", []) if masked else (tracker, assignments)), chosen.hosts, chosen)
         errors = errors_of(tracker, assignments, list(hosts), chosen)
         ratios = np.log([errors[name] / base[host] for name, host in hosts.items()])
         low, high = interval(errors.to_numpy())
