@@ -191,7 +191,7 @@ def merge(
 
 @app.command()
 def export(
-    output: Annotated[Path, typer.Argument(metavar="FILE", help="A .csv, or a .parquet (extra [parquet]).")],
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="A .csv, or a .parquet (extra \\[parquet]).")],
     results: Results = Path("results"),
     protocol: ProtocolId = "tum-rgbd/v1",
 ) -> None:

@@ -29,7 +29,7 @@ from dynslam_bench.sequences.fetch import extract
 SUMS = "SHA256SUMS"
 _PARTS = ("runs", "sequences")
 _ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
-_ADDRESS = re.compile(r"[a-z+]+://.*|[\w.-]+@[\w.-]+:.*")
+_ADDRESS = re.compile(r"[a-z+]+://.*|(?:[\w.-]+@)?[\w.-]+:.+")
 
 
 class Bank(RunStore):
@@ -42,11 +42,12 @@ class Bank(RunStore):
             InfrastructureError: It cannot be written.
         """
         self.copy_part(other, record)
+        full = raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space")
         with self.work_folder(record.run_id) as work:
-            for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
-                if file.is_file():
-                    shutil.copyfile(file, work / file.name)
-            with raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space"):
+            with full:
+                for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
+                    if file.is_file():
+                        shutil.copyfile(file, work / file.name)
                 (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
                 replace_folder(work, self.folder(record.run_id))
         return record
@@ -169,7 +170,7 @@ def verify(bank: str | Path) -> list[str]:
     faults = compare_sums(store.root, sums, RunError)
     listed = {line.rstrip("\n").partition("  ")[2] for line in read_lines(sums, kind=RunError)}
     names = store.files()
-    faults += [f"{name} is a link" for name in names if (store.root / name).is_symlink()]
+    faults += [f"{name} is a link" for name in (*_PARTS, *names) if (store.root / name).is_symlink()]
     faults += [f"{name} is not listed in {SUMS}" for name in names if name not in listed]
     records, unreadable = store.all()
     faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
@@ -178,6 +179,12 @@ def verify(bank: str | Path) -> list[str]:
             faults.append(f"runs/{record.run_id}: its id is not that of what it says of itself")
         if f"sequences/{record.sequence.part}/timestamps.txt" not in listed:
             faults.append(f"runs/{record.run_id}: the stamps of its sequence are missing")
+            continue
+        try:
+            store.timestamps(record.sequence.part), store.ground_truth(record.sequence.part)
+            store.trajectory(record.run_id, "online"), store.trajectory(record.run_id, "final")
+        except DynslamError as error:
+            faults.append(f"runs/{record.run_id}: {error}")
     return faults
 
 
@@ -203,6 +210,8 @@ def pull(source: str, bank: str | Path) -> Merged:
             folder = next((path.parent for path in sorted(folder.rglob(SUMS))), folder)
         elif _is_repository(source):
             folder = stack.enter_context(_cloned(source))
+        if not (folder / SUMS).is_file():
+            raise RunError(f"{source} is no bank: it has no {SUMS}")
         _check(folder)
         return _merge([RunStore(folder)], bank)
 
@@ -222,6 +231,11 @@ def push(bank: str | Path, target: str) -> Merged:
     if not _is_repository(target):
         return _merge([RunStore(bank)], target)
     with _cloned(target) as clone:
+        others = [path.name for path in clone.iterdir() if not path.name.startswith((".", "README", "LICENSE"))]
+        if others and SUMS not in others:
+            raise RunError(
+                f"{target} is no bank: it has no {SUMS}, and holds {others[0]}", "push to an empty repository"
+            )
         merged = _merge([RunStore(bank)], clone)
         if merged.added:
             _git(clone, "add", "--force", "--", SUMS, *_PARTS)
@@ -235,10 +249,11 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
     store = Bank(bank)
     if (store.root / SUMS).exists() or store.files():
         _check(bank)
-    merged = merge(sources, store, trials=False)
-    sums = (f"{file_sha256(store.root / name)}  {name}\n" for name in store.files())
-    write_atomic(store.root / SUMS, "".join(sums))
-    return merged
+    try:
+        return merge(sources, store, trials=False)
+    finally:  # what was copied before a fault is whole
+        sums = (f"{file_sha256(store.root / name)}  {name}\n" for name in store.files())
+        write_atomic(store.root / SUMS, "".join(sums))
 
 
 def _check(bank: str | Path) -> None:

@@ -331,11 +331,11 @@ class RunStore:
             return self.publish(work, record)
 
     def copy_part(self, other: RunStore, record: RunRecord) -> None:
-        """Copy the stamps and the ground truth of a run's part of a sequence, as far as they are not here."""
-        for file in sorted(other._part(record.sequence.part).glob("*.txt")):
-            target = self._part(record.sequence.part) / file.name
-            if not target.is_file():
-                write_atomic(target, file.read_bytes())
+        """Copy the ground truth and then the stamps of a run's part of a sequence, if its stamps are not here."""
+        folder = self._part(record.sequence.part)
+        if not (folder / "timestamps.txt").is_file():
+            for file in sorted(other._part(record.sequence.part).glob("*.txt")):
+                write_atomic(folder / file.name, file.read_bytes())
 
     def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
         """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth; done once a part."""
@@ -661,7 +661,7 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
         return str(error)
     if not (part / "timestamps.txt").is_file():
         return f"{source.root} has lost the stamps of its sequence"
-    if there.is_dir() and not _equal(part, there, ("timestamps.txt", "groundtruth.txt")):
+    if (there / "timestamps.txt").is_file() and not _equal(part, there, ("timestamps.txt", "groundtruth.txt")):
         return f"{store.root} holds other stamps or truth of its sequence"
     earlier, folders = store.get(record.run_id), (source.folder(record.run_id), store.folder(record.run_id))
     if earlier is not None and (earlier.status != record.status or not _equal(*folders, (ONLINE, FINAL))):

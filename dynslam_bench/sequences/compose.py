@@ -46,9 +46,13 @@ _NEAREST_M = 0.5
 """Nearer surfaces are not measured by a Kinect, and too little is known of the person to draw them."""
 _EDGE_M = 0.1
 """Neighbouring pixels of a person whose depths differ by more are parts of the body before each other."""
+_GAP_S = 0.1
+"""A frame may lie so far beyond the host's first and last true pose, and has that pose then."""
+_SHIFT_PX = 1.5
+"""Images of a fixed camera shift by less against each other, by the median."""
 _SHADOW_BASELINE_M = 0.075
 """Distance between a Kinect's projector and its infrared camera."""
-_FURTHEST_SHADOW_PX = 40
+_FURTHEST_SHADOW_PX = 80
 
 
 @dataclass(frozen=True)
@@ -104,19 +108,28 @@ def compose(
         progress: Called with frames done and frames in all.
 
     Raises:
-        SequenceError: The host has no ground truth, the people's camera moves, or nobody is seen.
+        SequenceError: The folder exists, the host has people or no ground truth of all frames, the people's camera
+            moves, or nobody is seen.
         DynslamError: A frame cannot be read, or the folder not be written.
     """
     if host.ground_truth is None:
         raise SequenceError(f"'{host.id}' has no ground truth, so nobody can be placed in its world")
-    if people.ground_truth is not None and not se3.stands_still(people.ground_truth.T_world_cam):
-        raise SequenceError(f"the camera of '{people.id}' moves", "people are cut out of recordings by a fixed camera")
+    target = Path(folder).expanduser().absolute()
+    if target.exists():
+        raise SequenceError(f"{target} exists already", "name a folder that does not")
+    if host.masks is not None:
+        raise SequenceError(f"'{host.id}' has people already", "compose the recording that was its host")
+    truth = host.ground_truth.timestamps
+    outside = int(np.count_nonzero((host.timestamps < truth[0] - _GAP_S) | (host.timestamps > truth[-1] + _GAP_S)))
+    if outside or len(truth) < 2:
+        raise SequenceError(f"{outside} of {len(host)} frames of '{host.id}' lie outside its ground truth's time")
+    _check_fixed(people)
     cutouts, tone = cut_out(people)
     rng = np.random.default_rng(instance)
     T_world_cam = _poses(host.ground_truth, host.timestamps)
     actors = [_Actor(cutouts, people, host, T_world_cam, rng) for _ in range(1 + instance % _MOST_PEOPLE)]
     shares = []
-    with atomic_folder(Path(folder).expanduser().absolute()) as work:
+    with atomic_folder(target) as work:
         for kind in ("rgb", "depth", "people"):
             (work / kind).mkdir()
         for i in range(len(host)):
@@ -139,7 +152,23 @@ def compose(
             write_atomic(work / (PEOPLE_LIST if kind == "people" else f"{kind}.txt"), "".join(lines))
         write_tum(work / "groundtruth.txt", host.ground_truth, comment=f"of {host.id}")
         write_camera(work / "camera.toml", host.camera, fps=host.fps)
-    return Composed(Path(folder), len(host), float(np.mean(shares)), float(np.max(shares)))
+        if not max(shares):
+            raise SequenceError(f"nobody can be seen in '{host.id}': all of its depth is missing or nearer than people")
+    return Composed(target, len(host), float(np.mean(shares)), float(np.max(shares)))
+
+
+def _check_fixed(people: Sequence) -> None:
+    """Refuse people of a camera that moves, by its truth, else by the shift of its images against the first one."""
+    cure = "people are cut out of recordings by a fixed camera"
+    truth = people.ground_truth
+    if truth is not None and len(truth) > 1 and not se3.stands_still(truth.T_world_cam):
+        raise SequenceError(f"the camera of '{people.id}' moves", cure)
+    sampled = np.linspace(0, len(people) - 1, _SAMPLED).astype(int).tolist()
+    first, *others = (cv2.cvtColor(people[i].rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for i in sampled)
+    window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
+    shifts = [np.linalg.norm(cv2.phaseCorrelate(first, other, window)[0]) for other in others]
+    if np.median(shifts) > _SHIFT_PX:
+        raise SequenceError(f"the camera of '{people.id}' moves: its images shift by {np.median(shifts):.1f} px", cure)
 
 
 def cut_out(people: Sequence) -> tuple[list[Cutout], NDArray[np.float64]]:
@@ -170,7 +199,7 @@ def cut_out(people: Sequence) -> tuple[list[Cutout], NDArray[np.float64]]:
         measured_there = np.where(nearer & mask, frame.depth, 0).astype(np.float32)
         depth = _smoothed(_filled(measured_there))
         rows, columns = np.nonzero(mask)
-        points = people.camera.unproject(np.stack([columns, rows], axis=1), depth[mask])
+        points = people.camera.unproject(people.camera.undistort_points(np.stack([columns, rows], axis=1)), depth[mask])
         cutouts.append(Cutout(frame.rgb, depth, mask, np.median(points, axis=0)))
     if not cutouts:
         raise SequenceError(f"nobody walks through '{people.id}'", "nothing comes nearer than its background")
@@ -286,7 +315,9 @@ class _Actor:
         at = self.played[index]
         cutout, after = (self.cutouts[min(int(at) + step, len(self.cutouts) - 1)] for step in (0, 1))
         rgb, pixels, depth = _upsampled(cutout, upsampled)
-        moved = self.camera.unproject(pixels, depth) + (at - int(at)) * (after.centre - cutout.centre)
+        moved = self.camera.unproject(self.camera.undistort_points(pixels), depth) + (at - int(at)) * (
+            after.centre - cutout.centre
+        )
         points = se3.transform(se3.inverse(self.T_world_cam[index]) @ self.T_world_people, moved)
         uv, visible = camera.view(points)
         at_pixels = np.rint(camera.distort_points(uv)).astype(int)

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import pickle
 import tempfile
 import zipfile
 from functools import cache
@@ -23,7 +22,7 @@ from dynslam_bench.runs import running as packing
 from dynslam_bench.runs.frames import FrameLog, load_frames
 from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.sequences.fetch import Receipt
-from dynslam_bench.tuning import Study, StudySummary, samplers
+from dynslam_bench.tuning import Study, StudySummary
 
 from .campaign import Target, at, written
 from .mutate import mutate_json, mutate_lines, mutate_zip
@@ -201,12 +200,6 @@ def _snapshot_seeds() -> list[bytes]:
     return [written(lambda file, arrays=sound | each: np.savez_compressed(file, **arrays)) for each in odd]
 
 
-def _state_seeds() -> list[bytes]:
-    """What such a state is made of, without the package that makes it."""
-    state = {"mean": np.zeros(3), "sigma": np.float64(1.5), "bounds": None}
-    return [*(pickle.dumps(state, protocol) for protocol in (4, 5)), pickle.dumps(print), b"(lr\xff\xff\xff\x7f."]
-
-
 TARGETS = [
     Target(
         "run record",
@@ -243,5 +236,4 @@ TARGETS = [
         mutate_zip,
     ),
     Target("stage cache entry", _read_entry, lambda: [_entry()]),
-    Target("state of CMA-ES", lambda data, folder: samplers.restore_cma(data or b""), _state_seeds),
 ]

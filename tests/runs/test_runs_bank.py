@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from dynslam_bench import api as db
 from dynslam_bench.cli.app import app
-from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.errors import InfrastructureError, RunError
 from dynslam_bench.geometry import Trajectory, se3, write_tum
 from dynslam_bench.runs import RunSpec, RunStore, bank, import_trajectory, run_many
 
@@ -156,6 +156,46 @@ def test_a_submission_with_an_altered_trajectory_is_refused(made, remote, tmp_pa
     pushed = bank.push(made, remote)
     assert pushed.added == [] and "another result" in pushed.left_out[0].reason
     assert invoke("bank", "push", made, remote).exit_code == 3
+
+
+def test_what_a_full_disk_cut_short_is_a_bank_and_can_be_gone_on_with(results, tmp_path, monkeypatch):
+    copies = []
+
+    def copy_one(source, target):
+        copies.append(target)
+        if len(copies) == 3:
+            raise OSError(28, "No space left on device")
+        Path(target).write_bytes(Path(source).read_bytes())
+
+    monkeypatch.setattr(bank.shutil, "copyfile", copy_one)
+    with pytest.raises(InfrastructureError, match="No space left"):
+        bank.add([results], tmp_path / "bank")
+    assert bank.verify(tmp_path / "bank") == [] and len(RunStore(tmp_path / "bank").ids()) == 1
+    assert len(bank.add([results], tmp_path / "bank").added) == 1
+
+
+@pytest.mark.parametrize("file", ["trajectory_online.txt", "timestamps.txt", "groundtruth.txt"])
+def test_text_that_is_no_trajectory_is_a_fault_though_its_checksum_fits(made, file):
+    path = sorted(made.rglob(file))[0]
+    path.write_text("total garbage\n")
+    sums = (made / "SHA256SUMS").read_text().splitlines()
+    name = path.relative_to(made).as_posix()
+    sums = [f"{sha256(path.read_bytes()).hexdigest()}  {name}" if name in line else line for line in sums]
+    (made / "SHA256SUMS").write_text("\n".join(sums) + "\n")
+    assert bank.verify(made) and all("runs/" in fault for fault in bank.verify(made))
+
+
+def test_a_repository_of_something_else_gets_no_bank(made, remote, tmp_path):
+    subprocess.run(["git", "clone", "--quiet", remote, tmp_path / "code"], check=True, capture_output=True)
+    (tmp_path / "code" / "main.py").write_text("")
+    for words in (
+        ["add", "main.py"],
+        ["commit", "--quiet", "--message", "Begin"],
+        ["push", "--quiet", "origin", "HEAD"],
+    ):
+        subprocess.run(["git", *words], cwd=tmp_path / "code", check=True)
+    with pytest.raises(RunError, match=r"is no bank: it has no SHA256SUMS, and holds main\.py"):
+        bank.push(made, remote)
 
 
 def test_an_archive_is_pulled_from_its_address(made, tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.compose import compose
+from dynslam_bench.sequences.view import Wrapped
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
 
@@ -41,6 +42,23 @@ class Room:
             rgb[20:110, left : left + 25] = (200, 40, 40)
             depth[20:110, left : left + 25] = 2.0
         return Frame(index, float(self.timestamps[index]), rgb, depth)
+
+
+class Shifted(Wrapped):
+    """The same seen by a camera that turns: each image lies 4 px further to the right."""
+
+    ground_truth = None
+
+    def __init__(self, base):
+        self.base = base
+
+    def __len__(self):
+        return len(self.base)
+
+    def __getitem__(self, index):
+        frame = self.base[index]
+        rgb, depth = (np.roll(image, 4 * index, axis=1) for image in (frame.rgb, frame.depth))
+        return Frame(index, frame.timestamp, rgb, depth)
 
 
 @pytest.fixture(scope="module")
@@ -106,18 +124,39 @@ def test_masks_count_as_content_and_have_to_be_there(folder, tmp_path):
 
 @pytest.mark.parametrize(
     "fault, message",
-    [("no truth", "no ground truth"), ("moving", "moves"), ("nobody", "nobody walks")],
+    [
+        ("no truth", "no ground truth"),
+        ("truth elsewhere", "4 of 4 frames .* lie outside"),
+        ("no depth", "nobody can be seen"),
+        ("people already", "has people already"),
+        ("moving", "moves"),
+        ("moving without truth", r"moves: its images shift by \d"),
+        ("nobody", "nobody walks"),
+        ("folder", "exists already"),
+    ],
 )
-def test_what_cannot_be_composed_is_said(host, people, tmp_path, fault, message):
+def test_what_cannot_be_composed_is_said(host, people, folder, tmp_path, fault, message):
+    truth, made = host.ground_truth, tmp_path / "made"
     if fault == "no truth":
         host.ground_truth = None
+    elif fault == "truth elsewhere":
+        host.ground_truth = Trajectory(truth.timestamps + 1000, truth.T_world_cam)
+    elif fault == "no depth":
+        host = Room("dark", 4, wall_m=0.0)
+    elif fault == "people already":
+        host = open_sequence(str(folder / "made"))
     elif fault == "moving":
         people.ground_truth = Trajectory(people.timestamps, se3.exp(0.01 * np.arange(10)[:, None] * np.eye(6)[0]))
+    elif fault == "moving without truth":
+        people = Shifted(people)
+    elif fault == "folder":
+        made.mkdir()
+        (made / "thesis.tex").write_text("work")
     else:
         people = Room("empty")
     with pytest.raises(SequenceError, match=message):
-        compose(host, people, tmp_path / "made")
-    assert not (tmp_path / "made").exists()
+        compose(host, people, made)
+    assert not made.exists() or (made / "thesis.tex").read_text() == "work"
 
 
 @needs_shared
