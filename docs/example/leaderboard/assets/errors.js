@@ -1,6 +1,6 @@
 // All trackers on all sequences: which number, in which unit, of which sequences; a cell leads to its run.
 async function startErrors() {
-  const data = await side("board"), view = { number: "0", scale: "abs", kind: "", ranked: "", ...Object.fromEntries(address.read()) };
+  const data = await side("board"), view = { number: "0", scale: "abs", kind: "", ...Object.fromEntries(address.read()) };
   const known = data.metrics.map((metric, at) => ({ ...metric, at })).filter(({ at }) => data.cells.some((cell) => cell[5][at] !== null));
   const cells = new Map(data.cells.map((cell) => [`${cell[0]},${cell[1]}`, cell]));
   const tags = [...new Set(data.sequences.flatMap((sequence) => sequence.tags))].sort();
@@ -25,10 +25,10 @@ async function startErrors() {
   }
 
   function render() {
-    byId("metric").value = view.number; byId("scale").value = view.scale; byId("kind").value = view.kind; byId("ranked").checked = Boolean(view.ranked);
+    byId("metric").value = view.number; byId("scale").value = view.scale; byId("kind").value = view.kind;
     const metric = known.find(({ at }) => at === +view.number) ?? known[0];
     const sequences = data.sequences.map((sequence, at) => ({ ...sequence, at })).filter(({ tags: own }) => !view.kind || own.includes(view.kind));
-    const trackers = data.trackers.map((tracker, at) => ({ ...tracker, at })).filter(({ ranked }) => ranked || !view.ranked);
+    const trackers = data.trackers.map((tracker, at) => ({ ...tracker, at }));
     const base = metric.at === 0 ? data.referenceAt : data.referenceAt ?? -1;
     table?.destroy();
     const head = make("thead", {}, make("tr", {}, make("th", { textContent: "tracker" }), ...sequences.map(({ name, short }) => make("th", { className: "n", title: name }, ...short.split(/(?<=[/_.?])/).flatMap((part) => [part, make("wbr")])))));
@@ -48,8 +48,6 @@ async function startErrors() {
 
   const set = (name, value) => { view[name] = value; address.write({ [name]: value === { number: "0", scale: "abs" }[name] ? "" : value }); render(); };
   for (const [id, name] of [["metric", "number"], ["scale", "scale"], ["kind", "kind"]]) byId(id).onchange = ({ target }) => set(name, target.value);
-  byId("ranked").onchange = ({ target }) => set("ranked", target.checked ? "1" : "");
-  byId("reset").onclick = () => { Object.assign(view, { number: "0", scale: "abs", kind: "", ranked: "" }); history.replaceState(null, "", location.pathname + "#"); render(); };
   render();
 }
 startErrors();

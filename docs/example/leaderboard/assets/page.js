@@ -1,5 +1,4 @@
-// What all pages share: the theme, figures, sortable tables, data beside the page, the view in the address.
-"use strict";
+// What all pages share: the system's theme, figures, sortable tables, data beside the page, the view in the address.
 const byId = (id) => document.getElementById(id);
 const select = (selector, from = document) => [...from.querySelectorAll(selector)];
 
@@ -30,13 +29,13 @@ function side(name) {
   return loading[name];
 }
 
-// -- figures in the page's theme
+// -- figures, in the theme of the reader's system
 const drawn = new Map();
-const scheme = () => document.documentElement.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+const dark = matchMedia("(prefers-color-scheme: dark)");
 
 async function draw(element, figure) {
   drawn.set(element, figure);
-  const layout = { ...figure.layout, template: THEMES[scheme()], autosize: true };
+  const layout = { ...figure.layout, template: THEMES[dark.matches ? "dark" : "light"], autosize: true };
   if (element.clientWidth < 500) layout.font = { size: 10 };
   if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: 1.02, yanchor: "bottom", ...layout.legend };
   const options = { format: "png", scale: 2, filename: element.id };
@@ -58,22 +57,9 @@ function drawFigures() {
   }
 }
 
-function startTheme() {
-  const button = byId("theme"), themes = ["", "light", "dark"], names = { "": "◐ Auto", light: "☀ Light", dark: "☾ Dark" };
-  const show = (theme) => {
-    document.documentElement.dataset.theme = theme;
-    document.documentElement.classList.toggle("dark", scheme() === "dark"); // DataTables' own switch
-    button.textContent = names[theme];
-    drawn.forEach((figure, element) => element.isConnected && draw(element, figure));
-  };
-  let theme = localStorage.getItem("theme") ?? "";
-  button.onclick = () => {
-    theme = themes[(themes.indexOf(theme) + 1) % 3];
-    localStorage.setItem("theme", theme);
-    show(theme);
-  };
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => show(theme));
-  show(theme);
+function followTheme() {
+  document.documentElement.classList.toggle("dark", dark.matches); // DataTables' own switch
+  drawn.forEach((figure, element) => element.isConnected && draw(element, figure));
 }
 
 // -- tables: what is missing stays last, a third click restores the order
@@ -93,7 +79,8 @@ function sortable(table, options = {}) {
   return new DataTable(table, { ...TABLE, columnDefs: [{ targets: ".n", type: "number", className: "n" }], ...options });
 }
 
-startTheme();
+dark.addEventListener("change", followTheme);
+followTheme();
 const sorts = (table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {});
 for (const table of select("table.sorts")) { // those of closed folds once they are opened: thousands of cells take seconds
   const fold = table.closest("details:not([open])");

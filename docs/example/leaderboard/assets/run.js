@@ -47,11 +47,11 @@ const rowsOf = (heads, rows) => make("div", { className: "scroll" }, make("table
 const fold = (title, ...parts) => make("details", { className: "fold" }, make("summary", { textContent: title }), ...parts);
 
 class RunView {
+  second = null; // the run of another tracker
   constructor(run) {
     this.run = run;
     this.frames = run.series.index ?? run.series.track_t ?? [];
     this.times = run.series.t ?? run.series.track_t ?? [];
-    this.second = null;
   }
 
   async show() {
@@ -64,12 +64,14 @@ class RunView {
       this.move(this.at + (event.key === "ArrowRight" ? 1 : -1));
     };
     byId("worst").replaceChildren(...(run.worst.length ? ["worst frames: "] : []), ...run.worst.map(([frame, error]) => make("button", { type: "button", textContent: `${frame} (${error} mm)`, onclick: () => this.move(nearest(this.frames, frame)) })));
-    for (const [name, there] of [["picture", run.pictures.length], ["track", run.figures.track], ["time", run.figures.time]]) byId(name).hidden = !there;
+    for (const [name, there] of [["image", run.pictures.length], ["track", run.figures.track], ["time", run.figures.time]]) byId(name).hidden = !there;
     const wanted = address.read().get("frame");
     this.at = wanted ? nearest(this.frames, +wanted) : run.worst.length ? nearest(this.frames, run.worst[0][0]) : 0;
     await this.drawTrack();
     if (run.figures.time) {
-      await draw(byId("time"), { ...run.figures.time, layout: { ...run.figures.time.layout, shapes: [...run.figures.time.layout.shapes, this.cursor()] } });
+      const t = this.times[this.at] ?? 0;
+      const cursor = { type: "line", x0: t, x1: t, y0: 0, y1: 1, yref: "paper", line: { color: "#e69f00", width: 3 }, editable: true };
+      await draw(byId("time"), { ...run.figures.time, layout: { ...run.figures.time.layout, shapes: [...run.figures.time.layout.shapes, cursor] } });
       byId("time").removeAllListeners?.("plotly_click");
       byId("time").on("plotly_click", ({ points }) => this.move(nearest(this.times, points[0].x)));
       byId("time").on("plotly_relayout", (change) => {
@@ -78,11 +80,6 @@ class RunView {
       });
     }
     this.move(this.at, false);
-  }
-
-  cursor() {
-    const t = this.times[this.at] ?? 0;
-    return { type: "line", x0: t, x1: t, y0: 0, y1: 1, yref: "paper", line: { color: "#e69f00", width: 3 }, editable: true };
   }
 
   async drawTrack() {
@@ -97,16 +94,16 @@ class RunView {
     const { run } = this;
     this.at = Math.max(0, Math.min(this.times.length - 1, at));
     byId("frame").value = this.at;
-    const t = this.times[this.at], frame = run.series.index?.[this.at];
+    const t = this.times[this.at], frame = run.series.index?.[this.at], caption = document.querySelector("#picture figcaption");
+    caption.textContent = "No pictures: they are kept with --snapshots";
     if (run.pictures.length) {
-      const shown = run.pictures[nearest(run.pictures, frame ?? 0)], image = document.querySelector("#picture img");
-      image.src = pictureOf(run.id, shown);
-      image.alt = `Frame ${shown} as the tracker saw it`;
-      document.querySelector("#picture figcaption").textContent = `Frame ${frame} at ${t.toFixed(2)} s${shown === frame ? "" : `; the nearest picture is of frame ${shown}`}`;
+      const shown = run.pictures[nearest(run.pictures, frame ?? 0)];
+      Object.assign(byId("image"), { src: pictureOf(run.id, shown), alt: `Frame ${shown} as the tracker saw it` });
+      caption.textContent = `Frame ${frame} at ${t.toFixed(2)} s${shown === frame ? "" : `; the nearest picture is of frame ${shown}`}`;
     }
     if (run.figures.time && byId("time").layout) {
-      const place = `shapes[${run.figures.time.layout.shapes.length}]`;
-      if (byId("time").layout.shapes[run.figures.time.layout.shapes.length].x0 !== t) Plotly.relayout(byId("time"), { [`${place}.x0`]: t, [`${place}.x1`]: t });
+      const cursor = run.figures.time.layout.shapes.length, place = `shapes[${cursor}]`;
+      if (byId("time").layout.shapes[cursor].x0 !== t) Plotly.relayout(byId("time"), { [`${place}.x0`]: t, [`${place}.x1`]: t });
     }
     if (run.figures.track) {
       const last = byId("track").data.length - 1, { x, y, z } = marker(run, t);
