@@ -208,7 +208,7 @@ def cut_out(people: Sequence) -> tuple[list[Cutout], NDArray[np.float64]]:
 
 def _person(nearer: NDArray[np.bool_], rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """The largest region that is nearer than the background, its outline moved to the edges of the colour image."""
-    opened = cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    opened = cv2.morphologyEx(nearer.astype(np.uint8), cv2.MORPH_OPEN, _SQUARE)
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _DISC, iterations=2)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
     if len(stats) < 2 or stats[1:, cv2.CC_STAT_AREA].max() < _LEAST_PX * nearer.size:
