@@ -116,10 +116,11 @@ def _exchange(one: Path, other: Path) -> None:
     try:
         one.rename(other)
     except OSError:
-        with contextlib.suppress(OSError):  # another process has just put its own there
+        try:
             aside.rename(other)
-        if other.exists():
-            shutil.rmtree(aside, ignore_errors=True)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another process has put its own there, which counts
+                shutil.rmtree(aside, ignore_errors=True)
         raise
     aside.rename(one)
 
