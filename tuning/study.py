@@ -161,7 +161,7 @@ class Study(Plan):
         self.store.prepare()
         self.folder = study_folder(self.results, base)
         self._identity = self._identify()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._interrupted = threading.Event()
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
@@ -207,12 +207,13 @@ class Study(Plan):
 
         def work() -> None:
             while not self._interrupted.is_set():
-                if not self._more():
+                with self._lock:  # between the count and the new trial no other thread adds one
+                    trial = self.ask() if self._more() else None
+                if trial is None:
                     if not self._others_run():
                         return
                     self._interrupted.wait(_WAIT_S)  # should one of their workers end, its trial is made again here
                     continue
-                trial = self.ask()
                 tell(StudyEvent("started", trial.number, self.trials, f"trial {trial.number}"))
                 evaluation = self.evaluate(trial)
                 self.tell(trial, evaluation)

@@ -221,11 +221,11 @@ def _load_file(path: Path) -> ModuleType:
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, resolved)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
+    try:  # from its text: byte code of an edit of equal length in the same second would pass for that of this one
+        exec(compile(resolved.read_bytes(), resolved, "exec"), module.__dict__)
     except BaseException:
         del sys.modules[name]
         raise

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,10 @@ needs_browser = pytest.mark.skipif(EXECUTABLE is None, reason=f"no browser is in
 
 OF_THE_DRIVER = ("GL Driver Message", "willReadFrequently", "WebGL")
 """Warnings of software that draws in place of a graphics card."""
+
+
+class CommandError(AssertionError):
+    """A command that the browser refused, for example as its page was left meanwhile."""
 
 
 class Browser:
@@ -81,7 +86,8 @@ class Browser:
         while True:
             answer = self._next()
             if answer.get("id") == self._number:
-                assert "error" not in answer, (method, answer["error"])
+                if "error" in answer:
+                    raise CommandError(method, answer["error"])
                 return answer["result"]
 
     def _next(self):
@@ -139,11 +145,12 @@ class Browser:
         return answer["result"].get("value")
 
     def until(self, expression, tries=40):
-        """Wait until an expression is true."""
+        """Wait until an expression is true; the page may give way to another one meanwhile."""
         for _ in range(tries):
-            if self.run(f"Boolean({expression})"):
-                return
-            self.run("new Promise(done => setTimeout(done, 50))")
+            with contextlib.suppress(CommandError):
+                if self.run(f"Boolean({expression})"):
+                    return
+            time.sleep(0.05)
         raise AssertionError(f"never true: {expression}")
 
     def violations(self):

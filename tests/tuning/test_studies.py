@@ -183,10 +183,14 @@ def test_bad_study_files_are_one_clear_line(tmp_path: Path, text: str, message: 
         read_study(path)
 
 
-def test_resuming_something_else_is_refused_with_the_difference(sequences: list[str], tmp_path: Path) -> None:
+def test_resuming_something_else_is_refused_with_the_difference(
+    sequences: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run_study(make(sequences, trials=2), results=tmp_path)
     with pytest.raises(StudyError, match=r"stored with other seeds: \[0\] there, \[0, 1\] here"):
         run_study(make(sequences, trials=2, seeds=[0, 1]), results=tmp_path)
+    ask = Study.ask
+    monkeypatch.setattr(Study, "ask", lambda *given: time.sleep(0.2) or ask(*given))  # other threads count meanwhile
     more = run_study(make(sequences, trials=4), results=tmp_path, jobs=3)
     assert len(more.study.get_trials()) == 4, "more trials of the same study are welcome"
 
