@@ -5,7 +5,13 @@ Between its runs, masks are carried along by optical flow.
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import Future, wait
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from threading import Thread
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,8 +31,26 @@ SMOOTHING = 0.5
 """Weight of the newest velocity."""
 
 
+@dataclass(eq=False)
+class _Request:
+    """A frame that the segmenter works on, the images from it on, and when its masks are there."""
+
+    images: list[NDArray[np.uint8]]
+    due: float
+    answer: Future[tuple[Instances, float]]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Request:
+        answer: Future[tuple[Instances, float]] = Future()
+        answer.set_result(deepcopy(self.answer.result(), memo))
+        return _Request(self.images.copy(), self.due, answer)
+
+
 class MaskScheduler:
     """The segmentation stage of a `SlamPipeline`: one call a frame, in order.
+
+    With schedule ``async`` the segmenter runs in a thread of its own, on one frame at a time. The masks of a frame are
+    taken `latency_s` later by the frames' stamps, carried to the frame of that time, and the segmenter begins with that
+    frame. If it is slower than `latency_s`, tracking waits for it: the same settings give the same masks everywhere.
 
     Args:
         settings: When to segment, how to carry masks, how long to bridge missed detections.
@@ -34,9 +58,11 @@ class MaskScheduler:
 
     Attributes:
         segmented: Whether the segmenter ran on the latest frame.
+        beside_s: Seconds that it took beside tracking for the masks that the latest frame took.
     """
 
     def __init__(self, settings: SegmentationSettings, segmenter: Segmenter) -> None:
+        self._request: _Request | None = None  # first: a copy waits for the segmenter before it copies it
         self.segmenter = segmenter
         self._missed = MissedDetections(settings.compensate)
         self.reset()
@@ -51,11 +77,15 @@ class MaskScheduler:
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget the masks of the previous sequence."""
+        if self._request is not None:
+            wait([self._request.answer])  # a segmenter works on one frame at a time
+        self._request = None
         self._missed.reset()
         self._instances = Instances.empty(0, 0)
         self._gray = np.zeros((0, 0), np.uint8)
         self._age = 0
         self.segmented = False
+        self.beside_s = 0.0
 
     def masks_for(self, frame: Frame, gray: NDArray[np.uint8], *, keyframe: bool) -> Instances:
         """The objects in the frame: segmented, or carried over from the previous frame.
@@ -65,16 +95,43 @@ class MaskScheduler:
             gray: uint8 ``[H, W]``, its intensities.
             keyframe: Whether the tracker asks for segmentation: on the first frame, after a keyframe, when lost.
         """
-        self.segmented = self._gray.shape != gray.shape or self._due(keyframe)
+        first, self.beside_s = self._gray.shape != gray.shape, 0.0
+        if self._settings.schedule == "async" and not first:
+            self.segmented = self._take(frame, gray)
+        else:
+            self.segmented = first or self._due(keyframe)
+            if self.segmented:
+                self._instances = self._missed.update(self.segmenter.segment(frame), max(self._age, 1))
         if self.segmented:
-            self._instances = self._missed.update(self.segmenter.segment(frame), max(self._age, 1))
             self._age = 0
         else:
-            carry = carry_dense if self._settings.carry == "dis" else carry_sparse
-            self._instances = carry(self._instances, self._gray, gray)
+            self._instances = self._carry(self._instances, self._gray, gray)
         self._age += 1
         self._gray = gray
         return self._instances
+
+    def _take(self, frame: Frame, gray: NDArray[np.uint8]) -> bool:
+        """Take the masks that are due, carried to this frame, and begin with it; False if none are due."""
+        request, taken = self._request, False
+        if request is not None:
+            request.images.append(gray)
+            if frame.timestamp >= request.due:
+                instances, self.beside_s = request.answer.result()
+                self._instances = self._missed.update(instances, max(self._age, 1))
+                for previous, current in pairwise(request.images):
+                    self._instances = self._carry(self._instances, previous, current)
+                request, taken = None, True
+        if request is None:
+            answer: Future[tuple[Instances, float]] = Future()
+            thread = Thread(target=_segment, args=(self.segmenter, frame, answer), daemon=True)
+            thread.start()
+            request = _Request([gray], frame.timestamp + self._settings.latency_s, answer)
+        self._request = request
+        return taken
+
+    def _carry(self, instances: Instances, previous: NDArray[np.uint8], current: NDArray[np.uint8]) -> Instances:
+        carry = carry_dense if self._settings.carry == "dis" else carry_sparse
+        return carry(instances, previous, current)
 
     def _due(self, keyframe: bool) -> bool:
         settings = self._settings
@@ -85,6 +142,15 @@ class MaskScheduler:
         if settings.schedule == "every_nth":
             return self._age >= settings.n
         return keyframe or self._age >= MAX_CARRY
+
+
+def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances, float]]) -> None:
+    """Segment a frame in a thread of its own; the answer holds the objects and the seconds, or the error."""
+    start = time.perf_counter()
+    try:
+        answer.set_result((segmenter.segment(frame), time.perf_counter() - start))
+    except BaseException as error:  # raised again where the masks are taken
+        answer.set_exception(error)
 
 
 @dataclass

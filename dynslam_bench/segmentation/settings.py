@@ -116,10 +116,14 @@ class SegmentationSettings(Settings):
         15, low=0, high=30, limits=(0, 200), unit="px", online=True,
         meaning="radius by which masks are grown (ellipse of 2r + 1 pixels)",
     )  # fmt: skip
-    schedule: Literal["every", "every_nth", "keyframes"] = tunable(
+    schedule: Literal["every", "every_nth", "keyframes", "async"] = tunable(
         "every", meaning="frames on which the segmenter runs; optical flow carries the masks between them"
     )
     n: int = Field(3, ge=1, description="schedule every_nth: the segmenter runs on every n-th frame")
+    latency_s: float = Field(
+        0.1, ge=0, le=10,
+        description="schedule async: the segmenter runs beside tracking; masks are there so many seconds after a frame",
+    )  # fmt: skip
     crowded_share: float = Field(
         1.0, ge=0, le=1, description="share of the view under masks above which every frame is segmented; 1 = off"
     )

@@ -180,6 +180,8 @@ class SlamPipeline:
         self._previous = PreviousFrame(bundle, static.keep, image, pose)
         self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
         timings = clock.seconds | dict(result.timings)
+        if self._masks is not None and self._masks.beside_s:
+            timings["detector"] = self._masks.beside_s  # in a thread of its own: not a part of the frame's time
         stats = self._stats(bundle, state, static, result)
         return TrackResult(result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep)
 

@@ -30,14 +30,16 @@ COLUMNS = {
     "coverage": ("coverage %", "coverage", 1e2),
     "skipped": ("F not used %", "epipolar_skipped", 1e2),
     "frame": ("frame ms", "frame_ms", 1),
+    "p95": ("95 % of frames, ms", "frame_p95_s", 1e3),
     "memory": ("memory MB", "peak_memory_mb", 1),
     "keyframes": ("keyframes", "keyframes", 1),
+    "loops": ("loops closed", "loops", 1),
 }
 
 
 def digits(value: float) -> str:
-    """A figure with a tenth below a hundred; a dash where there is none."""
-    return "-" if np.isnan(value) else f"{value:.0f}" if value >= 99.95 else f"{value:.1f}"
+    """A count, or a figure with a tenth below a hundred; a dash where there is none."""
+    return "-" if np.isnan(value) else f"{value:.0f}" if value >= 99.95 or value.dtype.kind == "i" else f"{value:.1f}"
 
 
 CELLS: dict[str, Callable[[Sequence[float]], str]] = {
@@ -48,11 +50,13 @@ CELLS: dict[str, Callable[[Sequence[float]], str]] = {
 
 
 def measured(run: RunResult) -> dict[str, float]:
-    """What a run's record does not hold: keyframes, path length and largest distance from the first pose in metres."""
+    """What a run's row does not hold; path length and largest distance from the first pose are in metres."""
     positions = np.zeros((1, 3)) if run.trajectory is None else run.trajectory.positions
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return {
         "keyframes": run.record.keyframes,
+        "loops": int(run.frames().get("stat_loops", pd.Series([0])).max()),
+        "frame_p95_s": run.record.timings["total"].p95_s,
         "path_m": steps.sum(),
         "farthest_m": np.linalg.norm(positions - positions[0], axis=1).max(),
     }
@@ -61,7 +65,7 @@ def measured(run: RunResult) -> dict[str, float]:
 def cell(runs: pd.DataFrame, show: str, style: str) -> str:
     """The runs of one tracker on one sequence."""
     _, column, scale = COLUMNS[show]
-    values = scale * runs[column].astype(float).to_numpy()
+    values = scale * runs[column].to_numpy(int if pd.api.types.is_integer_dtype(runs[column]) else float)
     text = digits(values[0]) if len(set(values)) == 1 else CELLS[style](values)
     least = runs["coverage"].min()
     note = f" ({least:.0%} tracked)" if show in ("ate", "final") and least < 0.95 else ""
@@ -95,7 +99,7 @@ def main() -> None:
         keys += [(text, sequence)] * len(new)
     runs = run_specs(specs, results=chosen.results, protocol=chosen.protocol, jobs=chosen.jobs)
     table = db.load(chosen.results, chosen.protocol).set_index("run_id").loc[[run.record.run_id for run in runs]]
-    table[["keyframes", "path_m", "farthest_m"]] = pd.DataFrame(map(measured, runs), table.index)
+    table = table.drop(columns="keyframes", errors="ignore").join(pd.DataFrame(map(measured, runs), table.index))
     cells = {key: part for key, part in table.groupby(pd.MultiIndex.from_tuples(keys), sort=False)}
     names = {sequence: sequence.rstrip("/").rpartition("/")[2] for sequence in chosen.sequences}
     labels = {

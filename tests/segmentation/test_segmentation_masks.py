@@ -1,5 +1,8 @@
 """Post-processing, carrying masks over, bridging missed detections, the schedule, and mask metrics."""
 
+import time
+from copy import deepcopy
+
 import cv2
 import numpy as np
 import pytest
@@ -226,6 +229,44 @@ def test_where_masks_cover_much_of_the_view_every_frame_is_segmented(when, rests
     assert run(less, keyframes=(0,))[0] == list(range(10))
     assert run(more, keyframes=(0,))[0] == rests
     assert run(less.model_copy(update={"confidence": 0.95}), keyframes=(0,))[0] == rests, "masks that do not count"
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_beside_tracking_masks_come_late_by_the_stamps_and_are_carried_to_the_frame(slow):
+    class Slow(Square):
+        def segment(self, frame):
+            time.sleep(0.05 * slow)
+            return super().segment(frame)
+
+    stage = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.09), Slow())
+    taken, quality = [], []
+    for index in range(14):
+        gray, truth = scene(3 * index)
+        if index == 8:
+            stage = deepcopy(stage)
+        found = stage.masks_for(frame_of(gray, index), gray, keyframe=True)
+        taken += [index] * stage.segmented
+        quality.append(iou(found.union(), truth))
+    stage.reset()
+    assert stage.segmenter.calls == [0, 1, 4, 7, 10, 13] and taken == [0, 4, 7, 10, 13]
+    assert min(quality) > 0.85
+    stage.masks_for(frame_of(gray), gray, keyframe=True)
+    assert stage.segmented, "a sequence begins with masks"
+
+
+def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken():
+    class Broken(Square):
+        def segment(self, frame):
+            if frame.index == 4:
+                raise RuntimeError("frame 4")
+            return super().segment(frame)
+
+    stage = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.09), Broken())
+    gray = scene(0)[0]
+    for index in range(7):
+        stage.masks_for(frame_of(gray, index), gray, keyframe=False)
+    with pytest.raises(RuntimeError, match="frame 4"):
+        stage.masks_for(frame_of(gray, 7), gray, keyframe=False)
 
 
 def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
