@@ -43,6 +43,7 @@ class Strategy(NamedTuple):
 STRATEGIES: dict[SearchName, Strategy] = {
     "emfoa+propagation": Strategy(moth_flame.EMFOA, 0.5, True),
     "emfoa-literal+propagation": Strategy(moth_flame.EMFOA_LITERAL, 0.5, True),
+    "mfo+propagation": Strategy(moth_flame.MFO, 0.5, True),
     "patchmatch": Strategy(None, 0.5, True),
     "random+propagation": Strategy(None, 1.0, True),
     "none+propagation": Strategy(None, 0.0, True),

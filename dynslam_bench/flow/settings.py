@@ -9,8 +9,8 @@ from pydantic import Field
 from dynslam_bench.core.settings import Settings, names, tunable
 
 SearchName = Literal[
-    "emfoa+propagation", "emfoa-literal+propagation", "patchmatch", "random+propagation", "none+propagation",
-    "emfoa", "mfo", "emfoa-literal", "random",
+    "emfoa+propagation", "emfoa-literal+propagation", "mfo+propagation", "patchmatch", "random+propagation",
+    "none+propagation", "emfoa", "mfo", "emfoa-literal", "random",
 ]  # fmt: skip
 
 

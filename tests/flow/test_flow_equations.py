@@ -112,6 +112,7 @@ STORED = {
     "emfoa-literal": "2b9e1164b663a30e",
     "emfoa-literal+propagation": "6aaf08bc9b17f31c",
     "mfo": "a2001c99c423c5b4",
+    "mfo+propagation": "e7c981cc3462865c",
     "none+propagation": "87beb52c40e16d5a",
     "patchmatch": "9977d4603dd9c019",
     "random": "5f5d2d8eb5727325",
