@@ -176,10 +176,7 @@ def evaluate_loaded(estimate: TumFile, ground_truth: TumFile, protocol: Protocol
     """
     protocol = get_protocol(protocol)
     loaded = {"estimate": estimate, "ground truth": ground_truth}
-    poses, truth = (
-        file.trajectory if protocol.one_to_one or file.every_line is None else file.every_line
-        for file in loaded.values()
-    )
+    poses, truth = (file.poses(repeats=not protocol.one_to_one) for file in loaded.values())
     result = evaluate(poses, truth_of_file(truth, protocol), protocol)
     described = {name: file.notes.describe(repeats=not protocol.one_to_one) for name, file in loaded.items()}
     notes = [f"{name}: {note}" for name, lines in described.items() for note in lines]

@@ -87,6 +87,10 @@ class TumFile:
     notes: FileNotes
     every_line: RepeatedStamps | None = None
 
+    def poses(self, *, repeats: bool) -> Trajectory:
+        """All poses where stamps may repeat, else the last of every stamp."""
+        return self.every_line if repeats and self.every_line is not None else self.trajectory
+
 
 def read_tum(path: str | Path) -> Trajectory:
     """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.

@@ -35,7 +35,7 @@ from dynslam_bench.core.toml import assignments
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.evaluation.hints import hints
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, get_protocol
-from dynslam_bench.geometry import Trajectory, format_ns, format_tum, read_tum
+from dynslam_bench.geometry import Trajectory, TumFile, format_ns, format_tum, load_tum, read_tum
 from dynslam_bench.runs.record import MetricRecord, RunRecord
 
 if TYPE_CHECKING:
@@ -451,11 +451,11 @@ class RunStore:
             return None
         return read_tum(path)
 
-    def ground_truth(self, part: str) -> Trajectory | None:
-        """The ground truth of a sequence's part; None if it has none."""
+    def ground_truth(self, part: str, *, repeats: bool = False) -> Trajectory | None:
+        """The ground truth of a sequence's part, with `repeats` all poses of a repeated stamp; None if it has none."""
         path = self._part(part) / "groundtruth.txt"
         check_plain(path.parent, self.root)
-        return _read_truth(path, file_stamp(path)) if path.is_file() else None
+        return _read_truth(path, file_stamp(path)).poses(repeats=repeats) if path.is_file() else None
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
         """Stamps in seconds of all input frames of a sequence's part.
@@ -544,7 +544,7 @@ class RunStore:
         """
         protocol.check_sequence(record.sequence.id)
         protocol.check_scale(record.tracker.id, record.tracker.sensors)
-        truth = self.ground_truth(record.sequence.part)
+        truth = self.ground_truth(record.sequence.part, repeats=not protocol.one_to_one)
         if truth is None:
             raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")
         trajectory = self.trajectory(record.run_id, which)
@@ -587,11 +587,12 @@ def _checked(name: str, what: str) -> str:
 
 
 @lru_cache(maxsize=64)
-def _read_truth(path: Path, _stamp: str) -> Trajectory:
+def _read_truth(path: Path, _stamp: str) -> TumFile:
     """A ground truth, which many runs share; its arrays are read-only."""
-    truth = read_tum(path)
-    truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
-    return truth
+    file = load_tum(path)
+    for truth in (file.trajectory, file.poses(repeats=True)):
+        truth.timestamps.flags.writeable = truth.T_world_cam.flags.writeable = False
+    return file
 
 
 @lru_cache(maxsize=64)

@@ -24,8 +24,8 @@ from dynslam_bench.geometry import (
     Array,
     Trajectory,
     associate,
+    load_tum,
     nearest_gap,
-    read_tum,
     to_seconds,
     write_kitti,
     write_tum,
@@ -337,10 +337,11 @@ def import_trajectory(
     notes, opened, stated = loaded.notes.describe(), None, None
     if truth is None:
         opened = open_frames(sequence, data_root, camera, frames, stride)
-        part, stamps = part_of(opened), timestamps_ns(opened)
+        part, stamps, poses = part_of(opened), timestamps_ns(opened), opened.ground_truth
     else:
-        stated = read_tum(Path(truth).expanduser())
-        part, stamps = _part_by_truth(sequence, stated), stated.timestamps_ns
+        file_of_truth = load_tum(Path(truth).expanduser())
+        stated, poses = file_of_truth.trajectory, file_of_truth.poses(repeats=True)
+        part, stamps = _part_by_truth(sequence, poses), stated.timestamps_ns
     covered, odd, last = _join(loaded.trajectory, to_seconds(stamps), f"{file} shares", f"'{part.id}'")
     total = len(stamps)
     if opened is None:
@@ -389,7 +390,7 @@ def import_trajectory(
     store.prepare()
     with store.work_folder(record.run_id) as work:
         write_tum(work / f"trajectory_{which}.txt", loaded.trajectory, comment=f"imported: {tracker} on {part.id}")
-        store.add_sequence(record.sequence.part, stamps, opened.ground_truth if opened else stated)
+        store.add_sequence(record.sequence.part, stamps, poses)
         store.publish(work, record)
     return record
 
