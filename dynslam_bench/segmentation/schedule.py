@@ -9,7 +9,6 @@ import time
 from concurrent.futures import Future, wait
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from threading import Thread
 from typing import Any
 
@@ -33,16 +32,22 @@ SMOOTHING = 0.5
 
 @dataclass(eq=False)
 class _Request:
-    """A frame that the segmenter works on, the images from it on, and when its masks are there."""
+    """A frame that the segmenter works on, when its masks are there, and the dense flow from it to the latest frame."""
 
-    images: list[NDArray[np.uint8]]
     due: float
     answer: Future[tuple[Instances, float]]
+    flow: NDArray[np.float32]
+
+    def follow(self, flow: NDArray[np.float32]) -> None:
+        """Add the flow from the frame before to a new one."""
+        rows, columns = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
+        x, y = columns + self.flow[:, :, 0], rows + self.flow[:, :, 1]
+        self.flow = self.flow + np.asarray(cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _Request:
         answer: Future[tuple[Instances, float]] = Future()
         answer.set_result(deepcopy(self.answer.result(), memo))
-        return _Request(self.images.copy(), self.due, answer)
+        return _Request(self.due, answer, self.flow)
 
 
 class MaskScheduler:
@@ -98,40 +103,35 @@ class MaskScheduler:
         first, self.beside_s = self._gray.shape != gray.shape, 0.0
         if self._settings.schedule == "async" and not first:
             self.segmented = self._take(frame, gray)
+        elif first or self._due(keyframe):
+            self.segmented = True
+            self._instances = self._missed.update(self.segmenter.segment(frame), max(self._age, 1))
         else:
-            self.segmented = first or self._due(keyframe)
-            if self.segmented:
-                self._instances = self._missed.update(self.segmenter.segment(frame), max(self._age, 1))
-        if self.segmented:
-            self._age = 0
-        else:
-            self._instances = self._carry(self._instances, self._gray, gray)
-        self._age += 1
+            self.segmented = False
+            if self._settings.carry == "sparse":
+                self._instances = carry_sparse(self._instances, self._gray, gray)
+            elif len(self._instances):
+                self._instances = carry_dense(self._instances, dense_flow(self._gray, gray))
+        self._age = 1 if self.segmented else self._age + 1
         self._gray = gray
         return self._instances
 
     def _take(self, frame: Frame, gray: NDArray[np.uint8]) -> bool:
         """Take the masks that are due, carried to this frame, and begin with it; False if none are due."""
-        request, taken = self._request, False
+        flow, request = dense_flow(self._gray, gray), self._request
         if request is not None:
-            request.images.append(gray)
-            if frame.timestamp >= request.due:
-                instances, self.beside_s = request.answer.result()
-                self._instances = self._missed.update(instances, max(self._age, 1))
-                for previous, current in pairwise(request.images):
-                    self._instances = self._carry(self._instances, previous, current)
-                request, taken = None, True
-        if request is None:
+            request.follow(flow)
+        taken = request is not None and frame.timestamp >= request.due
+        if request is not None and taken:
+            instances, self.beside_s = request.answer.result()
+            self._instances = carry_dense(self._missed.update(instances, self._age), request.flow)
+        else:
+            self._instances = carry_dense(self._instances, flow)
+        if request is None or taken:
             answer: Future[tuple[Instances, float]] = Future()
-            thread = Thread(target=_segment, args=(self.segmenter, frame, answer), daemon=True)
-            thread.start()
-            request = _Request([gray], frame.timestamp + self._settings.latency_s, answer)
-        self._request = request
+            Thread(target=_segment, args=(self.segmenter, frame, answer), daemon=True).start()
+            self._request = _Request(frame.timestamp + self._settings.latency_s, answer, np.zeros_like(flow))
         return taken
-
-    def _carry(self, instances: Instances, previous: NDArray[np.uint8], current: NDArray[np.uint8]) -> Instances:
-        carry = carry_dense if self._settings.carry == "dis" else carry_sparse
-        return carry(instances, previous, current)
 
     def _due(self, keyframe: bool) -> bool:
         settings = self._settings
@@ -348,11 +348,10 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
     return np.asarray(np.asarray(moved) >= 128)
 
 
-def carry_dense(instances: Instances, previous: Gray, current: Gray) -> Instances:
-    """The objects of the previous image in the current one, moved by dense flow; lost objects are left out."""
+def carry_dense(instances: Instances, flow: NDArray[np.float32]) -> Instances:
+    """The objects moved by the dense flow from their image (see `dense_flow`); lost objects are left out."""
     if not len(instances):
         return instances
-    flow = dense_flow(previous, current)
     return _moved(instances, [_carry_object(mask, flow) for mask in instances.masks])
 
 

@@ -24,7 +24,7 @@ from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.postprocess import dynamic_mask
-from dynslam_bench.segmentation.schedule import carry_dense, carry_sparse
+from dynslam_bench.segmentation.schedule import carry_dense, carry_sparse, dense_flow
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -87,7 +87,7 @@ def main() -> None:
     assert oracle is not None
     found = oracle.segment(frames[0])
     depth = np.ascontiguousarray(frames[0].depth)
-    rows.append((f"carry {len(found)} masks, dis", lambda: carry_dense(found, *grays)))
+    rows.append((f"carry {len(found)} masks, dis", lambda: carry_dense(found, dense_flow(*grays))))
     rows.append((f"carry {len(found)} masks, sparse", lambda: carry_sparse(found, *grays)))
     rows.append(("dilation by 15 px", lambda: dynamic_mask(found, SegmentationSettings())))
     rows.append(("depth repair and dilation", lambda: dynamic_mask(found, SegmentationSettings(repair="depth"), depth)))

@@ -110,7 +110,11 @@ def scene(shift_x, shift_y=0, scale=1.0, seed=0):
     return image, mask
 
 
-@pytest.mark.parametrize("move", [schedule.carry_dense, schedule.carry_sparse])
+def carry_dense(found, before, after):
+    return schedule.carry_dense(found, schedule.dense_flow(before, after))
+
+
+@pytest.mark.parametrize("move", [carry_dense, schedule.carry_sparse])
 @pytest.mark.parametrize("motion", [(0, 0, 1.0), (9, 3, 1.0), (-14, 6, 1.05)])
 def test_masks_follow_the_motion(move, motion):
     before, mask = scene(0)
@@ -121,7 +125,7 @@ def test_masks_follow_the_motion(move, motion):
     assert carried.class_names == ("person",) and carried.scores == pytest.approx([0.8])
 
 
-@pytest.mark.parametrize("move", [schedule.carry_dense, schedule.carry_sparse])
+@pytest.mark.parametrize("move", [carry_dense, schedule.carry_sparse])
 def test_carrying_nothing_and_carrying_over_black_images(move):
     black = np.zeros((H, W), np.uint8)
     assert len(move(Instances.empty(H, W), black, black)) == 0
