@@ -37,7 +37,7 @@ def verify(bank: Folder, as_json: AsJson = False) -> None:
     from dynslam_bench.runs.bank import verify
 
     faults = verify(bank)
-    present({"faults": faults}, *faults, f"{bank}: {len(faults)} faults")
+    present({"faults": faults}, *faults, f"{bank}: {len(faults)} fault{'s' * (len(faults) != 1)}")
     if faults:
         raise typer.Exit(VERIFICATION_FAILED)
 

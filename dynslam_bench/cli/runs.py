@@ -78,11 +78,11 @@ _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
 
-def _open(results: Path) -> stored.RunStore:
+def _open(results: Path, cure: str = "name the folder with --results") -> stored.RunStore:
     """The store of a results folder that exists."""
     store = stored.RunStore(results)
     if not store.runs.is_dir():
-        raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
+        raise RunError(f"there are no runs in {store.root}", cure)
     return store
 
 
@@ -171,7 +171,7 @@ def rescore(
     for outcome in outcomes:
         changed = f": {', '.join(outcome.changed)}" if outcome.changed else ""
         count = f"{len(outcome.changed)} with other errors than stored{changed}"
-        lines.append(f"{outcome.protocol}: {outcome.runs} runs scored, {count}")
+        lines.append(f"{outcome.protocol}: {outcome.runs} run{'s' * (outcome.runs != 1)} scored, {count}")
     present(outcomes, *lines)
     for reason in outcomes[0].unreadable if outcomes else ():
         announce(f"unreadable: {reason}")
@@ -185,7 +185,7 @@ def merge(
 ) -> None:
     """Copy the runs of results folders into one; exit with 3 if another result of a run is there, which stays."""
     store = stored.RunStore(output)
-    merged = stored.merge([_open(folder) for folder in sources], store)
+    merged = stored.merge([_open(folder, "name folders that hold runs") for folder in sources], store)
     show_merged(merged, str(store.root))
 
 
@@ -196,11 +196,12 @@ def export(
     protocol: ProtocolId = "tum-rgbd/v1",
 ) -> None:
     """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it."""
-    if output.suffix not in (".csv", ".parquet"):
+    kind = output.suffix.lower()
+    if kind not in (".csv", ".parquet"):
         raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
     frame = _open(results).frame(protocol)
     with raising(RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError):
-        write_atomic(output, frame.to_csv(index=False) if output.suffix == ".csv" else frame.to_parquet())
+        write_atomic(output, frame.to_csv(index=False) if kind == ".csv" else frame.to_parquet())
     write(str(output))
 
 
@@ -225,7 +226,7 @@ def rm(
 def show_merged(merged: Merged, target: str) -> None:
     """What was copied into a store; exit with 3 if something was left out."""
     counts = f"{len(merged.stored)} were there already, {len(merged.left_out)} left out"
-    present(merged, f"{len(merged.added)} runs copied to {target}, {counts}")
+    present(merged, f"{len(merged.added)} run{'s' * (len(merged.added) != 1)} copied to {target}, {counts}")
     for entry in merged.left_out:
         warn(f"left out {entry.path}: {entry.reason}")
     if merged.left_out:

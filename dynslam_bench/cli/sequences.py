@@ -121,7 +121,7 @@ def verify(
         with progress(name) as advance:
             report = verify_one(name, data_root=data_root, camera=camera, progress=advance)
         reports.append(report)
-        verdict = "ok" if report.ok else f"{len(report.faults)} faults"
+        verdict = "ok" if report.ok else f"{len(report.faults)} fault{'s' * (len(report.faults) != 1)}"
         how = "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
         lines.append(f"{report.id}: {verdict}, {report.frames} frames, {how}")
         lines += [f"  {report.dropped.describe()}"] if report.dropped is not None else []

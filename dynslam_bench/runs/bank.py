@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from pydantic import ConfigDict, Field
 
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, raising
-from dynslam_bench.core.files import TemporaryFolder, replace_folder, write_atomic
+from dynslam_bench.core.files import TemporaryFolder, claimed, replace_folder, write_atomic
 from dynslam_bench.core.reading import compare_sums, file_sha256, read_lines
 from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.core.toml import read_toml
@@ -28,6 +29,7 @@ from dynslam_bench.sequences.fetch import extract
 
 SUMS = "SHA256SUMS"
 _PARTS = ("runs", "sequences")
+_TURN_S = 0.1
 _ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
 _ADDRESS = re.compile(r"[a-z+]+://.*|(?:[\w.-]+@)?[\w.-]+:.+")
 
@@ -111,7 +113,7 @@ def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
     with ExitStack() as stack:
         stores, left_out = [], list[Unreadable]()
         for source in map(Path, sources):
-            if source.suffix == ".toml":
+            if source.suffix.lower() == ".toml":
                 stores.append(RunStore(stack.enter_context(closing(TemporaryFolder())).path))
                 left_out += _import(source, stores[-1])
             else:
@@ -239,16 +241,26 @@ def push(bank: str | Path, target: str) -> Merged:
         merged = _merge([RunStore(bank)], clone)
         if merged.added:
             _git(clone, "add", "--force", "--", SUMS, *_PARTS)
-            _git(clone, "commit", "--quiet", "--message", f"Add {len(merged.added)} runs")
+            _git(clone, "commit", "--quiet", "--message", f"Add runs: {len(merged.added)}")
             _git(clone, "push", "--quiet", "origin", "HEAD")
     return merged
 
 
 def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
-    """Merge stores into a bank without faults, and bring its checksums up to date."""
+    """Merge stores into a bank without faults, and bring its checksums up to date; one process at a time."""
     store = Bank(bank)
+    with raising(InfrastructureError, f"cannot write {store.root}", "name another folder"):
+        store.root.mkdir(parents=True, exist_ok=True)
+    while True:
+        with claimed(store.root / ".merging") as mine:
+            if mine:
+                return _merge_alone(sources, store)
+        time.sleep(_TURN_S)
+
+
+def _merge_alone(sources: Sequence[RunStore], store: Bank) -> Merged:
     if (store.root / SUMS).exists() or store.files():
-        _check(bank)
+        _check(store.root)
     try:
         return merge(sources, store, trials=False)
     finally:  # what was copied before a fault is whole
@@ -258,7 +270,7 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
 
 def _check(bank: str | Path) -> None:
     if faults := verify(bank):
-        raise RunError(f"{bank} has {len(faults)} faults, the first: {faults[0]}", "bank verify lists all")
+        raise RunError(f"{bank} has faults, of {len(faults)} the first: {faults[0]}", "bank verify lists all")
 
 
 def _with_runs(folder: Path) -> RunStore:

@@ -258,7 +258,7 @@ class RunStore:
             with temporary_folder(self.runs / "probe"):
                 pass
         except DynslamError as error:
-            raise RunError(str(error.args[0]), "name another folder with --results") from error
+            raise RunError(str(error.args[0]), "name another folder") from error
         if not self._swept:
             self._swept = True
             for pattern in (".*", "runs/.*", "sequences/*/.*"):

@@ -187,7 +187,7 @@ def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> tu
     if str(choice) in CAMERAS:
         return CAMERAS[str(choice)], None
     path = folder / CAMERA_FILE if choice is None else Path(choice).expanduser()
-    if path.suffix != ".toml" and not path.is_file():
+    if path.suffix.lower() != ".toml" and not path.is_file():
         return known_camera(str(choice)), None
     file = read_camera(path)
     return file.camera(), file.fps

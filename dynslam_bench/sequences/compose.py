@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from dynslam_bench.contracts import Sequence
+from dynslam_bench.contracts import Frame, Sequence
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.files import atomic_folder, write_atomic
 from dynslam_bench.geometry import Array, Camera, Trajectory, se3, write_tum
@@ -25,6 +26,8 @@ from dynslam_bench.sequences.readers.layouts import PEOPLE_LIST
 
 _NEARER_M, _NEARER_SHARE = 0.08, 0.04
 """A pixel shows a person if its depth is less than the background's by this and by this share of it."""
+_BACKGROUND_FRAMES, _BLOCKS = 150, 16
+"""Frames at most that tell the background's depth, and the parts of the image that are computed one by one."""
 _LEAST_PX = 0.01
 """Smallest share of the image that a person fills; less is noise, or a person who has just begun to enter."""
 _BORDER_PX = 2
@@ -63,13 +66,11 @@ class Cutout:
         rgb: uint8 ``[H, W, 3]``.
         depth: The person's, float32 ``[H, W]`` in metres, continued around the mask.
         mask: bool ``[H, W]``, the person.
-        centre: Median of the person's points in the camera's frame, metres ``[3]``.
     """
 
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
     mask: NDArray[np.bool_]
-    centre: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -124,17 +125,17 @@ def compose(
     if outside or len(truth) < 2:
         raise SequenceError(f"{outside} of {len(host)} frames of '{host.id}' lie outside its ground truth's time")
     _check_fixed(people)
-    cutouts, tone = cut_out(people)
+    cutouts = Cutouts(people)
     rng = np.random.default_rng(instance)
     T_world_cam = _poses(host.ground_truth, host.timestamps)
-    actors = [_Actor(cutouts, people, host, T_world_cam, rng) for _ in range(1 + instance % _MOST_PEOPLE)]
+    actors = [_Actor(cutouts, people.fps, host, T_world_cam, rng) for _ in range(1 + instance % _MOST_PEOPLE)]
     shares = []
     with atomic_folder(target) as work:
         for kind in ("rgb", "depth", "people"):
             (work / kind).mkdir()
         for i in range(len(host)):
             frame = host[i]
-            gain = np.clip(frame.rgb.reshape(-1, 3).mean(axis=0) / tone, 0.4, 1.6)
+            gain = np.clip(frame.rgb.reshape(-1, 3).mean(axis=0) / cutouts.tone, 0.4, 1.6)
             colour, z, ids = _nearest([actor.draw(i, host.camera) for actor in actors])
             rgb, depth, shown = paste(frame.rgb, frame.depth, colour * gain.astype(np.float32), z, host.camera)
             name = f"{frame.timestamp:.6f}.png"
@@ -171,39 +172,65 @@ def _check_fixed(people: Sequence) -> None:
         raise SequenceError(f"the camera of '{people.id}' moves: its images shift by {np.median(shifts):.1f} px", cure)
 
 
-def cut_out(people: Sequence) -> tuple[list[Cutout], NDArray[np.float64]]:
-    """The person in every frame of a fixed camera in which one is seen, in order.
+class Cutouts:
+    """The person in every frame of a fixed camera in which one is seen, in order; images are read when they are drawn.
 
-    The background's depth is the median of what is as far as the farthest tenth of a pixel's measurements.
+    Args:
+        people: The recording.
 
-    Returns:
-        The cutouts, and the mean colour of the recording ``[3]``.
+    Attributes:
+        camera: Its camera.
+        tone: Its mean colour ``[3]``.
+        centres: Median of the person's points in the camera's frame, metres ``[N, 3]``.
 
     Raises:
         SequenceError: Nobody is seen.
     """
-    frames = [people[i] for i in range(len(people))]
-    depths = np.stack([frame.depth for frame in frames])
-    measured = np.where(depths > 0, depths, np.nan)
-    measured[:, ~(depths > 0).any(axis=0)] = 0  # never measured: nobody is told from what is behind
-    farthest = np.nanquantile(measured, 0.9, axis=0)
-    background = np.nanmedian(np.where(measured >= 0.97 * farthest, measured, np.nan), axis=0)
-    tone = np.mean([frame.rgb.reshape(-1, 3).mean(axis=0) for frame in frames], axis=0)
-    cutouts = []
-    for frame in frames:
-        nearer = (frame.depth > 0) & (frame.depth < background - np.maximum(_NEARER_M, _NEARER_SHARE * background))
-        mask = _person(nearer, frame.rgb)
-        border = mask[:, :_BORDER_PX].any() or mask[:, -_BORDER_PX:].any() or mask[:_BORDER_PX].any()
-        if mask.mean() < _LEAST_PX or border:
-            continue
-        measured_there = np.where(nearer & mask, frame.depth, 0).astype(np.float32)
-        depth = _smoothed(_filled(measured_there))
-        rows, columns = np.nonzero(mask)
-        points = people.camera.unproject(people.camera.undistort_points(np.stack([columns, rows], axis=1)), depth[mask])
-        cutouts.append(Cutout(frame.rgb, depth, mask, np.median(points, axis=0)))
-    if not cutouts:
-        raise SequenceError(f"nobody walks through '{people.id}'", "nothing comes nearer than its background")
-    return cutouts, tone
+
+    def __init__(self, people: Sequence) -> None:
+        self._people, self.camera = people, people.camera
+        self._background = _background(people)
+        self._masks: list[tuple[int, NDArray[np.uint8]]] = []
+        colours, centres = [], []
+        for i in range(len(people)):
+            frame = people[i]
+            colours.append(frame.rgb.reshape(-1, 3).mean(axis=0))
+            mask = _person(self._nearer(frame), frame.rgb)
+            border = mask[:, :_BORDER_PX].any() or mask[:, -_BORDER_PX:].any() or mask[:_BORDER_PX].any()
+            if mask.mean() < _LEAST_PX or border:
+                continue
+            self._masks.append((i, np.packbits(mask)))
+            pixels = self.camera.undistort_points(np.stack(np.nonzero(mask)[::-1], axis=1))
+            centres.append(np.median(self.camera.unproject(pixels, self._depth(frame, mask)[mask]), axis=0))
+        if not centres:
+            raise SequenceError(f"nobody walks through '{people.id}'", "nothing comes nearer than its background")
+        self.tone, self.centres = np.mean(colours, axis=0), np.array(centres)
+        self.cutout = lru_cache(maxsize=_SAMPLED)(self._cutout)
+
+    def _cutout(self, index: int) -> Cutout:
+        at, packed = self._masks[index]
+        frame = self._people[at]
+        mask = np.unpackbits(packed, count=frame.depth.size).reshape(frame.depth.shape).astype(bool)
+        return Cutout(frame.rgb, self._depth(frame, mask), mask)
+
+    def _nearer(self, frame: Frame) -> NDArray[np.bool_]:
+        least = np.maximum(_NEARER_M, _NEARER_SHARE * self._background)
+        return np.asarray((frame.depth > 0) & (frame.depth < self._background - least))
+
+    def _depth(self, frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+        return _smoothed(_filled(np.where(self._nearer(frame) & mask, frame.depth, 0).astype(np.float32)))
+
+
+def _background(people: Sequence) -> Array:
+    """Depth ``[H, W]``: the median of what is as far as the farthest tenth of a pixel's measurements; 0 without any."""
+    sampled = np.linspace(0, len(people) - 1, min(len(people), _BACKGROUND_FRAMES)).astype(int).tolist()
+    blocks = []
+    for depths in np.array_split(np.stack([people[i].depth for i in sampled]), _BLOCKS, axis=1):
+        measured = np.where(depths > 0, depths, np.nan)
+        measured[:, ~(depths > 0).any(axis=0)] = 0  # never measured: nobody is told from what is behind
+        farthest = np.nanquantile(measured, 0.9, axis=0)
+        blocks.append(np.nanmedian(np.where(measured >= 0.97 * farthest, measured, np.nan), axis=0))
+    return np.concatenate(blocks)
 
 
 def _person(nearer: NDArray[np.bool_], rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -253,18 +280,18 @@ class _Actor:
 
     Args:
         cutouts: The person, frame by frame.
-        people: Where they are cut out of.
+        fps: Frames a second of the recording that they are cut out of.
         host: The recording that the person is drawn into.
         T_world_cam: The host's poses ``[N, 4, 4]``.
         rng: Draws place and time.
     """
 
     def __init__(
-        self, cutouts: list[Cutout], people: Sequence, host: Sequence, T_world_cam: Array, rng: np.random.Generator
+        self, cutouts: Cutouts, fps: float, host: Sequence, T_world_cam: Array, rng: np.random.Generator
     ) -> None:
-        self.cutouts, self.camera, self.T_world_cam = cutouts, people.camera, T_world_cam
-        seconds, last = host.timestamps - host.timestamps[0], len(cutouts) - 1
-        place = np.mod(rng.uniform(0, last) + people.fps * seconds, 2 * max(last, 1))
+        self.cutouts, self.T_world_cam = cutouts, T_world_cam
+        seconds, last = host.timestamps - host.timestamps[0], len(cutouts.centres) - 1
+        place = np.mod(rng.uniform(0, last) + fps * seconds, 2 * max(last, 1))
         self.played = np.minimum(place, np.maximum(2 * last - place, 0))  # forth and back; between two cutouts, too
         turn = Rotation.from_rotvec([0, np.deg2rad(rng.uniform(-15, 15)), 0]).as_matrix()
         self.turned = turn @ np.diag([rng.choice([-1.0, 1.0]), 1.0, 1.0])
@@ -280,7 +307,7 @@ class _Actor:
         small = host.camera.resized(host.camera.width // _REDUCED, host.camera.height // _REDUCED)
         sampled = np.linspace(0, len(host) - 1, _SAMPLED).astype(int).tolist()
         behind = [_filled(host[i].depth[::_REDUCED, ::_REDUCED][: small.height, : small.width]) for i in sampled]
-        centres = np.stack([cutout.centre for cutout in self.cutouts])[self.played.astype(int)]
+        centres = self.cutouts.centres[self.played.astype(int)]
         best, least = self.T_world_people, np.inf
         for _ in range(_PLACES):
             distance_m = rng.uniform(*_DISTANCES_M)
@@ -312,12 +339,11 @@ class _Actor:
             camera: Of the image.
             upsampled: By how much the cutout's resolution is increased.
         """
-        at = self.played[index]
-        cutout, after = (self.cutouts[min(int(at) + step, len(self.cutouts) - 1)] for step in (0, 1))
-        rgb, pixels, depth = _upsampled(cutout, upsampled)
-        moved = self.camera.unproject(self.camera.undistort_points(pixels), depth) + (at - int(at)) * (
-            after.centre - cutout.centre
-        )
+        at, cutouts = self.played[index], self.cutouts
+        now, after = (min(int(at) + step, len(cutouts.centres) - 1) for step in (0, 1))
+        rgb, pixels, depth = _upsampled(cutouts.cutout(now), upsampled)
+        step_m = (at - now) * (cutouts.centres[after] - cutouts.centres[now])
+        moved = cutouts.camera.unproject(cutouts.camera.undistort_points(pixels), depth) + step_m
         points = se3.transform(se3.inverse(self.T_world_cam[index]) @ self.T_world_people, moved)
         uv, visible = camera.view(points)
         at_pixels = np.rint(camera.distort_points(uv)).astype(int)

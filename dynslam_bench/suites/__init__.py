@@ -191,7 +191,7 @@ def load_suite(name: str | Path) -> Suite:
     path = Path(name).expanduser()
     if str(name) in suite_names():
         text, where = files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8"), f"{name}.toml"
-    elif path.suffix == ".toml":
+    elif path.suffix.lower() == ".toml":
         text, where = read_text(path, kind=RunError), str(path)
     else:
         hint = did_you_mean(str(name), suite_names())

@@ -208,15 +208,15 @@ def test_half_characters_of_the_command_line_end_in_one_line(cli, results: Path)
     assert code == 1 and "caf\\udce9" in err and err.count("\n") == 1
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize("suffix", ["csv", "CSV", "parquet"])
 def test_all_runs_are_written_as_one_table(cli, stored: Path, tmp_path: Path, suffix: str) -> None:
     target, frame = tmp_path / f"runs.{suffix}", RunStore(stored).frame()
     if suffix == "parquet":
         pytest.importorskip("pyarrow")
     assert cli("runs", "export", target, "--results", stored) == (0, f"{target}\n", "")
-    read = pd.read_csv(target) if suffix == "csv" else pd.read_parquet(target)
+    read = pd.read_csv(target) if suffix != "parquet" else pd.read_parquet(target)
     assert list(read.columns) == list(frame.columns) and read["ate_rmse_m"].tolist() == frame["ate_rmse_m"].tolist()
-    assert suffix == "csv" or read.dtypes.equals(frame.dtypes)
+    assert suffix != "parquet" or read.dtypes.equals(frame.dtypes)
 
 
 def test_a_table_without_pyarrow_or_of_another_kind_is_one_line(cli, stored: Path, tmp_path: Path, monkeypatch) -> None:

@@ -7,8 +7,11 @@ import re
 import shutil
 import subprocess
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
+from threading import Event
+from time import sleep
 
 import numpy as np
 import pytest
@@ -80,6 +83,28 @@ def test_a_bank_is_a_results_folder_of_text_files(results, made):
     assert (again.added, len(again.stored), again.left_out) == ([], 2, [])
 
 
+def test_two_who_add_at_once_lose_nothing(results, made, tmp_path, monkeypatch):
+    """The second one comes while the first has copied its runs and not yet written their checksums."""
+    merge, copied, target = bank.merge, Event(), tmp_path / "shared"
+
+    def slow(*words, **options):
+        merged = merge(*words, **options)
+        copied.set()
+        sleep(0.2)
+        return merged
+
+    first, second = RunStore(made).ids()
+    for run_id in (first, second):
+        shutil.copytree(made, tmp_path / run_id, ignore=shutil.ignore_patterns(*({first, second} - {run_id})))
+    monkeypatch.setattr(bank, "merge", slow)
+    with ThreadPoolExecutor() as pool:
+        earlier = pool.submit(bank.add, [tmp_path / first], target)
+        assert copied.wait(60)
+        later = pool.submit(bank.add, [tmp_path / second], target)
+        assert (earlier.result().added, later.result().added) == ([first], [second])
+    assert bank.verify(target) == [] and RunStore(target).ids() == [first, second]
+
+
 def test_trials_of_studies_are_left_out(results, tmp_path):
     store = RunStore(tmp_path / "with_trial")
     shutil.copytree(results, store.root)
@@ -138,7 +163,7 @@ def test_through_a_bare_git_repository_and_back(made, remote, tmp_path, monkeypa
     monkeypatch.chdir(Path(remote).parent)
     assert bank.push(made, Path(remote).name).added == []
     log = subprocess.run(["git", "-C", remote, "log", "--format=%s"], capture_output=True, text=True, check=True)
-    assert log.stdout == "Add 2 runs\n"
+    assert log.stdout == "Add runs: 2\n"
     pulled = bank.pull(remote, tmp_path / "pulled")
     assert len(pulled.added) == 2 and bank.verify(tmp_path / "pulled") == []
     assert (tmp_path / "pulled" / "SHA256SUMS").read_bytes() == (made / "SHA256SUMS").read_bytes()

@@ -1,6 +1,7 @@
 """People of a fixed camera's recording, pasted into another one: exact masks, the host's pixels and poses elsewhere."""
 
 import shutil
+from weakref import finalize
 
 import cv2
 import numpy as np
@@ -42,6 +43,26 @@ class Room:
             rgb[20:110, left : left + 25] = (200, 40, 40)
             depth[20:110, left : left + 25] = 2.0
         return Frame(index, float(self.timestamps[index]), rgb, depth)
+
+
+class Watched(Wrapped):
+    """The same; `most` counts the largest number of its images that existed at once."""
+
+    def __init__(self, base):
+        self.base, self.now, self.most = base, 0, 0
+
+    def __len__(self):
+        return len(self.base)
+
+    def __getitem__(self, index):
+        frame = self.base[index]
+        self.now += 1
+        self.most = max(self.most, self.now)
+        finalize(frame.rgb, self.released)
+        return frame
+
+    def released(self):
+        self.now -= 1
 
 
 class Shifted(Wrapped):
@@ -107,6 +128,12 @@ def test_an_instance_repeats_and_another_one_differs(host, people, folder, tmp_p
     digests = [open_sequence(str(place)).digest() for place in (folder / "made", again.folder, other.folder)]
     assert digests[0] == digests[1] != digests[2]
     assert again.share == np.mean([np.mean(open_sequence(str(again.folder)).masks[i].instances > 0) for i in range(4)])
+
+
+def test_images_are_not_held(host, tmp_path):
+    people = Watched(Room("people", 60, walker=True))
+    compose(host, people, tmp_path / "made", 2)
+    assert people.most < 20
 
 
 def test_masks_count_as_content_and_have_to_be_there(folder, tmp_path):
