@@ -5,6 +5,8 @@ read_kitti  # users with trajectories in KITTI's format
 write_kitti  # the same, the other way
 of_classes  # on Instances, for authors of filters and segmenters
 neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/reference/environments.md)
+clone_state  # on SlamEnv, for agents: a copy of the episode (docs/reference/environments.md)
+restore_state  # the same: back to it
 rtf  # on Outcome, for objectives of one's own (docs/how-to/study.md)
 
 compile_kernels  # cli.demo: .ci/run calls it, before the tests

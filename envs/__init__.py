@@ -10,11 +10,14 @@ import gymnasium as gym
 
 from dynslam_bench.contracts import TrackerContractError
 from dynslam_bench.envs.arguments import resolve_device
-from dynslam_bench.envs.slam_env import SlamEnv
-from dynslam_bench.envs.spaces import REWARDS, STATS_LAYOUT, ActionMap
+from dynslam_bench.envs.episode import Episode, FrameOutcome
+from dynslam_bench.envs.rewards import REWARDS, AccuracyMinusCost, NegWindowError
+from dynslam_bench.envs.slam_env import EpisodeState, SlamEnv
+from dynslam_bench.envs.spaces import KEYPOINT_LAYOUT, PRIVILEGED_LAYOUT, STATS_LAYOUT, ActionMap
 from dynslam_bench.envs.wrappers import (
     Degradation,
     DegradeFrames,
+    DiscreteActions,
     DropFrames,
     RecordTimings,
     RecordTrajectory,
@@ -25,12 +28,20 @@ from dynslam_bench.sequences.catalogue import sequence_ids
 
 __all__ = [
     "GENERIC_ID",
+    "KEYPOINT_LAYOUT",
+    "PRIVILEGED_LAYOUT",
     "REWARDS",
     "STATS_LAYOUT",
+    "AccuracyMinusCost",
     "ActionMap",
     "Degradation",
     "DegradeFrames",
+    "DiscreteActions",
     "DropFrames",
+    "Episode",
+    "EpisodeState",
+    "FrameOutcome",
+    "NegWindowError",
     "RecordTimings",
     "RecordTrajectory",
     "SequenceSampler",

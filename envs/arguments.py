@@ -60,6 +60,22 @@ def open_frames(
     return cast("Sequence", SequenceView(sequence, start, stop, stride))
 
 
+def parse_window(window: Frames, sequence: Sequence) -> tuple[int, int]:
+    """First frame of a window and one past its last.
+
+    Raises:
+        SequenceError: It does not lie within the sequence, or has fewer than two frames.
+    """
+    first, stop = parse_frames(window)
+    stop = len(sequence) if stop is None else stop
+    if not 0 <= first < stop - 1 < len(sequence):
+        raise SequenceError(
+            f"the window {first}:{stop} is no part of '{sequence.id}', which has {len(sequence)} frames here",
+            f"give two frames or more within 0:{len(sequence)}",
+        )
+    return first, stop
+
+
 def check_frames(sequence: Sequence) -> None:
     """Refuse a sequence that is too short for an episode, or whose stamps do not tell its frames or true poses apart.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Sequence, TrackResult
-from dynslam_bench.envs.slam_env import Episode
+from dynslam_bench.envs.episode import Episode
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import truths_at
 from dynslam_bench.geometry import Array, se3

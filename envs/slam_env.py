@@ -6,15 +6,16 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, SupportsFloat
+from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+import dynslam_bench
 from dynslam_bench.contracts import Frame, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory, exact_stamps
 from dynslam_bench.contracts import Sequence as FrameSequence
 from dynslam_bench.contracts.checks import check_frame, check_result, check_sensors, check_trajectory, tracker_code
@@ -26,87 +27,39 @@ from dynslam_bench.envs.arguments import (
     Frames,
     check_frames,
     open_frames,
+    parse_window,
     preprocessing_of,
     resolve_device,
 )
-from dynslam_bench.envs.spaces import (
-    REWARDS,
-    ActionMap,
-    ObservationKind,
-    RewardKind,
-    rgbd_observation,
-    rgbd_space,
-    stats_observation,
-    stats_space,
-)
-from dynslam_bench.evaluation import OnlineError, OnlineSample, Protocol, evaluate, get_protocol
+from dynslam_bench.envs.episode import Episode, FrameOutcome, FrameState, fixed_info, frame_info
+from dynslam_bench.envs.rewards import REWARDS, Reward, RewardKind
+from dynslam_bench.envs.spaces import ActionMap, observation_parts, observation_space, observe
+from dynslam_bench.evaluation import OnlineError, Protocol, evaluate, get_protocol
 from dynslam_bench.evaluation.comparison import tracked_frames
-from dynslam_bench.geometry import se3
 from dynslam_bench.segmentation.build_segmenter import segmentation_source
+from dynslam_bench.sequences import SequenceView
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 RENDER_MODES = ("rgb_array",)
 FrameTransform = Callable[[Frame], Frame]
-FrameState = Literal["initialising", "ok", "lost", "dropped"]
+_OF_AN_EPISODE = (
+    *("_tracker", "_errors", "episode", "frame", "result", "_final", "settings", "_actions", "window"),
+    *("_np_random", "_np_random_seed"),
+)
+"""What of an environment belongs to its episode."""
 
 
 @dataclass(frozen=True, eq=False)
-class FrameOutcome:
-    """One frame of the episode.
+class EpisodeState:
+    """A copy of an episode in its middle, made by `SlamEnv.clone_state`; it can be restored any number of times.
 
     Attributes:
-        index: Index of the frame in the sequence (after `frames` and `stride`).
-        timestamp: Seconds.
-        state: The tracker's state, or ``dropped`` if the frame never reached it.
-        T_world_cam: Tracked pose ``[4, 4]``; None unless the state is ``ok``.
-        stats: The tracker's diagnostics.
-        timings: Seconds: ``read`` (decoding or rendering), ``total`` (the tracker's step, segmentation included,
-            reading excluded), ``processor`` (processor time of this process in that step, all threads together; what a
-            foreign program or a GPU does is no part of it) and the tracker's stages.
-        error: Causal errors against the ground truth; None where there is none.
-        reward: What the frame earned.
+        origin: What it is of: sequence, tracker, control and version of this package.
+        parts: The copied attributes.
     """
 
-    index: int
-    timestamp: float
-    state: FrameState
-    T_world_cam: NDArray[np.float64] | None
-    stats: Mapping[str, float]
-    timings: Mapping[str, float]
-    error: OnlineSample | None
-    reward: float
-
-
-@dataclass(eq=False)
-class Episode:
-    """The frames so far.
-
-    Attributes:
-        outcomes: One entry a frame, in order.
-        lost_streak: Frames without a tracked pose in a row, up to the last one; an initialising tracker is not lost.
-        over: Whether the last step ended the episode.
-    """
-
-    outcomes: list[FrameOutcome] = field(default_factory=list)
-    lost_streak: int = 0
-    over: bool = False
-
-    def add(self, outcome: FrameOutcome) -> None:
-        """Append a frame's outcome."""
-        self.outcomes.append(outcome)
-        self.lost_streak = self.lost_streak + 1 if outcome.state == "lost" else 0
-
-    @property
-    def next_index(self) -> int:
-        """Index of the frame that comes next."""
-        return len(self.outcomes)
-
-    def trajectory(self) -> Trajectory:
-        """The online trajectory: the poses of the frames with state ``ok``, each as it was when the frame came."""
-        tracked = [(o.timestamp, o.T_world_cam) for o in self.outcomes if o.T_world_cam is not None]
-        stamps = np.array([stamp for stamp, _ in tracked], dtype=np.float64)
-        poses = np.array([pose for _, pose in tracked], dtype=np.float64).reshape(-1, 4, 4)
-        return Trajectory(stamps, poses)
+    origin: Mapping[str, str]
+    parts: Mapping[str, Any]
 
 
 class SlamEnv(gym.Env[Any, Any], EzPickle):
@@ -121,18 +74,23 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     settings, of which only online fields differ from those it was built with, and ``reset`` brings those back.
 
     **Observation.** ``stats``: float32 ``[24]`` (see `STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
-    ``depth`` and ``stats``. Neither holds anything of the ground truth.
+    ``depth`` and ``stats``; a list of parts: a dict of them. The parts: ``stats``; ``rgb`` uint8 ``[H, W, 3]``;
+    ``depth`` float32 ``[H, W]`` metres, 0 missing; ``gray`` uint8 ``[60, 80, 1]``; ``keypoints`` float32 ``[256, 5]``
+    (see `KEYPOINT_LAYOUT`) with ``keypoints_mask`` int8 ``[256]``; ``privileged`` float32 ``[11]`` (see
+    `PRIVILEGED_LAYOUT`), which alone holds something of the ground truth, for a critic.
 
-    **Reward** in metres: ``neg_rpe`` or ``neg_pose_error`` (see `REWARDS`). Frames without a tracked pose, and
-    all remaining ones when `lost_after` ends an episode, cost twice the true motion (``neg_rpe``: not having moved, and
-    having to catch up), or the length of the true path so far (``neg_pose_error``).
+    **Reward** in metres: see `REWARDS`. Frames without a tracked pose, and all remaining ones when `lost_after` ends an
+    episode, cost twice the true motion (``neg_rpe``: not having moved, and having to catch up), or the length of the
+    true path so far (``neg_pose_error``).
 
-    **Info**: ``frame_index``, ``timestamp``, ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the
-    tracker's diagnostics); ``pose`` float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames;
-    ``pose_error_trans_m`` and ``pose_error_rot_deg`` (cumulative, causal: not an ATE), ``frame_error_trans_m`` and
-    ``frame_error_rot_deg`` (motion since the previous frame) where there is ground truth. The last step adds
-    ``episode_metrics`` under the protocol named by ``protocol``. What is not defined is left out, never NaN. Wall-clock
-    times are no part of it: see `timings`.
+    **Info**: ``frame_index``, ``timestamp``, ``window`` (int64 ``[2]``: first frame of the episode and one past its
+    last), ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the tracker's diagnostics); ``pose``
+    float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames; ``pose_error_trans_m`` and
+    ``pose_error_rot_deg`` (cumulative, causal: not an ATE), ``frame_error_trans_m`` and ``frame_error_rot_deg`` (motion
+    since the previous frame) where there is ground truth. The last step adds ``episode_metrics`` under the protocol
+    named by ``protocol``. What is not defined is left out, never NaN; with `fixed_info` it is 0 and its flag, ``has_``
+    before the name, False, so that keys and types are always the same. Wall-clock times are no part of it: see
+    `timings`.
 
     **Monocular trackers** (`TrackerSpec.sensors` is ``rgb``) give poses in a unit of their own. No pose error is known
     as frames come: none is given, and the reward is 0. The last step's metrics need a protocol with Sim(3) alignment.
@@ -144,11 +102,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         tracker: Id, ``id:value``, ``module:Attr``, ``file.py:Attr``, or a spec.
         settings: Overrides of the tracker's settings by dotted name, or its complete settings.
         control: Dotted names of the online settings that actions change.
-        observation: ``stats`` or ``rgbd``.
-        reward: ``neg_rpe`` or ``neg_pose_error``.
+        observation: ``stats``, ``rgbd``, or a list of parts.
+        reward: A name of `REWARDS`, or a callable ``reward(episode) -> float`` that is asked after every frame.
         protocol: Id of the protocol of the episode's metrics; its tolerance also joins frames and ground truth.
         frames: Part of the sequence, ``(start, stop)`` or ``"start:stop"``; None for all.
         stride: Take every so many frames.
+        window: Frames of an episode: each `reset` draws a stretch of so many frames; None for all frames.
         lost_after: End the episode after so many lost frames in a row, initialising ones not counted; None never.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         render_mode: ``rgb_array`` or None.
@@ -157,12 +116,18 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         threads: Threads that the tracker may use.
         cache: Whether features and network masks come from the stage cache where they are stored; poses and reported
             stage times are the same either way, and `stats` says which came from it (``cached_stages``).
+        fixed_info: Whether ``info`` has the same keys on every step, as Minari needs.
 
     Raises:
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
     """
 
     metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 30}  # noqa: RUF012
+    sequence: FrameSequence
+    """The frames of the episode."""
+    window: tuple[int, int]
+    """Which frames of `sequence`, as it was opened, they are: the first and one past the last."""
+    _whole: FrameSequence
 
     def __init__(
         self,
@@ -171,11 +136,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         *,
         settings: Mapping[str, Any] | Settings | None = None,
         control: Sequence[str] = (),
-        observation: ObservationKind = "stats",
-        reward: RewardKind = "neg_rpe",
+        observation: str | Sequence[str] = "stats",
+        reward: RewardKind | Reward = "neg_rpe",
         protocol: str | Protocol = "tum-rgbd/v1",
         frames: Frames = None,
         stride: int = 1,
+        window: int | None = None,
         lost_after: int | None = None,
         device: str = "auto",
         render_mode: str | None = None,
@@ -183,27 +149,26 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         camera: str | Path | None = None,
         threads: int = 1,
         cache: bool = False,
+        fixed_info: bool = False,
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
-        modes: tuple[tuple[str, str | None, Iterable[str | None]], ...] = (
-            ("render mode", render_mode, (None, *RENDER_MODES)),
-            ("observation", observation, ("stats", "rgbd")),
-            ("reward", reward, REWARDS),
-        )
-        for title, value, choices in modes:
-            if value not in choices:
-                raise SettingsError(f"unknown {title} '{value}'", f"choose {' or '.join(filter(None, choices))}")
-        for title, number in (("lost_after", lost_after), ("threads", threads)):
-            if number is not None and number < 1:
-                raise SettingsError(f"{title} is {number}", "give a number >= 1")
+        if render_mode not in (None, *RENDER_MODES):
+            raise SettingsError(f"unknown render mode '{render_mode}'", f"choose {' or '.join(RENDER_MODES)}")
+        if not callable(reward) and reward not in REWARDS:
+            raise SettingsError(f"unknown reward '{reward}'", f"choose {' or '.join(REWARDS)}, or give a callable")
+        for title, number, least in (("lost_after", lost_after, 1), ("threads", threads, 1), ("window", window, 2)):
+            if number is not None and number < least:
+                raise SettingsError(f"{title} is {number}", f"give a number >= {least}")
         self.render_mode = render_mode
         self.protocol = get_protocol(protocol)
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
         self.frame_transforms: list[FrameTransform] = []
         """Applied in order to every frame before the tracker sees it; wrappers add to it."""
-        self._observation: ObservationKind = observation
-        self._reward_of = REWARDS[reward]
+        self._observation = observation
+        self._reward: Reward = reward if callable(reward) else REWARDS[reward]
+        self._length = window
+        self._fixed_info = fixed_info
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
@@ -215,7 +180,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._use_sequence(sequence)
         segmentation_source(self.settings, self.sequence, fetch=False)
         self.action_space = self._actions.space()
-        self.observation_space = stats_space() if observation == "stats" else rgbd_space(self.sequence.camera)
+        self.observation_space = observation_space(observation, self.sequence.camera)
         self.episode = Episode()
         self._final: Trajectory | None = None
         self._canvas: Any = None
@@ -234,6 +199,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def timings(self) -> list[dict[str, float]]:
         """Seconds by stage of every frame so far: ``read``, ``total`` and the tracker's stages (see `FrameOutcome`)."""
         return [dict(outcome.timings) for outcome in self.episode.outcomes]
+
+    def action_of(self, values: Mapping[str, Any]) -> NDArray[np.float32]:
+        """The action that asks for values of controlled settings, by dotted name; all others stay as they are.
+
+        Raises:
+            SettingsError: A name is not in `control`, or a value is not within the range that actions span.
+        """
+        return self._actions.of(values)
 
     def online_trajectory(self) -> Trajectory:
         """Poses of the frames that were tracked, each as it was when the frame came."""
@@ -281,18 +254,23 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
         Args:
             seed: Seed of everything random; None goes on from the previous episode.
-            options: ``sequence`` and ``settings`` replace those of the constructor from this episode on.
+            options: ``sequence`` and ``settings`` replace those of the constructor from this episode on; ``window``,
+                ``(first, one past the last)``, says which of its frames this episode is made of.
 
         Raises:
-            DynslamError: Unknown option, or a new sequence whose images do not fit the observation space.
+            DynslamError: Unknown option, a window that does not fit, or a new sequence whose images do not fit the
+                observation space.
             TrackerError: The tracker cannot be built or broke its contract. Whatever fails before frame 0 is tracked,
                 settings and sequence stay as they were, and no episode runs.
         """
         super().reset(seed=seed)
         self.episode, self._final = Episode(), None
-        before = {name: vars(self)[name] for name in ("settings", "_actions", "sequence", "_source")}
+        before = {
+            name: vars(self)[name] for name in ("settings", "_actions", "sequence", "_whole", "window", "_source")
+        }
         try:
             self._apply_options(options or {})
+            self._begin_window((options or {}).get("window"))
             tracker = self._ready_tracker()
             with tracker_code():
                 if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
@@ -307,7 +285,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         )
         self._canvas = None
         self._track_next(tracker)
-        return self._observe(), frame_info(self.episode.outcomes[-1])
+        return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Track the next frame.
@@ -328,13 +306,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
         truncated = len(outcomes) == len(self.sequence.timestamps)
         if terminated:
-            stamps = self.sequence.timestamps[len(outcomes) :]
-            reward += sum(self._reward(self._errors.update(float(stamp), None)) for stamp in stamps)
+            rest = Episode(list(outcomes))
+            reward += sum(self._add_untracked(rest, "lost") for _ in self.sequence.timestamps[len(outcomes) :])
         self.episode.over = terminated or truncated
-        info = frame_info(outcomes[-1])
-        if self.episode.over:
-            info |= {"episode_metrics": self.episode_metrics(), "protocol": self.protocol.id}
-        return self._observe(), float(reward), terminated, truncated, info
+        return self._observe(), float(reward), terminated, truncated, self._info()
 
     def drop_frames(self, count: int) -> float:
         """Let the next `count` frames pass without tracking them, as a camera does while the tracker is busy.
@@ -351,14 +326,49 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         left = len(self.sequence) - 1 - self.episode.next_index
         if not 0 <= count <= left:
             raise DynslamError(f"cannot drop {count} frames, {left} are left before the last one")
-        total = 0.0
-        for index in range(self.episode.next_index, self.episode.next_index + count):
-            stamp = float(self.sequence.timestamps[index])
-            error = self._errors.update(stamp, None)
-            outcome = FrameOutcome(index, stamp, "dropped", None, {}, {}, error, self._reward(error))
-            self.episode.add(outcome)
-            total += outcome.reward
-        return total
+        return sum(self._add_untracked(self.episode, "dropped") for _ in range(count))
+
+    def clone_state(self) -> EpisodeState:
+        """A copy of the whole episode: tracker, errors, random numbers, position. Wrappers' own state is no part of it.
+
+        Sequence, networks and past frames are shared, not copied.
+
+        Raises:
+            DynslamError: `reset` was not called.
+            TrackerError: The tracker cannot be copied, e.g. because it is an external program.
+        """
+        if self._tracker is None or not self.episode.outcomes:
+            raise DynslamError("clone_state() was called before reset()")
+        parts = {name: vars(self)[name] for name in _OF_AN_EPISODE}
+        return EpisodeState(self._origin(), self._copied(parts, {}))
+
+    def restore_state(self, state: EpisodeState) -> None:
+        """Go back to a copied episode; the steps that follow are equal to the bit to those that followed the copy.
+
+        Raises:
+            DynslamError: The state is of another sequence, tracker, control or version.
+        """
+        origin = self._origin()
+        for name, value in state.origin.items():
+            if origin[name] != value:
+                raise DynslamError(
+                    f"the state is of {name} {value}, this environment has {origin[name]}",
+                    "restore it where it was cloned, or in an environment that was made alike",
+                )
+        parts = self._copied(state.parts, {})
+        self.close()
+        self._canvas = None
+        vars(self).update(parts)
+        self.sequence = _part(self._whole, self.window)
+
+    def _origin(self) -> dict[str, str]:
+        whole = self._whole
+        return {
+            "sequence": f"'{whole.id}' ({len(whole)} frames from {whole.timestamps[0]:.6f} s, {whole.digest()})",
+            "tracker": f"'{self.tracker_spec.id}'",
+            "control": str(list(self._control)),
+            "version": dynslam_bench.__version__,
+        }
 
     def episode_metrics(self) -> dict[str, float]:
         """The metrics of the frames so far under the protocol: plain floats by name, without undefined ones.
@@ -417,19 +427,24 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         Raises:
             TrackerError: The tracker cannot be copied, e.g. because it is an external program.
         """
-        parts = dict(vars(self), _canvas=None)
-        for name in ("sequence", "_source", "tracker_spec", "protocol", "settings"):
-            memo[id(parts[name])] = parts[name]
-        copied = memo[id(self)] = object.__new__(type(self))
+        copied = object.__new__(type(self))
+        memo[id(self)] = copied
+        vars(copied).update(self._copied(dict(vars(self), _canvas=None), memo))
+        return copied
+
+    def _copied(self, parts: Mapping[str, Any], memo: dict[int, Any]) -> dict[str, Any]:
+        """Deep copies of attributes, which share what is never changed."""
+        shared = (self.sequence, self._whole, self._source, self.tracker_spec, self.protocol, self.settings)
+        for value in (*shared, self.sequence.ground_truth):
+            memo[id(value)] = value
         try:
-            deepcopy(self._tracker, memo)
+            deepcopy(parts["_tracker"], memo)
         except Exception as error:
             raise TrackerError(
                 f"tracker '{self.tracker_spec.id}' cannot be copied in mid-episode: {type(error).__name__}: {error}",
                 "make a second environment, or give the tracker a __deepcopy__",
             ) from error
-        vars(copied).update(deepcopy(parts, memo))
-        return copied
+        return deepcopy(dict(parts), memo)
 
     def _use_settings(self, settings: Mapping[str, Any] | Settings | None) -> None:
         if isinstance(settings, Settings):
@@ -449,14 +464,39 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)
-        self.sequence = opened
+        self._check_window(opened)
+        self.sequence = self._whole = opened
+        self.window = (0, len(opened))
         self._source = sequence
 
+    def _check_window(self, sequence: FrameSequence) -> None:
+        if self._length is not None and self._length > len(sequence):
+            raise SettingsError(
+                f"a window of {self._length} frames is longer than '{sequence.id}', which has {len(sequence)} here",
+                f"give window={len(sequence)} or less",
+            )
+
+    def _begin_window(self, given: Frames) -> None:
+        """Cut the episode's part out of the sequence."""
+        count = len(self._whole)
+        if given is not None:
+            window = parse_window(given, self._whole)
+        elif self._length is not None:
+            first = int(self.np_random.integers(count - self._length + 1))
+            window = (first, first + self._length)
+        else:
+            window = (0, count)
+        if window == self.window:
+            return
+        if self._whole.masks is not None:
+            self.close()  # the tracker may hold the exact masks, which are numbered as the frames
+        self.sequence, self.window = _part(self._whole, window), window
+
     def _apply_options(self, options: Mapping[str, Any]) -> None:
-        unknown = sorted(set(options) - {"sequence", "settings"})
+        unknown = sorted(set(options) - {"sequence", "settings", "window"})
         if unknown:
-            raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings")
-        if options:
+            raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings, window")
+        if {"sequence", "settings"} & set(options):
             self.close()  # the next tracker is built for other settings or another sequence
         preprocessing, camera = preprocessing_of(self.settings), self.sequence.camera
         if "settings" in options:
@@ -468,7 +508,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if "sequence" in options:
             self._use_sequence(options["sequence"])
             size, new_size = ((c.width, c.height) for c in (camera, self.sequence.camera))
-            if self._observation == "rgbd" and size != new_size:
+            if {"rgb", "depth"} & set(observation_parts(self._observation)) and size != new_size:
                 raise SequenceError(f"images of {new_size} pixels do not fit the observation space of {size}")
 
     def _ready_tracker(self) -> Tracker:
@@ -504,25 +544,38 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.frame, self.result = frame, result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose)
-        reward = self._reward(error)
-        self.episode.add(FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error, reward))
+        outcome = FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error)
+        self._add(self.episode, outcome)
+
+    def _add(self, episode: Episode, outcome: FrameOutcome) -> float:
+        """Append a frame's outcome with what it earns, which is returned."""
+        episode.add(outcome)
+        reward = float(self._reward(episode))
+        episode.outcomes[-1] = replace(outcome, reward=reward)
+        return reward
+
+    def _add_untracked(self, episode: Episode, state: FrameState) -> float:
+        """Append the next frame as one without a pose; returns what it earns."""
+        index = episode.next_index
+        stamp = float(self.sequence.timestamps[index])
+        return self._add(episode, FrameOutcome(index, stamp, state, None, {}, {}, self._errors.update(stamp, None)))
 
     def _observe(self) -> Any:
-        outcomes = self.episode.outcomes
-        here = outcomes[-1].T_world_cam
-        before = outcomes[-2].T_world_cam if len(outcomes) > 1 else None
-        motion = None if here is None or before is None else se3.log(se3.inverse(before) @ here)
-        stats = stats_observation(
-            self.frame,
-            self.result,
-            progress=outcomes[-1].index / max(len(self.sequence.timestamps) - 1, 1),
-            lost_streak=self.episode.lost_streak,
-            motion=motion,
-        )
-        return stats if self._observation == "stats" else rgbd_observation(self.frame, stats)
+        progress = self.episode.outcomes[-1].index / max(len(self.sequence.timestamps) - 1, 1)
+        parts = observation_parts(self._observation)
+        observed = observe(parts, self.frame, self.result, self.episode, progress)
+        return observed["stats"] if self._observation == "stats" else observed
 
-    def _reward(self, error: OnlineSample | None) -> float:
-        return 0.0 if error is None else self._reward_of(error)
+    def _info(self) -> dict[str, Any]:
+        info = frame_info(self.episode.outcomes[-1]) | {"window": np.array(self.window)}
+        if self.episode.over:
+            info |= {"episode_metrics": self.episode_metrics(), "protocol": self.protocol.id}
+        return fixed_info(info, self.protocol) if self._fixed_info else info
+
+
+def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
+    """The frames of a window."""
+    return whole if window == (0, len(whole)) else cast("FrameSequence", SequenceView(whole, *window))
 
 
 def track_one(
@@ -574,25 +627,3 @@ def _read_frame(sequence: FrameSequence, index: int) -> Frame:
         hint = getattr(error, "hint", "") if ours else ""
         raise SequenceError(f"frame {index} of '{sequence.id}' cannot be read: {fault}", hint) from error
     return frame
-
-
-def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
-    """Index, stamp, state and stats of a frame, its pose if it was tracked, its errors where they are defined."""
-    info: dict[str, Any] = {
-        "frame_index": outcome.index,
-        "timestamp": float(outcome.timestamp),
-        "tracking_state": str(outcome.state),
-        "stats": dict(outcome.stats),
-    }
-    if outcome.T_world_cam is not None:
-        info["pose"] = np.concatenate(se3.to_quaternion(outcome.T_world_cam))
-    error = outcome.error
-    if error is not None:
-        errors = {
-            "pose_error_trans_m": error.trans_m,
-            "pose_error_rot_deg": error.rot_deg,
-            "frame_error_trans_m": error.frame_trans_m,
-            "frame_error_rot_deg": error.frame_rot_deg,
-        }
-        info |= {name: float(value) for name, value in errors.items() if value is not None}
-    return info

@@ -1,13 +1,14 @@
-"""Action space, observation space and reward of the environment. Ground truth never enters an observation."""
+"""Action space and observation space of the environment. Ground truth enters the part ``privileged`` alone."""
 
 from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
-from typing import Literal
+from typing import Any
 
+import cv2
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ from dynslam_bench.core.settings import (
     parameters,
     why_unused,
 )
-from dynslam_bench.evaluation.online import OnlineSample
+from dynslam_bench.envs.episode import Episode
+from dynslam_bench.geometry import se3
 
 
 class ActionMap:
@@ -103,6 +105,16 @@ class ActionMap:
         asked = zip(self.parameters, shares, vector.astype(np.float32) == self._neutral, strict=True)
         return {p.name: self._values[p.name] if same else _decode(p, float(u)) for p, u, same in asked}
 
+    def of(self, values: Mapping[str, Any]) -> NDArray[np.float32]:
+        """The action ``[k]`` that asks for values of controlled settings; see `SlamEnv.action_of`."""
+        for name in values:
+            if name not in self._values:
+                raise SettingsError(f"setting '{name}' is not in control", did_you_mean(name, self._values))
+        settings = apply_overrides(self.base, values)
+        for parameter in self.parameters:
+            _check_range(parameter, attrgetter(parameter.name)(settings), f"setting '{parameter.name}'")
+        return self.encode(settings)
+
     def encode(self, settings: Settings) -> NDArray[np.float32]:
         """The action ``[k]`` that asks for given settings; values beyond the search range are clipped to its ends."""
         flat = flatten(settings)
@@ -127,13 +139,17 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
             raise SettingsError(f"setting '{name}' is given twice in control")
         if reason := why_unused(settings, name):
             raise SettingsError(f"setting '{name}' in control has no effect: {reason}", "leave it out of control")
-        if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
-            raise SettingsError(
-                f"setting '{name}' in control is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
-                "set it within, or leave it out of control",
-            )
+        _check_range(parameter, value, f"setting '{name}' in control")
         chosen.append(parameter)
     return tuple(chosen)
+
+
+def _check_range(parameter: Parameter, value: Any, title: str) -> None:
+    if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
+        raise SettingsError(
+            f"{title} is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
+            "set it within, or leave it out of control",
+        )
 
 
 def _decode(parameter: Parameter, share: float) -> Scalar:
@@ -156,9 +172,34 @@ def _encode(parameter: Parameter, value: Scalar) -> float:
     return (x - low) / (high - low)
 
 
-ObservationKind = Literal["stats", "rgbd"]
 MAX_DEPTH_M = 20.0
-"""Upper end of the depth image in ``rgbd`` observations, metres; farther values are clipped."""
+"""Upper end of the depth image in observations, metres; farther values are clipped."""
+GRAY_SIZE = (60, 80)
+"""Rows and columns of the part ``gray``."""
+MOST_KEYPOINTS = 256
+"""Rows of the part ``keypoints``."""
+KEYPOINT_LAYOUT: tuple[tuple[str, str], ...] = (
+    ("x", "column / width of the image"),
+    ("y", "row / height"),
+    ("depth", "d / (d + 3 m) of the depth d there, 0 where it is missing"),
+    ("static", "1 if the tracker kept it, 0 if it was culled"),
+    ("masked", "1 if it lies under the dynamic mask"),
+)
+"""Name and meaning of every column of the part ``keypoints``, in order."""
+PRIVILEGED_LAYOUT: tuple[tuple[str, str], ...] = (
+    ("known", "1 if the frame has ground truth, else 0"),
+    ("pose_error_trans", "e / (e + 1 m) of the causal translational pose error e"),
+    ("pose_error_rot", "causal rotational pose error / 180 degrees"),
+    ("frame_error_trans", "tanh(e / 0.1 m) of the frame-to-frame translational error e"),
+    ("frame_error_rot", "frame-to-frame rotational error / 180 degrees"),
+    ("motion_x", "tanh(x / 0.1 m) of the true motion since the previous frame, in the previous camera frame"),
+    ("motion_y", "likewise, y"),
+    ("motion_z", "likewise, z (forward)"),
+    ("motion_rx", "tanh(r / 0.1 rad) of the rotation vector of that motion"),
+    ("motion_ry", "likewise, y"),
+    ("motion_rz", "likewise, z"),
+)
+"""Name and meaning of every entry of the part ``privileged``, in order: for a critic, never for the agent itself."""
 
 STATS_LAYOUT: tuple[tuple[str, str], ...] = (
     ("initialising", "1 while the tracker initialises, else 0"),
@@ -197,16 +238,108 @@ def stats_space() -> spaces.Box:
     return spaces.Box(low, np.ones_like(low), dtype=np.float32)
 
 
-def rgbd_space(camera: Camera) -> spaces.Dict:
-    """``Dict`` of ``rgb`` uint8 ``[H, W, 3]``, ``depth`` float32 ``[H, W]`` metres (0 missing) and ``stats``."""
-    size = (camera.height, camera.width)
-    return spaces.Dict(
-        {
-            "rgb": spaces.Box(0, 255, (*size, 3), np.uint8),
-            "depth": spaces.Box(0.0, MAX_DEPTH_M, size, np.float32),
-            "stats": stats_space(),
-        }
-    )
+def observation_space(observation: str | Sequence[str], camera: Camera) -> spaces.Space[Any]:
+    """``Box`` of the vector for ``stats``, else the ``Dict`` of the named parts.
+
+    Raises:
+        SettingsError: A part is unknown.
+    """
+    if observation == "stats":
+        return stats_space()
+    size, most = (camera.height, camera.width), MOST_KEYPOINTS
+    known: dict[str, dict[str, spaces.Space[Any]]] = {
+        "stats": {"stats": stats_space()},
+        "rgb": {"rgb": spaces.Box(0, 255, (*size, 3), np.uint8)},
+        "depth": {"depth": spaces.Box(0.0, MAX_DEPTH_M, size, np.float32)},
+        "gray": {"gray": spaces.Box(0, 255, (*GRAY_SIZE, 1), np.uint8)},
+        "keypoints": {
+            "keypoints": spaces.Box(0.0, 1.0, (most, len(KEYPOINT_LAYOUT)), np.float32),
+            "keypoints_mask": spaces.MultiBinary(most),
+        },
+        "privileged": {"privileged": spaces.Box(-1.0, 1.0, (len(PRIVILEGED_LAYOUT),), np.float32)},
+    }
+    parts = observation_parts(observation)
+    for part in parts:
+        if part not in known:
+            raise SettingsError(f"unknown observation '{part}'", f"stats, rgbd, or a list of {', '.join(known)}")
+    return spaces.Dict({key: space for part in parts for key, space in known[part].items()})
+
+
+def observation_parts(observation: str | Sequence[str]) -> tuple[str, ...]:
+    """The parts that an observation is made of."""
+    if observation == "rgbd":
+        return ("rgb", "depth", "stats")
+    return (observation,) if isinstance(observation, str) else tuple(observation)
+
+
+def observe(parts: Iterable[str], frame: Frame, result: TrackResult, episode: Episode, progress: float) -> Any:
+    """The parts of the observation of the last frame, by key; what is asked for alone is computed."""
+    observed: dict[str, Any] = {}
+    for part in parts:
+        match part:
+            case "stats":
+                motion = _estimated_motion(episode)
+                observed[part] = stats_observation(
+                    frame, result, progress=progress, lost_streak=episode.lost_streak, motion=motion
+                )
+            case "rgb":
+                observed[part] = np.array(frame.rgb, dtype=np.uint8)
+            case "depth":
+                depth = np.nan_to_num(frame.depth, nan=0.0, posinf=MAX_DEPTH_M, neginf=0.0)
+                observed[part] = np.clip(depth, 0.0, MAX_DEPTH_M).astype(np.float32)
+            case "gray":
+                gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+                observed[part] = cv2.resize(gray, GRAY_SIZE[::-1], interpolation=cv2.INTER_AREA)[..., None]
+            case "keypoints":
+                observed[part], observed["keypoints_mask"] = keypoint_tokens(frame, result)
+            case "privileged":
+                observed[part] = privileged_observation(episode)
+    return observed
+
+
+def _estimated_motion(episode: Episode) -> NDArray[np.float64] | None:
+    """Twist ``[6]`` of the estimated motion since the previous frame; None if either has no pose."""
+    poses = [outcome.T_world_cam for outcome in episode.outcomes[-2:]]
+    if len(poses) < 2 or poses[0] is None or poses[1] is None:
+        return None
+    return se3.log(se3.inverse(poses[0]) @ poses[1])
+
+
+def keypoint_tokens(frame: Frame, result: TrackResult) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+    """The tracker's keypoints as a set of fixed size; of more than `MOST_KEYPOINTS`, evenly many along their list.
+
+    Returns:
+        float32 ``[N, 5]`` (`KEYPOINT_LAYOUT`), rows beyond the keypoints 0, and int8 ``[N]``, 1 where there is one.
+    """
+    tokens = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32)
+    mask = np.zeros(MOST_KEYPOINTS, np.int8)
+    xy = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy)
+    keep = np.ones(len(xy)) if result.keypoints_keep is None else np.asarray(result.keypoints_keep)
+    rows = np.arange(len(xy))
+    if len(xy) > MOST_KEYPOINTS:
+        rows = np.linspace(0, len(xy) - 1, MOST_KEYPOINTS).astype(np.intp)
+    height, width = frame.depth.shape
+    x, y = xy[rows].T
+    at = np.rint(y).astype(np.intp).clip(0, height - 1), np.rint(x).astype(np.intp).clip(0, width - 1)
+    z = np.nan_to_num(frame.depth[at], nan=0.0, posinf=MAX_DEPTH_M).clip(0, MAX_DEPTH_M)
+    masked = np.zeros(len(rows)) if result.dynamic_mask is None else result.dynamic_mask[at]
+    tokens[: len(rows)] = np.stack([x / width, y / height, z / (z + 3.0), keep[rows], masked], axis=1).clip(0, 1)
+    mask[: len(rows)] = 1
+    return tokens, mask
+
+
+def privileged_observation(episode: Episode) -> NDArray[np.float32]:
+    """What the ground truth says of the last frame, float32 ``[11]`` (`PRIVILEGED_LAYOUT`); 0 where it is silent."""
+    values = np.zeros(len(PRIVILEGED_LAYOUT))
+    now = episode.outcomes[-1].error
+    before = episode.outcomes[-2].error if len(episode.outcomes) > 1 else None
+    if now is not None:
+        frame_trans, frame_rot = now.frame_trans_m or 0.0, now.frame_rot_deg or 0.0
+        values[:3] = 1.0, now.trans_m / (now.trans_m + 1.0), now.rot_deg / 180.0
+        values[3:5] = np.tanh(frame_trans / 0.1), frame_rot / 180.0
+    if now is not None and before is not None:
+        values[5:] = np.tanh(se3.log(se3.inverse(before.T_world_true) @ now.T_world_true) / 0.1)
+    return values.astype(np.float32)
 
 
 def stats_observation(
@@ -253,16 +386,6 @@ def stats_observation(
     return np.clip(np.asarray(values, dtype=np.float32), np.where(_SIGNED, -1.0, 0.0), 1.0).astype(np.float32)
 
 
-def rgbd_observation(frame: Frame, stats: NDArray[np.float32]) -> dict[str, NDArray[np.uint8] | NDArray[np.float32]]:
-    """Copies of the images, and the vector of `stats_observation`."""
-    depth = np.nan_to_num(frame.depth, nan=0.0, posinf=MAX_DEPTH_M, neginf=0.0)
-    return {
-        "rgb": np.array(frame.rgb, dtype=np.uint8),
-        "depth": np.clip(depth, 0.0, MAX_DEPTH_M).astype(np.float32),
-        "stats": stats,
-    }
-
-
 def _stat(stats: Mapping[str, float], name: str) -> float:
     value = float(stats.get(name, 0.0))
     return value if np.isfinite(value) else 0.0
@@ -274,33 +397,3 @@ def _saturate(value: float, scale: float) -> float:
 
 def _ratio(part: float, whole: float) -> float:
     return min(max(part / whole, 0.0), 1.0) if whole > 0 else 0.0
-
-
-RewardKind = Literal["neg_rpe", "neg_pose_error"]
-
-
-def _frame_error(error: OnlineSample) -> float:
-    moved = error.frame_trans_m or 0.0
-    return -max(moved - error.lost_way_m, 0.0) if error.tracked else -2.0 * moved
-
-
-def _pose_error(error: OnlineSample) -> float:
-    return -min(error.trans_m, error.way_m) if error.tracked else -error.way_m
-
-
-REWARDS: dict[str, Callable[[OnlineSample], float]] = {
-    "neg_rpe": _frame_error,
-    "neg_pose_error": _pose_error,
-}
-"""Reward in metres of a frame that has ground truth, by name; other frames earn 0.
-
-- ``neg_rpe``: minus the translational error of the motion since the previous frame; needs no alignment and adds up.
-  A frame without a tracked pose costs twice the true motion: it did not move, and it has to catch up. The first tracked
-  pose after it is a jump from the last one (see `OnlineError`), which costs only the error beyond the charged path. So
-  reporting a loss never earns more than repeating the last pose, and staying lost never more than recovering.
-- ``neg_pose_error``: minus the causal translational pose error, at most the length of the true path so far (an error of
-  100 %). A frame without a tracked pose earns minus that length: no pose, however far it has drifted, earns less, so
-  that getting lost pays only before the first tracked pose, which begins the episode's frame of reference.
-
-The sum over an episode is not the ATE, which the last step's ``episode_metrics`` give under the protocol.
-"""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
@@ -117,8 +117,9 @@ class SequenceSampler(SlamWrapper):
     Args:
         env: A `SlamEnv`, wrapped or not.
         sequences: Ids or folders; with ``rgbd`` observations all must have the same image size.
-        mode: ``round_robin`` takes them in order; ``random`` draws from the wrapper's own generator, which a `reset`
-            with a seed seeds.
+        mode: ``round_robin`` takes them in order, from the ``seed``-th on (cyclic), so that sub-environments of a
+            vector environment, whose seeds follow each other, begin apart; ``random`` draws from the wrapper's own
+            generator, which a `reset` with a seed seeds.
 
     Raises:
         SettingsError: No sequences, or an unknown mode.
@@ -143,11 +144,11 @@ class SequenceSampler(SlamWrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode on the next sequence; ``options["sequence"]`` wins over the sampler.
 
-        A seed also sets the sampler back: to the first sequence, or to the seed's first draw.
+        A seed also sets the sampler: to the seed's sequence, or to its first draw.
         """
         if seed is not None:
-            self._next = 0
-            self._rng = gym.utils.seeding.np_random(seed)[0]
+            self._next = seed
+            self._rng = stream(seed, "sequences")  # apart from the environment's own numbers
         chosen = self._draw()
         options = {"sequence": chosen} | (options or {})
         observation, info = self.env.reset(seed=seed, options=options)
@@ -159,6 +160,36 @@ class SequenceSampler(SlamWrapper):
         chosen = self._sequences[self._next % len(self._sequences)]
         self._next += 1
         return chosen
+
+
+class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
+    """Makes the action the choice of one of a few settings, ``Discrete(n)``.
+
+    "Segment now?" is ``[{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}]`` with a setting
+    ``segmentation.n`` that no episode reaches.
+
+    Args:
+        env: A `SlamEnv`, wrapped or not, made with ``control``.
+        actions: For each action the values of controlled settings by dotted name; the others stay as they are.
+
+    Raises:
+        SettingsError: No actions, or one that `SlamEnv.action_of` refuses.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], actions: Sequence[Mapping[str, Any]]) -> None:
+        super().__init__(env, actions=[dict(values) for values in actions])
+        if not actions:
+            raise SettingsError("DiscreteActions got no actions")
+        for values in actions:
+            self._base.action_of(values)
+        self._actions = tuple(actions)
+        self.action_space = spaces.Discrete(len(actions))
+
+    def action(self, action: Any) -> NDArray[np.float32]:
+        """The environment's own action."""
+        if not self.action_space.contains(action):
+            raise SettingsError(f"the action {action!r} is not in {self.action_space}")
+        return self._base.action_of(self._actions[int(action)])
 
 
 class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
@@ -180,8 +211,8 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any], width: int = 80, height: int = 60) -> None:
         super().__init__(env, width=width, height=height)
         space = env.observation_space
-        if not isinstance(space, spaces.Dict):
-            raise SettingsError("SmallImages needs images, the observation is 'stats'", 'use observation="rgbd"')
+        if not isinstance(space, spaces.Dict) or not {"rgb", "depth"} <= set(space):
+            raise SettingsError("SmallImages needs the images rgb and depth", 'use observation="rgbd"')
         if min(width, height) < 1:
             raise SettingsError(f"an image of {width} x {height} pixels has none")
         self._size = (width, height)
@@ -351,7 +382,6 @@ class DropFrames(SlamWrapper):
         if share is not None and not 0 <= share < 1:
             raise SettingsError(f"share is {share}, expected a probability in [0, 1)")
         self._speed, self._frame_time_s, self._share, self._seed = speed, frame_time_s, share, seed
-        self._free_at = 0.0
         self._warm = share is not None or frame_time_s is not None
 
     @property
@@ -365,16 +395,17 @@ class DropFrames(SlamWrapper):
             self._warm_up(options)
             self._warm = True
         outcome = self.env.reset(seed=seed, options=options)
-        self._free_at = self._arrivals()[0] + self._busy_s()
+        self._base.episode.free_at = self._arrivals()[0] + self._busy_s()
         return outcome
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Drop what the tracker missed, then track the next frame."""
-        index = self._base.episode.next_index
+        episode = self._base.episode
+        index = episode.next_index
         target = self._next_frame(index)
         charged = self._base.drop_frames(target - index)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._free_at = max(self._free_at, self._arrivals()[target]) + self._busy_s()
+        episode.free_at = max(episode.free_at, self._arrivals()[target]) + self._busy_s()
         return observation, float(reward) + charged, terminated, truncated, info
 
     def _warm_up(self, options: dict[str, Any] | None) -> None:
@@ -393,7 +424,7 @@ class DropFrames(SlamWrapper):
             while target < last and stream(self._seed, "drop", target).random() < self._share:
                 target += 1
             return target
-        newest = int(np.searchsorted(self._arrivals(), self._free_at, side="right")) - 1
+        newest = int(np.searchsorted(self._arrivals(), self._base.episode.free_at, side="right")) - 1
         return min(max(newest, index), last)
 
     def _arrivals(self) -> Any:

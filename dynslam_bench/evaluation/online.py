@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,9 @@ class OnlineSample:
         tracked: Whether the frame was tracked.
         lost_way_m: Metres that the camera truly moved over the lost frames since the last tracked pose, where its
             frame-to-frame motion is known; 0 without lost frames in between.
+        T_world_true: True pose ``[4, 4]``, camera to world of the ground truth.
+        T_world_held: The estimate in the same world: of the last tracked frame; the first true pose before there is
+            one.
     """
 
     trans_m: float
@@ -33,6 +36,8 @@ class OnlineSample:
     way_m: float = 0.0
     tracked: bool = True
     lost_way_m: float = 0.0
+    T_world_true: Array = field(default_factory=lambda: np.eye(4), compare=False, repr=False)
+    T_world_held: Array = field(default_factory=lambda: np.eye(4), compare=False, repr=False)
 
 
 def truths_at(truth: Trajectory | None, stamps: Array) -> dict[int, Array]:
@@ -111,4 +116,7 @@ class OnlineError:
             frame_trans, frame_rot = float(np.linalg.norm(gap[:3, 3])), float(np.rad2deg(se3.rotation_angle(gap)))
             if pose is None:
                 self._lost_way_m += frame_trans
-        return OnlineSample(trans, rot, frame_trans, frame_rot, self._way_m, pose is not None, self._lost_way_m)
+        tracked = pose is not None
+        return OnlineSample(
+            trans, rot, frame_trans, frame_rot, self._way_m, tracked, self._lost_way_m, truth, self._held
+        )

@@ -23,7 +23,7 @@ from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_pl
 from dynslam_bench.slam.run_figure import write_run_figure
 
 if TYPE_CHECKING:
-    from dynslam_bench.envs.slam_env import FrameOutcome
+    from dynslam_bench.envs.episode import FrameOutcome
 
 
 SNAPSHOTS_FILE = "snapshots.npz"

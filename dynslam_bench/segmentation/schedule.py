@@ -76,21 +76,27 @@ class MaskScheduler:
     def configure(self, settings: SegmentationSettings) -> None:
         """Put other settings with the same source into force."""
         self._settings = settings
+        if settings.schedule != "async":
+            self._drop_request()
         self._missed.limit = settings.compensate
         if isinstance(self.segmenter, ConfiguredSegmenter):
             self.segmenter.settings = settings
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget the masks of the previous sequence."""
-        if self._request is not None:
-            wait([self._request.answer])  # a segmenter works on one frame at a time
-        self._request = None
+        self._drop_request()
         self._missed.reset()
         self._instances = Instances.empty(0, 0)
         self._gray = np.zeros((0, 0), np.uint8)
         self._age = 0
         self.segmented = False
         self.beside_s = 0.0
+
+    def _drop_request(self) -> None:
+        """Wait for the segmenter, which works on one frame at a time, and forget its answer."""
+        if self._request is not None:
+            wait([self._request.answer])
+        self._request = None
 
     def masks_for(self, frame: Frame, gray: NDArray[np.uint8], *, keyframe: bool) -> Instances:
         """The objects in the frame: segmented, or carried over from the previous frame.

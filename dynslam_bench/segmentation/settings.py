@@ -117,7 +117,9 @@ class SegmentationSettings(Settings):
         meaning="radius by which masks are grown (ellipse of 2r + 1 pixels)",
     )  # fmt: skip
     schedule: Literal["every", "every_nth", "keyframes", "async"] = tunable(
-        "every", meaning="frames on which the segmenter runs; optical flow carries the masks between them"
+        "every",
+        online=True,
+        meaning="frames on which the segmenter runs; optical flow carries the masks between them",
     )
     n: int = Field(3, ge=1, description="schedule every_nth: the segmenter runs on every n-th frame")
     latency_s: float = Field(

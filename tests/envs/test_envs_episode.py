@@ -9,7 +9,7 @@ import pytest
 from envs_toys import SPEC, STEP_M, TARGET, ToySequence, ToyTracker, truth
 
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
-from dynslam_bench.envs import REWARDS, SlamEnv, TrackerContractError
+from dynslam_bench.envs import REWARDS, Episode, FrameOutcome, SlamEnv, TrackerContractError
 from dynslam_bench.evaluation.evaluate import evaluate
 from dynslam_bench.evaluation.online import OnlineError
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol, get_protocol
@@ -325,9 +325,12 @@ def episode(seed: int) -> tuple[Trajectory, np.ndarray, np.ndarray]:
 
 
 def rewards(name: str, truth: Trajectory, poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
-    stamps, online = np.arange(len(poses)) / 30.0, OnlineError(truth)
-    errors = [online.update(t, p if ok else None) for t, p, ok in zip(stamps, poses, tracked, strict=True)]
-    return np.array([0.0 if error is None else REWARDS[name](error) for error in errors])
+    online, so_far, earned = OnlineError(truth), Episode(), []
+    for index, (pose, ok) in enumerate(zip(poses, tracked, strict=True)):
+        error = online.update(index / 30.0, pose if ok else None)
+        so_far.add(FrameOutcome(index, index / 30.0, "ok", None, {}, {}, error))
+        earned.append(REWARDS[name](so_far))
+    return np.array(earned)
 
 
 @pytest.mark.parametrize("seed", range(EPISODES))

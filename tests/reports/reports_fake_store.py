@@ -7,7 +7,7 @@ import numpy as np
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.fingerprint import Machine
 from dynslam_bench.core.records import digest
-from dynslam_bench.envs.slam_env import FrameOutcome
+from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import from_seconds

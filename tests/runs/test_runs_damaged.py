@@ -14,7 +14,7 @@ from reports_fake_store import add_run
 
 from dynslam_bench.core.errors import DynslamError, ReportError, RunError, StudyError
 from dynslam_bench.core.files import claimed
-from dynslam_bench.envs.slam_env import FrameOutcome
+from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs import RunStore, score
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv

@@ -21,7 +21,7 @@ from reports_fake_store import add_run
 
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import DynslamError, RunError
-from dynslam_bench.envs.slam_env import FrameOutcome
+from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory

@@ -93,8 +93,11 @@ def test_classes_are_names_and_presets():
 
 def test_what_studies_tune_and_agents_steer():
     tunable = {parameter.name: parameter.online for parameter in parameters(SegmentationSettings)}
-    offline = dict.fromkeys(("mask_threshold", "schedule"), False)
-    assert tunable == dict.fromkeys(("confidence", "dilation_px", "compensate", "outside_share"), True) | offline
+    offline = {"mask_threshold": False}
+    assert (
+        tunable
+        == dict.fromkeys(("confidence", "dilation_px", "schedule", "compensate", "outside_share"), True) | offline
+    )
 
 
 def test_class_tables():
