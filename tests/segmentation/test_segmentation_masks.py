@@ -273,6 +273,20 @@ def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are
         stage.masks_for(frame_of(gray, 7), gray, keyframe=False)
 
 
+def test_the_schedule_may_change_while_the_segmenter_runs_beside_tracking():
+    """It finishes first, what it was asked before is forgotten, and masks stay those of the frame."""
+    beside, every = (SegmentationSettings(schedule=when, latency_s=0.09) for when in ("async", "every"))
+    stage = MaskScheduler(beside, Square())
+    taken = []
+    for index in range(12):
+        stage.configure(every if index in (3, 4) else beside)
+        gray, truth = scene(3 * index)
+        assert iou(stage.masks_for(frame_of(gray, index), gray, keyframe=False).union(), truth) > 0.85
+        taken += [index] * stage.segmented
+    stage.reset()
+    assert taken == [0, 3, 4, 8, 11] and stage.segmenter.calls == [0, 1, 3, 4, 5, 8, 11]
+
+
 def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
     segmenter = Square()
     settings = SegmentationSettings(schedule="every_nth", n=10)
