@@ -112,6 +112,7 @@ class Registry(Generic[P]):
         """Forget what was discovered, e.g. after the environment variable changed."""
         self._found = None
         self._failures = []
+        _entry_points.cache_clear()
 
     def _discover(self) -> dict[str, Found[P]]:
         if self._found is None:
@@ -120,7 +121,8 @@ class Registry(Generic[P]):
                 self._add(spec, "built in")
             for target in _environment_targets(self.kind):
                 self._add(target, f"{ENVIRONMENT_VARIABLE}: {target}")
-            for point in sorted(entry_points(group=f"dynslam_bench.{self.kind}"), key=attrgetter("name")):
+            installed = _entry_points(*sys.path).select(group=f"dynslam_bench.{self.kind}")
+            for point in sorted(installed, key=attrgetter("name")):
                 distribution = point.dist.name if point.dist else "unknown distribution"
                 self._add(f"{point.module}:{point.attr}", f"entry point '{point.name}' of {distribution}")
         return self._found
@@ -143,6 +145,12 @@ class Registry(Generic[P]):
         raise PluginError(
             f"{source} is a {type(value).__name__}, not a {self._spec_type.__name__}", "name the spec, not the class"
         )
+
+
+@cache
+def _entry_points(*_path: str) -> Any:
+    """Those of all distributions on the import path; reading them takes 12 ms."""
+    return entry_points()
 
 
 def load_object(target: str) -> Any:

@@ -27,6 +27,17 @@ def test_kernels_are_cached_and_release_the_lock() -> None:
     assert options["nogil"] and apply_twist.stats.cache_path
 
 
+def test_kernels_on_disk_are_loaded_before_they_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    def twice(x: float) -> float:
+        return 2 * x
+
+    monkeypatch.setattr(compiled, "_CACHED", [])
+    compiled.kernel(twice)(1.0)
+    again = compiled.kernel(twice)
+    compiled.load_kernels()
+    assert again.signatures == [(numba.float64,)] and not again.stats.cache_misses
+
+
 def test_a_division_by_zero_is_an_error_unless_asked_for() -> None:
     @compiled.dividing_kernel
     def like_numpy(x: float) -> float:

@@ -42,17 +42,15 @@ _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (
     *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium"),
     *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
-    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.flow.registry"),
-    *("dynslam_bench.segmentation.schedule", _CHILD),
-    *("dynslam_bench.runs.loop", "dynslam_bench.trackers.registry"),
+    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.features.orb"),
+    *("dynslam_bench.flow.moth_flame", "dynslam_bench.segmentation.schedule", _CHILD),
+    *("dynslam_bench.runs.loop", "dynslam_bench.trackers.registry", "dynslam_bench.sequences.synthetic.sequence"),
 )
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 _SET_PARENT_DEATH_SIGNAL, _SET_CHILD_SUBREAPER = 1, 36
-_LOOK_S = 0.02
-"""How often the server looks whether a child has ended."""
 _END_S = 5.0
 _REAP_S = 10.0
 """How long `Child.close` waits for the report of the child's end."""
@@ -222,11 +220,18 @@ class _Server:
         self.control, self.start = control, start
         self.own = frozenset(child.pid for child in psutil.Process().children())  # helpers of libraries
         self.runs: dict[int, int] = {}
+        self.wake_fds = os.pipe()
+        for end in self.wake_fds:
+            os.set_blocking(end, False)
+        signal.set_wakeup_fd(self.wake_fds[1], warn_on_full_buffer=False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)  # it wakes the loop
         signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
     def run(self) -> None:
         with contextlib.suppress(SystemExit):
-            while not wait([self.control], _LOOK_S if self.runs else None) or self._accept():
+            while self.control not in wait([self.control, self.wake_fds[0]]) or self._accept():
+                with contextlib.suppress(BlockingIOError):
+                    os.read(self.wake_fds[0], 4096)
                 self._reap()
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what follows ends by itself
         for pid in self.runs:
@@ -259,10 +264,11 @@ class _Server:
             return pid
         code = 1
         try:
-            for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+            signal.set_wakeup_fd(-1)
+            for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGCHLD):
                 signal.signal(number, signal.SIG_DFL)
             self.control.close()
-            for inherited in (status_fd, *self.runs.values()):
+            for inherited in (status_fd, *self.wake_fds, *self.runs.values()):
                 os.close(inherited)
             from dynslam_bench.runs.process.child import main
 
@@ -305,6 +311,9 @@ def serve(fd: int, start: str) -> None:
     for name in PRELOADED if start == "fork" else ():
         with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
             importlib.import_module(name)
+    if start == "fork":
+        with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
+            importlib.import_module("dynslam_bench.core.compiled").load_kernels()
     adopt_orphans()
     _Server(control, start).run()
 
