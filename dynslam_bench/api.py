@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -208,7 +208,7 @@ def bench(
         retry: See `run_many`, as the callbacks `on_plan`, `on_event` and `on_fault`.
         time_limit_s: Seconds that a run may take, in place of the suite's limit.
         memory_limit_mb: Memory that a run may take, in place of the suite's limit.
-        shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ... of them.
+        shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ... of them, if any.
         on_workers: Called before the first run, with what each of the scheduler's workers has.
         on_plan: Called once, with the runs that are to be made.
         on_event: Called with every `RunEvent`.
@@ -216,7 +216,7 @@ def bench(
         **choice: Arguments of `Suite.specs`: ``trackers``, ``seeds``, ``offsets``, ``frames``, ``data_root``, ...
 
     Raises:
-        DynslamError: The suite names something unknown, a run cannot be made, or the part holds no run.
+        DynslamError: The suite names something unknown, or a run cannot be made.
     """
     from dynslam_bench.runs.cluster import DaskWorkers
     from dynslam_bench.suites import load_suite
@@ -225,10 +225,7 @@ def bench(
     chosen = load_suite(suite)
     limits = chosen.limits.model_dump() | {name: value for name, value in asked.items() if value is not None}
     every = chosen.model_copy(update={"limits": checked(Limits, **limits)}).specs(**choice)
-    part = islice(every, shard[0] - 1, None, shard[1])
-    if (first := next(part, None)) is None:
-        raise RunError(f"part {shard[0]} of {shard[1]} holds none of the suite's runs", "make fewer parts")
-    specs = chain([first], part)
+    specs = islice(every, shard[0] - 1, None, shard[1])
     how: dict[str, Any] = {"on_plan": on_plan, "on_event": on_event, "on_fault": on_fault, "retry": retry}
     how |= {"results": results, "protocol": protocol, "jobs": jobs}
     if scheduler is None:

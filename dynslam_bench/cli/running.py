@@ -21,6 +21,7 @@ from dynslam_bench.cli.output import (
     is_interactive,
     json_mode,
     note,
+    present,
     progress,
     table,
     warn,
@@ -292,8 +293,11 @@ def finish(
             raise
         fetch_checkpoint(error.checkpoint)
         made = watched.make(make)
-    if not made:
+    if watched.faults and not made:
         raise typer.Exit(1)
+    if not made:
+        present([], "this part of the suite holds no runs")
+        return
     rows = show_runs((run.record for run in made), store, protocol, watched.reused)
     missing = show_files(rows, store, pictures)
     if caution := training_scene_note(rows):

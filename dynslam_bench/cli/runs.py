@@ -78,14 +78,6 @@ _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 
 
-def _open(results: Path, cure: str = "name the folder with --results") -> stored.RunStore:
-    """The store of a results folder that exists."""
-    store = stored.RunStore(results)
-    if not store.runs.is_dir():
-        raise RunError(f"there are no runs in {store.root}", cure)
-    return store
-
-
 @app.command("list")
 def list_(
     results: Results = Path("results"),
@@ -117,7 +109,7 @@ def list_(
     column = sort.removeprefix("-")
     if column not in SORTED_BY:
         raise RunError(f"runs are not sorted by '{column}'", did_you_mean(column, SORTED_BY))
-    store = _open(results)
+    store = stored.open_store(results)
     with progress("reading runs") as advance:
         rows, unreadable = stored.list_runs(store, protocol, on_progress=advance)
     chosen = [
@@ -166,7 +158,7 @@ def rescore(
 ) -> None:
     """Compute the errors of all runs again from their trajectories, and list those that have changed."""
     with progress("scoring runs") as advance:
-        outcomes = stored.rescore(_open(results), protocol, on_progress=advance)
+        outcomes = stored.rescore(stored.open_store(results), protocol, on_progress=advance)
     lines = []
     for outcome in outcomes:
         changed = f": {', '.join(outcome.changed)}" if outcome.changed else ""
@@ -179,13 +171,13 @@ def rescore(
 
 @app.command()
 def merge(
-    sources: Annotated[list[Path], typer.Argument(metavar="RESULTS...", help="Results folders, e.g. of shards.")],
+    sources: Annotated[list[Path], typer.Argument(metavar="RESULTS...", help="Results folders, or archives of them.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Results folder that gets the runs.")],
     as_json: AsJson = False,
 ) -> None:
     """Copy the runs of results folders into one; exit with 3 if another result of a run is there, which stays."""
     store = stored.RunStore(output)
-    merged = stored.merge([_open(folder, "name folders that hold runs") for folder in sources], store)
+    merged = stored.merge(map(stored.open_store, sources), store)
     show_merged(merged, str(store.root))
 
 
@@ -199,7 +191,7 @@ def export(
     kind = output.suffix.lower()
     if kind not in (".csv", ".parquet"):
         raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
-    frame = _open(results).frame(protocol)
+    frame = stored.open_store(results).frame(protocol)
     with raising(RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError):
         write_atomic(output, frame.to_csv(index=False) if kind == ".csv" else frame.to_parquet())
     write(str(output))
@@ -214,8 +206,10 @@ def rm(
     """Delete runs and their metrics."""
     if not runs and not failed:
         raise RunError("no run was named", "name ids, or --failed")
-    store = _open(results) if failed else stored.RunStore(results)
+    store = stored.RunStore(results)
     chosen = [store.find(run) for run in runs or ()]
+    if failed and not store.ids():
+        raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
     if failed:
         chosen += [record.run_id for record in store.all()[0] if record.failed]
     for run_id in dict.fromkeys(chosen):

@@ -24,8 +24,7 @@ from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.core.toml import read_toml
 from dynslam_bench.runs.exchange.transfer import Which, import_trajectory
 from dynslam_bench.runs.record import RunRecord
-from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, merge
-from dynslam_bench.sequences.fetch import extract
+from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, merge, open_store
 
 SUMS = "SHA256SUMS"
 _PARTS = ("runs", "sequences")
@@ -100,7 +99,7 @@ def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
     """Add the runs of results folders and the trajectories of manifests to a bank; trials of studies are no results.
 
     Args:
-        sources: Results folders, and manifests (``.toml``).
+        sources: Results folders, archives of such, and manifests (``.toml``).
         bank: The bank; it is made where there is none.
 
     Returns:
@@ -117,7 +116,7 @@ def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
                 stores.append(RunStore(stack.enter_context(closing(TemporaryFolder())).path))
                 left_out += _import(source, stores[-1])
             else:
-                stores.append(_with_runs(source))
+                stores.append(open_store(source))
         merged = _merge(stores, bank)
     return Merged(merged.added, merged.stored, left_out + merged.left_out)
 
@@ -204,12 +203,10 @@ def pull(source: str, bank: str | Path) -> Merged:
     with ExitStack() as stack:
         folder = Path(source)
         if _ARCHIVE.fullmatch(source):
-            work = stack.enter_context(closing(TemporaryFolder())).path
-            folder = work / "bank"
-            folder.mkdir()
-            download(source, work / "archive")
-            extract(work / "archive", folder)
-            folder = next((path.parent for path in sorted(folder.rglob(SUMS))), folder)
+            archive = stack.enter_context(closing(TemporaryFolder())).path / "archive"
+            download(source, archive)
+            unpacked = open_store(archive)
+            folder = unpacked.root
         elif _is_repository(source):
             folder = stack.enter_context(_cloned(source))
         if not (folder / SUMS).is_file():
@@ -271,13 +268,6 @@ def _merge_alone(sources: Sequence[RunStore], store: Bank) -> Merged:
 def _check(bank: str | Path) -> None:
     if faults := verify(bank):
         raise RunError(f"{bank} has faults, of {len(faults)} the first: {faults[0]}", "bank verify lists all")
-
-
-def _with_runs(folder: Path) -> RunStore:
-    store = RunStore(folder)
-    if not store.runs.is_dir():
-        raise RunError(f"there are no runs in {store.root}")
-    return store
 
 
 def _is_repository(place: str) -> bool:

@@ -12,7 +12,7 @@ import threading
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -46,7 +46,7 @@ from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
 from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, StageTime, Status, TrackerInfo
 from dynslam_bench.runs.spec import RunSpec, place_of
-from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL, Records, RunStore
 from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
 from dynslam_bench.sequences.tags import sequence_tags
 from dynslam_bench.sequences.view import part_of
@@ -303,30 +303,6 @@ class Plan:
 
     runs: int = 0
     frames: Counter[str] = field(default_factory=Counter)
-
-
-@dataclass(frozen=True, eq=False)
-class Records(Sequence[RunRecord]):
-    """The records of many runs; each is read from the store when it is asked for.
-
-    Attributes:
-        store: The store.
-        run_ids: The runs.
-        not_stored: The records of those that were stopped.
-    """
-
-    store: RunStore
-    run_ids: list[str]
-    not_stored: dict[str, RunRecord]
-
-    def __len__(self) -> int:
-        return len(self.run_ids)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[at] for at in range(len(self))[index]]
-        run_id = self.run_ids[index]
-        return self.not_stored.get(run_id) or self.store.read_whole(run_id)
 
 
 def run_many(

@@ -9,9 +9,10 @@ import os
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -27,7 +28,7 @@ from dynslam_bench.core.errors import (
     did_you_mean,
     raising,
 )
-from dynslam_bench.core.files import claimed, replace_folder, sweep_temporary, temporary_folder
+from dynslam_bench.core.files import TemporaryFolder, claimed, replace_folder, sweep_temporary, temporary_folder
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.reading import read_lines
 from dynslam_bench.core.records import digest, write_atomic
@@ -417,15 +418,15 @@ class RunStore:
         record = self.read_whole(run_id)
         return record, self.index.state(run_id, record.sequence.part, stamp)
 
-    def all(self) -> tuple[list[RunRecord], list[Unreadable]]:
+    def all(self) -> tuple[Records, list[Unreadable]]:
         """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
-        records, unreadable = [], []
+        started, unreadable = [], []
         for run_id in self.ids():
             try:
-                records.append(self.read_whole(run_id))
+                started.append((self.read_whole(run_id).started, run_id))
             except DynslamError as error:
                 unreadable.append(Unreadable(self.folder(run_id), str(error)))
-        return sorted(records, key=lambda record: (record.started, record.run_id)), unreadable
+        return Records(self, [run_id for _, run_id in sorted(started)]), unreadable
 
     def find(self, prefix: str) -> str:
         """The full id of a run from its first digits, or of ``latest``.
@@ -562,8 +563,58 @@ class RunStore:
         Returns:
             The columns that `runs_frame` describes.
         """
-        listed = [record for record in self.all()[0] if trials or not record.trial_of]
-        return runs_frame([(r, None if r.status == "stopped" else self.score(r, protocol)) for r in listed])
+        listed = (record for record in self.all()[0] if trials or not record.trial_of)
+        return runs_frame((r, None if r.status == "stopped" else self.score(r, protocol)) for r in listed)
+
+
+@dataclass(frozen=True, eq=False)
+class Records(Sequence[RunRecord]):
+    """The records of many runs; each is read from the store when it is asked for.
+
+    Attributes:
+        store: The store.
+        run_ids: The runs.
+        not_stored: The records of those that are not in the store.
+    """
+
+    store: RunStore
+    run_ids: list[str]
+    not_stored: Mapping[str, RunRecord] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.run_ids)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[at] for at in range(len(self))[index]]
+        run_id = self.run_ids[index]
+        return self.not_stored.get(run_id) or self.store.read_whole(run_id)
+
+
+def open_store(results: str | Path) -> RunStore:
+    """The store of a results folder that exists, or of an archive of one (``.tar``, ``.tgz``, ``.zip``).
+
+    An archive is unpacked into a temporary folder, which is removed with the store.
+
+    Raises:
+        RunError: There are no runs in it.
+        SequenceError: The archive is damaged, or holds links or names that lead out of it.
+        InfrastructureError: It cannot be unpacked here.
+    """
+    store = RunStore(results)
+    if store.root.is_file():
+        from dynslam_bench.sequences.fetch import extract  # loads what fetches sequences
+
+        with raising(InfrastructureError, f"cannot unpack {results}", "check the free space"):
+            temporary = TemporaryFolder()
+            unpacked = temporary.path / store.root.name  # so that messages name the archive
+            unpacked.mkdir()
+            extract(store.root, unpacked)
+        store = RunStore(next((runs.parent for runs in unpacked.rglob("runs")), unpacked))
+        weakref.finalize(store, temporary.close)
+    if not store.runs.is_dir():
+        raise RunError(f"there are no runs in {results}", "name a folder that holds runs")
+    return store
 
 
 def evaluation_code() -> str:
@@ -750,7 +801,7 @@ def rescore(
         What has changed, by protocol.
     """
     records, unreadable = store.all()
-    ended = [record for record in records if record.status != "stopped"]
+    ended = Records(store, [record.run_id for record in records if record.status != "stopped"])
     reasons = tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)
     names = store.index.names()
     chosen = [option for option in PROTOCOLS.values() if option.id == DEFAULT_PROTOCOL or _metrics_of(option) in names]
@@ -865,13 +916,14 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
     """
     import pandas as pd
 
-    pairs = list(runs)
-    metrics = sorted({name for _, scored in pairs if scored is not None for name in scored.metrics} | {"ate_rmse_m"})
+    rows, metrics = list[Row](), {"ate_rmse_m"}
+    for record, scored in runs:
+        rows.append(_cells(record, scored))
+        metrics.update(scored.metrics if scored is not None else ())
     kinds: dict[str, str] = dict.fromkeys(_TEXT, "string") | dict.fromkeys(_WHOLE, "Int64")
-    kinds |= dict.fromkeys((*_NUMBERS, *metrics), "Float64")
-    frame = pd.DataFrame([_cells(*pair) for pair in pairs], columns=list(kinds), dtype=object).astype(kinds)
-    stamps = pd.Series([record.started or None for record, _ in pairs], dtype=object)
-    started = pd.to_datetime(stamps, utc=True, format="ISO8601")
+    kinds |= dict.fromkeys((*_NUMBERS, *sorted(metrics)), "Float64")
+    frame = pd.DataFrame(rows, columns=[*kinds, "started"], dtype=object).astype(kinds)
+    started = pd.to_datetime(frame.started, utc=True, format="ISO8601")
     return frame.assign(started=started.astype("datetime64[us, UTC]"))
 
 

@@ -29,7 +29,7 @@ from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.runs.store import RunStore, open_store
 
 T = TypeVar("T")
 OnProgress = Callable[[float, float | None, str], None]
@@ -320,22 +320,12 @@ def check_one_protocol(rows: Sequence[RunRow]) -> None:
 
 
 def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) -> list[RunStore]:
-    """Stores of results folders.
+    """Stores of results folders, and of archives of such.
 
     Raises:
-        ReportError: A folder does not exist or holds no store.
+        DynslamError: There are no runs in one.
     """
     if isinstance(runs, RunStore):
         return [runs]
-    folders = [Path(runs)] if isinstance(runs, str | Path) else [Path(path) for path in runs]
-    stores = []
-    for folder in folders:
-        root = folder.expanduser()
-        if not root.is_dir():
-            raise ReportError(f"there is no results folder {root}", "make runs first, or name their folder")
-        if root.name == "runs" and not (root / "runs").is_dir():
-            root = root.parent
-        if not (root / "runs").is_dir():
-            raise ReportError(f"{root} holds no runs: it has no folder 'runs'", "name the folder given as --results")
-        stores.append(RunStore(root))
-    return stores
+    roots = [Path(runs)] if isinstance(runs, str | Path) else map(Path, runs)
+    return [open_store(root.parent if root.name == "runs" and not (root / "runs").is_dir() else root) for root in roots]

@@ -1,10 +1,12 @@
-"""What many runs cost beside their frames: looking them up, resuming when all are stored, listing them.
+"""What many runs cost beside their tracking, by their number, by Dask's workers and by their frames.
 
-    python tests/benchmarks/many_runs.py FOLDER [--runs 1000 10000 100000]
+    python tests/benchmarks/many_runs.py FOLDER [--runs 1000 10000 100000] [--workers 1 2 4 8] [--frames 5 50 200]
 
-FOLDER is a recording in TUM layout. Each number of runs is shared by two trackers, ten start offsets and as many seeds
-as are needed. No frame is tracked: the stored runs are copies of one. Times are of the processor, in seconds, but the
-one to the first run, which is the clock's.
+FOLDER is a recording in TUM layout. First table: looking runs up, resuming when all are stored, listing them, and all
+runs as one frame. Each number of runs is shared by two trackers, ten start offsets and as many seeds as are needed. No
+frame is tracked: the stored runs are copies of one. Times are of the processor, in seconds, but the one to the first
+run, which is the clock's. The other tables: runs of `never-move`, which tracks nothing. Times are of the processor, in
+milliseconds a run: of the process that asks for the runs, and of those that make them.
 """
 
 import argparse
@@ -15,11 +17,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
+import psutil
+
 from dynslam_bench.runs import RunSpec, RunStore, list_runs, run_many
+from dynslam_bench.runs.cluster import DaskWorkers
 from dynslam_bench.runs.identity import Resolver
 
 
@@ -87,34 +92,104 @@ def listing(folder: str, count: int, results: str) -> dict[str, float]:
     return {"list": time.process_time()}
 
 
-PARTS = {"look_up": look_up, "fill": fill, "resume": resume, "listed": listing, "list": listing}
+def frame(folder: str, count: int, results: str) -> dict[str, float]:
+    """All runs as one pandas frame."""
+    assert len(RunStore(results).frame()) == count + 1
+    return {"frame": time.process_time()}
+
+
+_CLUSTER = """
+from distributed import LocalCluster
+cluster = LocalCluster(n_workers={workers}, threads_per_worker=1, dashboard_address=None)
+print(cluster.scheduler_address, flush=True)
+input()
+cluster.close()
+"""
+
+
+def on_workers(folder: str, workers: int, results: str) -> dict[str, float]:
+    """Runs of five frames on Dask's workers."""
+    command = [sys.executable, "-c", _CLUSTER.format(workers=workers)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as cluster:
+        with DaskWorkers(cluster.stdout.readline().strip()) as executor:
+            run_many(still(folder, 5, range(-5 * workers, 0)), results=results, executor=executor)  # all are ready then
+            began, spent = time.monotonic(), time.process_time()
+            run_many(still(folder, 5, range(RUNS)), results=results, executor=executor)
+        head_ms, minutes = 1000 * (time.process_time() - spent) / RUNS, (time.monotonic() - began) / 60
+        cluster.communicate("\n")
+    return {"head": head_ms, "a minute": RUNS / minutes}
+
+
+def of_frames(folder: str, frames: int, results: str) -> dict[str, float]:
+    """Runs of so many frames."""
+    run_many(still(folder, frames, [-1]), results=results)  # the fork server has started then
+    (server,) = psutil.Process().children()
+    before, spent = sum(server.cpu_times()), time.process_time()
+    records = run_many(still(folder, frames, range(RUNS)), results=results)
+    head, other = time.process_time() - spent, sum(server.cpu_times()) - before
+    files = list(RunStore(results).folder(records[0].run_id).iterdir())
+    kilobytes = sum(file.stat().st_size for file in files) / 1000
+    return {"head": 1000 * head / RUNS, "other": 1000 * other / RUNS, "kB": kilobytes, "files": len(files)}
+
+
+RUNS = 100
+"""Runs of a row of the second and the third table."""
+
+
+def still(folder: str, frames: int, seeds: Iterable[int]) -> list[RunSpec]:
+    return [
+        RunSpec(tracker="never-move", sequence=folder, frames=(0, frames), seed=seed % 10**6, device="cpu")
+        for seed in seeds
+    ]
+
+
+PARTS = {"look_up": look_up, "fill": fill, "resume": resume, "listed": listing, "list": listing, "frame": frame}
+CURVES = {"on_workers": on_workers, "of_frames": of_frames}
+
+
+def measured(name: str, folder: Path, count: int, results: str) -> dict[str, float]:
+    """What a part measures in a process of its own, with the most memory (MB) that it takes."""
+    command = [sys.executable, __file__, str(folder), "--part", name, str(count), results]
+    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
 
 
 def main() -> None:
-    """Run each part in a process of its own, and print a row a number of runs."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--runs", type=int, nargs="+", default=[1000, 10_000, 100_000])
-    parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--runs", type=int, nargs="*", default=[1000, 10_000, 100_000])
+    parser.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8])
+    parser.add_argument("--frames", type=int, nargs="*", default=[5, 50, 200])
+    parser.add_argument("--part", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.part:
-        name, results = chosen.part
-        values = PARTS[name](str(chosen.folder), chosen.runs[0], results)
+        name, count, results = chosen.part
+        values = (PARTS | CURVES)[name](str(chosen.folder), int(count), results)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(json.dumps(values | {"MB": peak}))
         return
-    print("| Runs | First run begins | Look-up | Resume | First list | Later lists | Most memory, MB |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print(
+        "| runs | first run, s | look-up, s | resume, s | first list, s | later lists, s | frame, s | most memory, MB |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for count in chosen.runs:
         with tempfile.TemporaryDirectory() as results:
-            measured = {}
-            for name in PARTS:
-                command = [sys.executable, __file__, str(chosen.folder), "--runs", str(count), "--part", name, results]
-                measured[name] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
-        cells = [measured["look_up"]["first run"], measured["look_up"]["look-up"], measured["resume"]["resume"]]
-        cells += [measured["listed"]["list"], measured["list"]["list"]]
-        most = max(measured[name]["MB"] for name in ("look_up", "resume", "list"))
+            parts = {name: measured(name, chosen.folder, count, results) for name in PARTS}
+        cells = [parts["look_up"]["first run"], parts["look_up"]["look-up"], parts["resume"]["resume"]]
+        cells += [parts["listed"]["list"], parts["list"]["list"], parts["frame"]["frame"]]
+        most = max(values["MB"] for name, values in parts.items() if name != "fill")
         print(f"| {count} | " + " | ".join(f"{cell:.1f}" for cell in cells) + f" | {most:.0f} |", flush=True)
+    print("\n| Dask's workers | head, ms a run | runs a minute |\n| --- | --- | --- |")
+    for count in chosen.workers:
+        with tempfile.TemporaryDirectory() as results:
+            values = measured("on_workers", chosen.folder, count, results)
+        print(f"| {count} | {values['head']:.1f} | {values['a minute']:.0f} |", flush=True)
+    print("\n| frames | head, ms a run | other processes, ms a run | kB a run | files a run |\n" + "| --- " * 5 + "|")
+    for count in chosen.frames:
+        with tempfile.TemporaryDirectory() as results:
+            values = measured("of_frames", chosen.folder, count, results)
+        cells = [f"{values[name]:.0f}" for name in ("head", "other", "kB", "files")]
+        print(f"| {count} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

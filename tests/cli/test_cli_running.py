@@ -108,6 +108,12 @@ def test_bench_has_limits(cli, walk, tmp_path):
         assert ended == code and json.loads(out)[0]["status"] in statuses
 
 
+def test_a_part_without_runs_is_no_error(cli, walk, tmp_path):
+    (tmp_path / "small.toml").write_text(f'trackers = ["never-move"]\nsequences = ["{walk}"]\n')
+    assert cli("bench", "small.toml", "--shard", "7/64") == (0, "this part of the suite holds no runs\n", "")
+    assert cli("bench", "small.toml", "--shard", "7/64", "--json") == (0, "[]\n", "")
+
+
 def test_pictures_of_a_stored_run_are_made(facts, walk):
     folder = Path(facts("run", "orb-slam2", walk)[0]["folder"])
     for option, name in (("--snapshots", "frame_000000.webp"), ("--sheet", "sheet.png"), ("--video", "video.webm")):

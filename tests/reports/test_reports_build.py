@@ -11,7 +11,7 @@ import pytest
 from reports_fake_store import add_run
 from reports_rows import page_data, rows_of
 
-from dynslam_bench.core.errors import ReportError
+from dynslam_bench.core.errors import DynslamError, ReportError
 from dynslam_bench.reports import ReportData, build_report, compare
 from dynslam_bench.reports.html.run_pages import broken
 from dynslam_bench.reports.model.board import make_board
@@ -150,8 +150,8 @@ def test_small_and_odd_results(tmp_path):
 @pytest.mark.parametrize(
     ("file", "text"),
     [
-        ("", "there is no results folder"),
-        ("results/x", "holds no runs"),
+        ("", "there are no runs in"),
+        ("results/x", "there are no runs in"),
         ("results/runs/x", "there are no runs in"),
         (f"results/runs/{'a' * 16}/run.json", "Invalid JSON"),
     ],
@@ -160,7 +160,7 @@ def test_what_cannot_be_reported_is_one_clear_line(tmp_path, file, text):
     if file:
         (tmp_path / file).parent.mkdir(parents=True)
         (tmp_path / file).write_text("{")
-    with pytest.raises(ReportError, match=text) as caught:
+    with pytest.raises(DynslamError, match=text) as caught:
         build_report([tmp_path / "results"], tmp_path / "report")
     assert "\n" not in str(caught.value) and not (tmp_path / "report").exists()
 

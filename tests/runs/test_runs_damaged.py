@@ -164,7 +164,7 @@ def test_a_run_with_a_link_to_elsewhere_is_one_unreadable_record(
     (store.folder(run) / name).unlink(missing_ok=True)
     (store.folder(run) / name).symlink_to(secret)
     for found, (bad,) in (store.all(), list_runs(store)):
-        assert found == [] and "is a link that leads out" in bad.reason and SECRET not in bad.reason
+        assert not found and "is a link that leads out" in bad.reason and SECRET not in bad.reason
     assert store.get(run) is None
 
 
@@ -182,7 +182,7 @@ def test_a_pipe_hangs_nothing(filled: tuple[RunStore, str]) -> None:
     record.unlink()
     os.mkfifo(record)
     found, (bad,) = store.all()
-    assert found == [] and bad.reason.endswith("run.json is no plain file")
+    assert not found and bad.reason.endswith("run.json is no plain file")
 
 
 @pytest.mark.parametrize("file", ["groundtruth.txt", "timestamps.txt"])

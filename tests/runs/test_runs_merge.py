@@ -1,16 +1,21 @@
 """Parts of a suite on several machines: shards, stores that are merged, and workers that are not like this machine."""
 
 import json
+import shutil
+import tarfile
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import astuple
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from envs_toys import TARGET
 
 from dynslam_bench.api import bench
 from dynslam_bench.cli.running import parse_shard
 from dynslam_bench.core.errors import DynslamError, RunError
-from dynslam_bench.runs import RunSpec, RunStore, merge, resolve, run_many
+from dynslam_bench.reports import load_frame
+from dynslam_bench.runs import RunSpec, RunStore, merge, open_store, resolve, run_many
 from dynslam_bench.runs.identity import Resolver
 
 
@@ -38,8 +43,40 @@ def test_merged_shards_are_the_suite(suite: Path, tmp_path: Path) -> None:
     assert outcomes(target) == outcomes(whole)
     again = merge([*parts, whole], target)
     assert (again.added, len(again.stored), again.left_out) == ([], 10, [])
-    with pytest.raises(RunError, match="part 6 of 6 holds none of the suite's runs"):
-        bench(suite, results=tmp_path / "none", shard=(6, 6))
+    assert bench(suite, results=tmp_path / "none", shard=(6, 6)) == [] and not (tmp_path / "none").exists()
+
+
+def test_a_shard_is_merged_and_read_as_one_file(suite: Path, tmp_path: Path) -> None:
+    parts = [RunStore(tmp_path / f"shard{k}") for k in (1, 2)]
+    for k, part in enumerate(parts, 1):
+        bench(suite, results=part.root, shard=(k, 2))
+    with tarfile.open(tmp_path / "shard1.tgz", "w:gz") as archive:
+        for name in ("runs", "sequences"):
+            archive.add(parts[0].root / name, name)
+    shutil.make_archive(str(parts[1].root), "zip", tmp_path, "shard2")
+    files, target = [tmp_path / "shard1.tgz", tmp_path / "shard2.zip"], RunStore(tmp_path / "all")
+    assert len(merge(map(open_store, files), target).added) == 5
+    assert outcomes(target) == outcomes(parts[0]) | outcomes(parts[1])
+    frame = pd.concat([open_store(file).frame() for file in files]).sort_values("started", ignore_index=True)
+    pd.testing.assert_frame_equal(frame, target.frame())
+    assert len(load_frame(files)) == 5
+    contradicted = files[1].rename(tmp_path / "other.zip")
+    trajectory = target.folder(parts[1].ids()[0]) / "trajectory_online.txt"
+    trajectory.write_text("")
+    ((path, _),) = map(astuple, merge([open_store(contradicted)], target).left_out)
+    assert {"other.zip", trajectory.parent.name} <= set(path.parts)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("runs/../../x", "outside"), ("latest", "a link"), ("other/x", "there are no runs in")]
+)
+def test_an_archive_that_is_no_results_folder_is_refused(tmp_path: Path, name: str, reason: str) -> None:
+    with tarfile.open(tmp_path / "shard.tar", "w") as archive:
+        entry = tarfile.TarInfo(name)
+        entry.type = tarfile.SYMTYPE if name == "latest" else tarfile.REGTYPE
+        archive.addfile(entry)
+    with pytest.raises(DynslamError, match=reason):
+        open_store(tmp_path / "shard.tar")
 
 
 @pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "-1/2", "1/2/3"])

@@ -181,7 +181,7 @@ def test_a_new_run_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
 
     def whole_or_missing() -> None:
         records, unreadable = RunStore(root).all()
-        assert records in ([], [RECORD]) and unreadable == []
+        assert list(records) in ([], [RECORD]) and unreadable == []
 
     found = survey(lambda: make(root, RECORD), root, halfway=whole_or_missing, result=lambda: held(root))
     assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
