@@ -132,7 +132,7 @@ def of_frames(folder: str, frames: int, results: str) -> dict[str, float]:
     return {"head": 1000 * head / RUNS, "other": 1000 * other / RUNS, "kB": kilobytes, "files": len(files)}
 
 
-RUNS = 100
+RUNS = 50
 """Runs of a row of the second and the third table."""
 
 
