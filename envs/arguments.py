@@ -27,6 +27,8 @@ def open_frames(
     frames: Frames,
     stride: int,
     preprocessing: PreprocessingSettings | None = None,
+    *,
+    memory_map: bool = False,
 ) -> Sequence:
     """The sequence, preprocessed and cut to the chosen frames.
 
@@ -37,13 +39,14 @@ def open_frames(
         frames: Part of the sequence.
         stride: Take every so many frames.
         preprocessing: Applied to every frame.
+        memory_map: Whether the frames are decoded once, see `sequences.decoded.Decoded`.
 
     Raises:
         SequenceError: Unknown, missing or damaged sequence, or no frames are left.
     """
     start, stop = parse_frames(frames)
     if isinstance(sequence, str | Path):
-        return open_sequence(
+        sequence = open_sequence(
             sequence,
             data_root=data_root,
             camera=camera,
@@ -51,13 +54,18 @@ def open_frames(
             stride=stride,
             preprocessing=preprocessing,
         )
-    if preprocessing is not None and preprocessing.changes_images:
-        from dynslam_bench.sequences.preprocessing import Preprocessed
+    else:
+        if preprocessing is not None and preprocessing.changes_images:
+            from dynslam_bench.sequences.preprocessing import Preprocessed
 
-        sequence = cast("Sequence", Preprocessed(sequence, preprocessing))
-    if (start, stop, stride) == (0, None, 1):
-        return sequence
-    return cast("Sequence", SequenceView(sequence, start, stop, stride))
+            sequence = cast("Sequence", Preprocessed(sequence, preprocessing))
+        if (start, stop, stride) != (0, None, 1):
+            sequence = cast("Sequence", SequenceView(sequence, start, stop, stride))
+    if memory_map:
+        from dynslam_bench.sequences.decoded import Decoded
+
+        sequence = cast("Sequence", Decoded(sequence))
+    return sequence
 
 
 def parse_window(window: Frames, sequence: Sequence) -> tuple[int, int]:

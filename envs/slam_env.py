@@ -117,6 +117,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         cache: Whether features and network masks come from the stage cache where they are stored; poses and reported
             stage times are the same either way, and `stats` says which came from it (``cached_stages``).
         fixed_info: Whether ``info`` has the same keys on every step, as Minari needs.
+        memory_map: Whether all frames are decoded once into a file of the stage cache that environments and processes
+            share (2.2 MB a frame of 640 x 480); the tracker then gets arrays that cannot be written.
 
     Raises:
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
@@ -150,6 +152,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         threads: int = 1,
         cache: bool = False,
         fixed_info: bool = False,
+        memory_map: bool = False,
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
@@ -169,6 +172,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._reward: Reward = reward if callable(reward) else REWARDS[reward]
         self._length = window
         self._fixed_info = fixed_info
+        self._memory_map = memory_map
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
@@ -460,7 +464,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._actions = ActionMap(self.settings, self._control)
 
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
-        opened = open_frames(sequence, *self._part, preprocessing_of(self.settings))
+        opened = open_frames(sequence, *self._part, preprocessing_of(self.settings), memory_map=self._memory_map)
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)

@@ -60,7 +60,7 @@ class StageCache:
 
     def get(self, stage: str, key: str) -> Entry | None:
         """The stored result, or None; a damaged entry is deleted and counts as missing."""
-        path = self._path(stage, key)
+        path = self.path(stage, key)
         try:
             arrays = read_npz(path)
             cost = float(arrays.pop("cost_s"))
@@ -78,7 +78,7 @@ class StageCache:
         Raises:
             DynslamError: The folder cannot be written, e.g. a full disk; nothing is left behind.
         """
-        path = self._path(stage, key)
+        path = self.path(stage, key)
         with (
             raising(
                 DynslamError,
@@ -120,13 +120,14 @@ class StageCache:
             left -= size
         return total - left
 
-    def _path(self, stage: str, key: str) -> Path:
-        return self.folder / stage / key[:2] / f"{key}.npz"
+    def path(self, stage: str, key: str, suffix: str = ".npz") -> Path:
+        """Where an entry lies; `get` and `put` take ``.npz``, other modules write ``.npy`` that count and go as all."""
+        return self.folder / stage / key[:2] / f"{key}{suffix}"
 
     def _entries(self) -> list[tuple[float, Path, int]]:
         """(last use, path, bytes) of every entry; files that vanish meanwhile are left out."""
         entries = []
-        for path in self.folder.glob("*/*/*.npz"):
+        for path in self.folder.glob("*/*/*.np[yz]"):
             with contextlib.suppress(OSError):
                 status = path.stat()
                 entries.append((status.st_mtime, path, status.st_size))

@@ -1,5 +1,7 @@
 """Local bundle adjustment: Levenberg-Marquardt with the Schur complement over the points.
 
+Residuals weigh by Cauchy's kernel, as wide as they are at the start (see `pose_optimisation`).
+
 The work is a function of the number of observations and iterations only, and everything runs in one thread in a fixed
 order: equal input gives equal bits.
 """
@@ -19,6 +21,7 @@ from dynslam_bench.slam.pose_optimisation import (
     CHI2_DEPTH,
     CHI2_MONO,
     apply_twist,
+    cauchy_width,
     observation_chi2,
 )
 
@@ -66,7 +69,7 @@ class BundleResult:
         points: World points, metres.
         chi2: Chi-square of each observation ``[N]``; inf behind the camera.
         inliers: bool ``[N]``, which observations fit.
-        cost: Sum of the Huber costs.
+        cost: Sum of the costs of Cauchy's kernel.
     """
 
     poses: Array
@@ -79,27 +82,23 @@ class BundleResult:
 @kernel
 def _cost(
     poses: Array, points: Array, obs_pose: Slots, obs_point: Slots, uv: Array, right: Array, info: Array,
-    info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, chi2: Array,
+    info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, width: float, chi2: Array,
 ) -> float:  # fmt: skip
-    """Huber cost of all observations; fills `chi2` (inf behind the camera)."""
+    """Cost of all observations under a kernel of this squared width; fills `chi2` (inf behind the camera)."""
     total = 0.0
     for k in range(obs_pose.shape[0]):
         _, chi2[k] = observation_chi2(
             poses[obs_pose[k]], points[obs_point[k]], uv[k], right[k], info[k], info_right[k], fx, fy, cx, cy, bf
         )
-        limit = CHI2_DEPTH if info_right[k] > 0.0 else CHI2_MONO
-        if chi2[k] == np.inf:
-            total += 100.0 * limit
-        else:
-            total += chi2[k] if chi2[k] <= limit else 2.0 * np.sqrt(limit * chi2[k]) - limit
+        total += 100.0 * CHI2_DEPTH if chi2[k] == np.inf else width * np.log1p(chi2[k] / width)
     return total
 
 
 @kernel
 def _step(
     poses: Array, variable: int, points: Array, obs_pose: Slots, obs_point: Slots, start: Slots, uv: Array,
-    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, damping: float,
-    chi2: Array, new_poses: Array, new_points: Array,
+    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, width: float,
+    damping: float, chi2: Array, new_poses: Array, new_points: Array,
 ) -> bool:  # fmt: skip
     """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
     n, q = obs_pose.shape[0], points.shape[0]
@@ -116,10 +115,9 @@ def _step(
         hll[:] = 0.0
         for k in range(start[i], start[i + 1]):
             depth = info_right[k] > 0.0
-            limit = CHI2_DEPTH if depth else CHI2_MONO
             if chi2[k] == np.inf:
                 continue
-            weight = 1.0 if chi2[k] <= limit else np.sqrt(limit / chi2[k])
+            weight = 1.0 / (1.0 + chi2[k] / width)
             c = obs_pose[k]
             r = poses[c]
             px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -228,19 +226,22 @@ def _adjust(
     right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float,
     iterations: int, chi2: Array,
 ) -> tuple[Array, Array, float]:  # fmt: skip
-    cost = _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, chi2)
+    _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, 1.0, chi2)
+    width = cauchy_width(chi2)
+    cost = _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, width, chi2)
     damping = 1e-5
     trial = np.empty_like(chi2)
     for _ in range(iterations):
         new_poses, new_points = poses.copy(), points.copy()
         solved = _step(
             poses, variable, points, obs_pose, obs_point, start, uv, right, info, info_right, fx, fy, cx, cy, bf,
-            damping, chi2, new_poses, new_points,
+            width, damping, chi2, new_poses, new_points,
         )  # fmt: skip
         if solved:
             new = _cost(
-                new_poses, new_points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, trial
-            )
+                new_poses, new_points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, width,
+                trial,
+            )  # fmt: skip
             if new < cost:
                 poses, points = new_poses, new_points
                 for k in range(chi2.shape[0]):
@@ -256,7 +257,7 @@ def _adjust(
 
 
 def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
-    """Minimise the Huber reprojection error over the variable poses and all points.
+    """Minimise the robust reprojection error over the variable poses and all points.
 
     Args:
         problem: Start values and observations; every point should have two observations or depth.

@@ -126,6 +126,12 @@ def test_a_restored_episode_goes_on_to_the_bit(tracker: str) -> None:
     assert rest(env) == first and env.reset()[0].tobytes() == following, "random numbers are restored, too"
 
 
+def test_networks_are_shared_by_copies() -> None:
+    env = stepped(SlamEnv("synthetic/walking_xyz?scene=0&frames=4", "mask-rcnn"), 1)
+    copied, own = (tracker._masks.segmenter.inner for tracker in (env.clone_state().parts["_tracker"], env._tracker))
+    assert copied.network is own.network
+
+
 def test_counterfactual_actions_differ_and_windows_come_back() -> None:
     env = SlamEnv(ToySequence(30), TARGET, control=["noise.level_m"], window=10)
     stepped(env, 3)

@@ -1,5 +1,6 @@
 """ONNX networks: layouts found from shapes, decoding checked by hand-made outputs, clear errors."""
 
+from copy import deepcopy
 from pathlib import Path
 
 import cv2
@@ -188,6 +189,7 @@ def test_a_written_network_runs_through_opencv(tmp_path):
         found = segmenter.segment(frame(np.zeros(shape, np.uint8)))
         assert found.masks.shape == (1, *shape[:2])
         assert found.masks.mean() == pytest.approx(20 * 20 / (60 * 80), rel=0.35)
+        assert (deepcopy(segmenter).segment(frame(np.zeros(shape, np.uint8))).masks == found.masks).all()
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,11 +43,15 @@ class MaskRCNNSegmenter:
         self.network = network.eval().fuse().to(device)
         self.settings, self.device, self.threads, self.floor = settings, device, threads, floor
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> MaskRCNNSegmenter:
+        """Itself: no frame changes the network."""
+        return self
+
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame; none is an empty result."""
         height, width = frame.rgb.shape[:2]
         with pinned_threads(torch.get_num_threads, torch.set_num_threads, self.threads):
-            image = torch.from_numpy(np.ascontiguousarray(frame.rgb)).to(self.device).permute(2, 0, 1).float() / 255
+            image = torch.from_numpy(np.array(frame.rgb, order="C")).to(self.device).permute(2, 0, 1).float() / 255
             detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
             boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
         config, wanted = self.network.config, expand_classes(self.settings.classes)

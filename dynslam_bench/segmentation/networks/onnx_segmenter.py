@@ -79,6 +79,10 @@ class OnnxSegmenter:
         self._input = header.inputs[0].name
         self.layout = self._find_layout(header)
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> OnnxSegmenter:
+        """A segmenter with a network of its own: OpenCV's cannot be copied, nor used by two threads."""
+        return OnnxSegmenter(self.path, self.settings, threads=self.threads, floor=self.floor)
+
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame.
 
