@@ -247,7 +247,7 @@ def observation_space(observation: str | Sequence[str], camera: Camera) -> space
     if observation == "stats":
         return stats_space()
     size, most = (camera.height, camera.width), MOST_KEYPOINTS
-    known: dict[str, dict[str, spaces.Space[Any]]] = {
+    part_spaces: dict[str, dict[str, spaces.Space[Any]]] = {
         "stats": {"stats": stats_space()},
         "rgb": {"rgb": spaces.Box(0, 255, (*size, 3), np.uint8)},
         "depth": {"depth": spaces.Box(0.0, MAX_DEPTH_M, size, np.float32)},
@@ -260,9 +260,9 @@ def observation_space(observation: str | Sequence[str], camera: Camera) -> space
     }
     parts = observation_parts(observation)
     for part in parts:
-        if part not in known:
-            raise SettingsError(f"unknown observation '{part}'", f"stats, rgbd, or a list of {', '.join(known)}")
-    return spaces.Dict({key: space for part in parts for key, space in known[part].items()})
+        if part not in part_spaces:
+            raise SettingsError(f"unknown observation '{part}'", f"stats, rgbd, or a list of {', '.join(part_spaces)}")
+    return spaces.Dict({key: space for part in parts for key, space in part_spaces[part].items()})
 
 
 def observation_parts(observation: str | Sequence[str]) -> tuple[str, ...]:

@@ -40,7 +40,7 @@ RUN = {
     "docs/how-to/recording.md": 1,
     "docs/how-to/suite.md": 1,
     "docs/how-to/trajectory.md": 1,
-    "docs/reference/environments.md": 3,
+    "docs/reference/environments.md": 2,
     "docs/reference/rendered.md": 1,
 }
 """Pages, and how many of their first Python blocks are run here, one after the other in one namespace."""
