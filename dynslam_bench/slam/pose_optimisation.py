@@ -105,8 +105,9 @@ def apply_twist(pose: Array, xi: Array) -> Array:
 
 @kernel
 def cauchy_width(chi2: Array) -> float:
-    """Squared width of the kernel for observations with these chi-squares, by their median."""
-    return CAUCHY * max(np.median(chi2) / MEDIAN_CHI2, LEAST_VARIANCE)
+    """Squared width of the kernel for observations with these chi-squares, by the median of those in front."""
+    finite = chi2[np.isfinite(chi2)]
+    return CAUCHY * (max(np.median(finite) / MEDIAN_CHI2, LEAST_VARIANCE) if len(finite) else 1.0)
 
 
 @kernel

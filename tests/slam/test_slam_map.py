@@ -194,3 +194,6 @@ def test_bundle_adjustment_agrees_with_general_least_squares(with_depth):
     result = adjust_bundle(problem, 40)
     assert result.inliers.all() and result.cost == pytest.approx(2 * solution.cost, rel=1e-4)
     np.testing.assert_allclose(result.poses, poses, atol=1e-4)
+    behind = problem.points * np.where(np.arange(POINTS) % 5 < 3, -1, 1)[:, None]
+    rest = adjust_bundle(replace(problem, points=behind), 40)
+    assert np.isfinite(rest.cost) and rest.inliers.mean() > 0.35, "points behind the camera stop no other's adjustment"

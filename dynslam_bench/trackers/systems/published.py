@@ -68,6 +68,7 @@ ORB_SLAM2 = (
     "features spread by the cells of a grid, not by a quadtree",
     "relocalisation and matching without a bag of words",
     "mapping in step with tracking, in one thread",
+    "residuals weigh by Cauchy's kernel, as wide as they are, where ORB-SLAM2 has Huber's",
     "the rolling shutter of a camera whose readout is known is undone, which ORB-SLAM2 does not do",
 )
 """Deviations with depth and without."""
