@@ -25,6 +25,7 @@ from dynslam_bench.core.errors import DynslamError, raising
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.(tmp|new)")
 _NEW_S = 60.0
+_TURN_S = 0.1
 """A temporary name ends in ``.new`` until it is locked, which takes no time, and in ``.tmp`` from then on."""
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
@@ -213,6 +214,17 @@ def claimed(path: Path) -> Iterator[bool]:
                     path.unlink()
     finally:
         os.close(handle)
+
+
+@contextmanager
+def turn(path: Path) -> Iterator[None]:
+    """Hold a name while the block lasts, and wait for it as long as another process does (see `claimed`)."""
+    while True:
+        with claimed(path) as mine:
+            if mine:
+                yield
+                return
+        time.sleep(_TURN_S)
 
 
 def hold(path: Path) -> int:

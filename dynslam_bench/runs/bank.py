@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -18,7 +17,7 @@ from pydantic import ConfigDict, Field
 
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, raising
-from dynslam_bench.core.files import TemporaryFolder, claimed, replace_folder, write_atomic
+from dynslam_bench.core.files import TemporaryFolder, replace_folder, turn, write_atomic
 from dynslam_bench.core.reading import compare_sums, file_sha256, read_lines
 from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.core.toml import read_toml
@@ -28,7 +27,6 @@ from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, 
 
 SUMS = "SHA256SUMS"
 _PARTS = ("runs", "sequences")
-_TURN_S = 0.1
 _ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
 _ADDRESS = re.compile(r"[a-z+]+://.*|(?:[\w.-]+@)?[\w.-]+:.+")
 
@@ -248,21 +246,14 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
     store = Bank(bank)
     with raising(InfrastructureError, f"cannot write {store.root}", "name another folder"):
         store.root.mkdir(parents=True, exist_ok=True)
-    while True:
-        with claimed(store.root / ".merging") as mine:
-            if mine:
-                return _merge_alone(sources, store)
-        time.sleep(_TURN_S)
-
-
-def _merge_alone(sources: Sequence[RunStore], store: Bank) -> Merged:
-    if (store.root / SUMS).exists() or store.files():
-        _check(store.root)
-    try:
-        return merge(sources, store, trials=False)
-    finally:  # what was copied before a fault is whole
-        sums = (f"{file_sha256(store.root / name)}  {name}\n" for name in store.files())
-        write_atomic(store.root / SUMS, "".join(sums))
+    with turn(store.root / ".merging"):
+        if (store.root / SUMS).exists() or store.files():
+            _check(store.root)
+        try:
+            return merge(sources, store, trials=False)
+        finally:  # what was copied before a fault is whole
+            sums = (f"{file_sha256(store.root / name)}  {name}\n" for name in store.files())
+            write_atomic(store.root / SUMS, "".join(sums))
 
 
 def _check(bank: str | Path) -> None:

@@ -610,7 +610,12 @@ def open_store(results: str | Path) -> RunStore:
             unpacked = temporary.path / store.root.name  # so that messages name the archive
             unpacked.mkdir()
             extract(store.root, unpacked)
-        store = RunStore(next((runs.parent for runs in unpacked.rglob("runs")), unpacked))
+        roots = [path.parent for path in unpacked.rglob("runs") if path.is_dir()]
+        depth = min((len(root.parts) for root in roots), default=0)  # below it, e.g. a study's own runs
+        roots = [root for root in roots if len(root.parts) == depth]
+        if len(roots) > 1:
+            raise RunError(f"{results} holds {len(roots)} results folders", "pack each into an archive of its own")
+        store = RunStore(roots[0] if roots else unpacked)
         weakref.finalize(store, temporary.close)
     if not store.runs.is_dir():
         raise RunError(f"there are no runs in {results}", "name a folder that holds runs")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future, wait
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from threading import Thread
 from typing import Any
@@ -32,22 +31,33 @@ SMOOTHING = 0.5
 
 @dataclass(eq=False)
 class _Request:
-    """A frame that the segmenter works on, when its masks are there, and the dense flow from it to the latest frame."""
+    """A frame that the segmenter works on beside tracking.
+
+    Attributes:
+        due: When its masks are taken, seconds of the frames' stamps.
+        since: Frames since the one that was segmented before it.
+        answer: The objects, and the seconds that the segmenter took.
+        flow: Dense flow from it to the latest frame, float32 ``[h, w, 2]``.
+        age: Frames since.
+    """
 
     due: float
+    since: int
     answer: Future[tuple[Instances, float]]
     flow: NDArray[np.float32]
+    age: int = 0
 
     def follow(self, flow: NDArray[np.float32]) -> None:
         """Add the flow from the frame before to a new one."""
+        self.age += 1
         rows, columns = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
         x, y = columns + self.flow[:, :, 0], rows + self.flow[:, :, 1]
         self.flow = self.flow + np.asarray(cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _Request:
-        answer: Future[tuple[Instances, float]] = Future()
-        answer.set_result(deepcopy(self.answer.result(), memo))
-        return _Request(self.due, answer, self.flow)
+        """One that shares the answer, which is waited for and never changed."""
+        wait([self.answer])
+        return replace(self)
 
 
 class MaskScheduler:
@@ -55,7 +65,8 @@ class MaskScheduler:
 
     With schedule ``async`` the segmenter runs in a thread of its own, on one frame at a time. The masks of a frame are
     taken `latency_s` later by the frames' stamps, carried to the frame of that time, and the segmenter begins with that
-    frame. If it is slower than `latency_s`, tracking waits for it: the same settings give the same masks everywhere.
+    frame; they are at least one frame late. If it is slower than `latency_s`, tracking waits for it: the same settings
+    give the same masks everywhere.
 
     Args:
         settings: When to segment, how to carry masks, how long to bridge missed detections.
@@ -130,13 +141,14 @@ class MaskScheduler:
         taken = request is not None and frame.timestamp >= request.due
         if request is not None and taken:
             instances, self.beside_s = request.answer.result()
-            self._instances = carry_dense(self._missed.update(instances, self._age), request.flow)
+            self._instances = carry_dense(self._missed.update(instances, request.since), request.flow)
         else:
             self._instances = carry_dense(self._instances, flow)
         if request is None or taken:
             answer: Future[tuple[Instances, float]] = Future()
             Thread(target=_segment, args=(self.segmenter, frame, answer), daemon=True).start()
-            self._request = _Request(frame.timestamp + self._settings.latency_s, answer, np.zeros_like(flow))
+            since = self._age if request is None else request.age
+            self._request = _Request(frame.timestamp + self._settings.latency_s, since, answer, np.zeros_like(flow))
         return taken
 
     def _due(self, keyframe: bool) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,12 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Sequence
 from dynslam_bench.core.errors import DynslamError, SequenceError, raising
-from dynslam_bench.core.files import claimed, replacing
+from dynslam_bench.core.files import replacing, turn
 from dynslam_bench.core.fingerprint import opencv_version, package_digest
 from dynslam_bench.core.folders import STAGES_VARIABLE
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.sequences.view import Wrapped, part_of
-
-_POLL_S = 0.1
 
 
 class Decoded(Wrapped):
@@ -54,20 +51,17 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
     cache, part = StageCache(), part_of(sequence)
     code = [package_digest(("core", "geometry", "sequences")), opencv_version()]
     path = cache.path("frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy")
-    while True:
-        with contextlib.suppress(FileNotFoundError):
-            frames: NDArray[np.void] = np.load(path, mmap_mode="r", allow_pickle=False)
-            with contextlib.suppress(OSError):  # a cache that can only be read
-                os.utime(path)
-            return frames
+    if not path.exists():
         with raising(DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"):
             path.parent.mkdir(parents=True, exist_ok=True)
-        with claimed(path.with_suffix(".lock")) as mine:
-            if mine and not path.exists():
+        with turn(path.with_suffix(".lock")):
+            if not path.exists():
                 _write(sequence, path, cache.max_bytes)
                 cache.prune()
-        if not mine:
-            time.sleep(_POLL_S)
+    frames: NDArray[np.void] = np.load(path, mmap_mode="r", allow_pickle=False)
+    with contextlib.suppress(OSError):  # a cache that can only be read
+        os.utime(path)
+    return frames
 
 
 def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:

@@ -68,13 +68,19 @@ def test_a_shard_is_merged_and_read_as_one_file(suite: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "reason"), [("runs/../../x", "outside"), ("latest", "a link"), ("other/x", "there are no runs in")]
-)
+    ("name", "reason"),
+    [
+        ("runs/../../x", "outside"), ("latest", "a link"), ("other/x", "there are no runs in"),
+        ("shard1/runs/x", "holds 2 results folders"),
+    ],
+)  # fmt: skip
 def test_an_archive_that_is_no_results_folder_is_refused(tmp_path: Path, name: str, reason: str) -> None:
     with tarfile.open(tmp_path / "shard.tar", "w") as archive:
         entry = tarfile.TarInfo(name)
         entry.type = tarfile.SYMTYPE if name == "latest" else tarfile.REGTYPE
         archive.addfile(entry)
+        if name.startswith("shard1"):
+            archive.addfile(tarfile.TarInfo("shard2/runs/x"))
     with pytest.raises(DynslamError, match=reason):
         open_store(tmp_path / "shard.tar")
 

@@ -258,6 +258,16 @@ def test_beside_tracking_masks_come_late_by_the_stamps_and_are_carried_to_the_fr
     assert stage.segmented, "a sequence begins with masks"
 
 
+def test_beside_tracking_missed_detections_count_the_frames_between_those_segmented(monkeypatch):
+    stage, apart = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.09), Square()), []
+    update = stage._missed.update
+    monkeypatch.setattr(stage._missed, "update", lambda found, frames: apart.append(frames) or update(found, frames))
+    for index in range(11):
+        gray = scene(3 * index)[0]
+        stage.masks_for(frame_of(gray, index), gray, keyframe=False)
+    assert stage.segmenter.calls[:4] == [0, 1, 4, 7] and apart == [1, 1, 3, 3]
+
+
 def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken():
     class Broken(Square):
         def segment(self, frame):
