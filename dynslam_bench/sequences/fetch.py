@@ -413,7 +413,10 @@ def _tar_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
                     continue
                 stream = tar.extractfile(entry) if entry.isreg() and not entry.issparse() else None
                 if stream is None:
-                    raise SequenceError(f"{archive.name} holds {entry.name!r}, a link or device, refused")
+                    raise SequenceError(
+                        f"{archive.name} holds {entry.name!r}, a link or device, refused",
+                        "of results, pack the folders runs and sequences alone",
+                    )
                 yield entry.name, stream
         while counted.read(CHUNK):  # tarfile stops before the end of the stream, where gzip keeps its checksum
             pass
