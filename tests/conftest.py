@@ -30,6 +30,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             half.wait()
 
 
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Ids of the records that are read whole."""
+    from dynslam_bench.runs import RunStore
+
+    ids: list[str] = []
+    read_whole = RunStore.read_whole
+    monkeypatch.setattr(RunStore, "read_whole", lambda self, run_id: ids.append(run_id) or read_whole(self, run_id))
+    return ids
+
+
 @pytest.fixture(scope="session")
 def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A toy sequence of 60 frames in TUM layout."""

@@ -1,21 +1,38 @@
 """The report of a results folder: what is in it, what it refuses, and that the page needs no network."""
 
 import json
+import os
 import re
+import shutil
+import sqlite3
+import subprocess
+import sys
 from itertools import product
 
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 import pytest
-from reports_fake_store import add_run
-from reports_rows import page_data, rows_of
+from reports_fake_store import add_frames, add_run, fill, truth_of
+from reports_rows import PROTOCOL, crashed, page_data, row, rows_of
 
-from dynslam_bench.core.errors import DynslamError, ReportError
-from dynslam_bench.reports import ReportData, build_report, compare
-from dynslam_bench.reports.html.run_pages import broken
+from dynslam_bench.cli.app import start
+from dynslam_bench.core import reading
+from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError
+from dynslam_bench.core.records import digest
+from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.reports import ReportData, build_report, compare, figures
+from dynslam_bench.reports.build_report import FEWER_PAGES, MOST_PAGES, masks_section, pages_for
+from dynslam_bench.reports.figures import mask_figure
+from dynslam_bench.reports.html import board_page
+from dynslam_bench.reports.html.run_pages import broken, exact_shares
+from dynslam_bench.reports.model import load
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.load import check_one_protocol
+from dynslam_bench.reports.model.load import check_one_protocol, load_runs
+from dynslam_bench.reports.tables import table as tables
+from dynslam_bench.reports.tables.leaderboard import repeatability
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_csv, to_markdown
 from dynslam_bench.runs.store import RunStore
 
 PAGES = ("index", "errors", "compare", "paper", "diagnostics", "reproduce", "run")
@@ -194,3 +211,386 @@ def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
     t, v = broken(long, long[:, None], most=400)
     assert len(t) < 420 and np.isnan(v[:, 0]).sum() == 1
     assert {long[0], long[4999], long[5000], long[-1]} <= set(t.tolist())
+
+
+def contents(folder):
+    """Every file of a report but those that hold the time when it was made."""
+    files = [
+        path for path in folder.rglob("*") if path.is_file() and path.suffix != ".html" and path.name != "report.md"
+    ]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def refuse(kind):
+    if kind == "die":
+        os._exit(3)
+    raise ReportError("no", "a hint")
+
+
+@pytest.fixture
+def two_cores(monkeypatch):
+    monkeypatch.setattr(load, "MANY", 1)
+    monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+
+
+def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
+    store = fill(tmp_path / "results", sequences=["synthetic/sitting_xyz"], seeds=(0,))
+    add_run(store, "orb-slam2", "synthetic/sitting_xyz", 7, lost=range(30), status="lost")
+    events = []
+    build_report(store, tmp_path / "helped", command="c", on_progress=lambda *event: events.append(event))
+    (store.root / "index.sqlite").unlink()  # or there would be nothing left to read
+    monkeypatch.setattr(load, "MANY", 1000)
+    build_report(store, tmp_path / "alone", command="c")
+    alone, helped = contents(tmp_path / "alone"), contents(tmp_path / "helped")
+    assert alone.keys() == helped.keys() and len(alone) > len(store.ids())
+    assert [name for name in alone if alone[name] != helped[name]] == []
+    scored = [done for done, total, what in events if what.startswith("scoring") and total == len(store.ids())]
+    assert scored[-1] == len(store.ids())
+
+
+def test_an_error_of_a_worker_is_raised_and_a_dead_worker_is_named(two_cores):
+    with load.worker_pool(1) as pool:
+        for kind, error in (("raise", ReportError), ("die", InfrastructureError)):
+            with pytest.raises(error):
+                list(load.run_jobs(pool, refuse, [(kind,)] * 3))
+
+
+@pytest.mark.parametrize(("runs", "cores"), [(load.MANY - 1, 8), (10_000, 1)])
+def test_few_runs_and_one_core_need_no_workers(runs, cores, monkeypatch):
+    monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    with load.worker_pool(runs) as pool:
+        assert pool is None
+
+
+def test_a_script_needs_no_guard(tmp_path):
+    """Workers do not run the caller's script."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from dynslam_bench.reports.model import load\n"
+        "load.MANY = 1\nload.os.sched_getaffinity = lambda _: {0, 1}\nprint('once')\n"
+        "with load.worker_pool(1) as pool:\n    print(list(load.run_jobs(pool, abs, [(-2,), (3,)])))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout == "once\n[2, 3]\n"
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Files that are read."""
+    found = []
+    real = reading.read_bytes
+    monkeypatch.setattr(reading, "read_bytes", lambda path, **how: found.append(path.name) or real(path, **how))
+    return found
+
+
+def test_fifty_known_runs_cost_no_file_each(store, tmp_path, opened):
+    for number in range(50):
+        add_run(store, f"tracker-{number % 5}", f"s/{number % 2}", number // 10, n=20)
+    load_runs([store], PROTOCOL)
+    assert opened.count("run.json") == 50
+    opened.clear()
+    assert len(load_runs([store], PROTOCOL).rows) == 50 and opened == []
+    build_report(store, tmp_path / "report", most_pages=7)
+    assert opened.count("run.json") == 7  # those that have a page, and every one once
+    opened.clear()
+    pages = {path: path.read_text() for path in (tmp_path / "report" / "data").glob("*.js")}
+    build_report(store, tmp_path / "report", most_pages=7)
+    assert opened.count("run.json") == 0, "nothing has changed"
+    assert pages == {path: path.read_text() for path in pages}
+    victim = next(store.folder(path.stem[4:]) for path in pages if path.stem.startswith("run-"))
+    (victim / "log.txt").write_text("another log\n")
+    build_report(store, tmp_path / "report", most_pages=7)
+    assert "another log" in (tmp_path / "report" / "data" / f"run-{victim.name}.js").read_text()
+    assert opened.count("run.json") == 1
+
+
+def test_of_very_many_runs_few_have_a_page():
+    assert pages_for(MOST_PAGES, 10) == MOST_PAGES
+    assert pages_for(MOST_PAGES + 1, 10) == pages_for(100_000, 1000) == FEWER_PAGES
+    assert pages_for(100_000, 3000) == 3000 and pages_for(100_000, 90_000) == MOST_PAGES
+
+
+def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
+    store = fill(tmp_path / "results", sequences=["synthetic/walking_xyz"])
+    add_run(store, "dies", "synthetic/walking_xyz", status="crashed", reason="RuntimeError: no")
+    build_report(store, tmp_path / "whole")
+    monkeypatch.setattr(board_page, "MOST_LISTED", 3)
+    build_report(store, tmp_path / "short", most_pages=2)
+    whole, short = page_data(tmp_path / "whole", "board"), page_data(tmp_path / "short", "board")
+    assert len(whole["runs"]) == len(store.ids()) == len(short["runs"]) + short["unlisted"] and short["unlisted"] > 5
+    assert short["cells"] == whole["cells"] and whole["unlisted"] == 0
+    assert {(run[1], run[2]) for run in short["runs"]} == {(cell[0], cell[1]) for cell in whole["cells"]}
+
+
+def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
+    monkeypatch.setattr(tables, "MOST_ROWS", 3)
+    long = Table("long", "Long", "All of it.", [Column("x")], [[TableCell(str(at), value=at)] for at in range(5)])
+    assert len(long.displayed().rows) == 3 and to_csv(long).splitlines() == ["x", *"01234"]
+    assert "All of it. These are the first 3 of 5 rows; all stand in csv/long.csv." in to_markdown(long)
+
+
+def test_the_figure_of_masks_thins_many_points_and_keeps_the_best(tmp_path, monkeypatch):
+    board = make_board(load_runs([fill(tmp_path / "results", sequences=["s/a", "s/b"], seeds=range(4))], PROTOCOL).rows)
+    whole = figures.mask_figure(board)
+    monkeypatch.setattr(figures, "MOST_POINTS", 3)
+    thin = figures.mask_figure(board)
+    assert {len(trace.x) for trace in thin.data} <= {2, 3} and "more than 3 runs" in str(masks_section(board))
+    assert [min(trace.y) for trace in thin.data] == [min(trace.y) for trace in whole.data]
+
+
+def test_csv_of_every_kind_of_column():
+    frame = pd.DataFrame(
+        {
+            "number": pd.array([0.1, None, 1e-17], dtype="Float64"),
+            "whole": pd.array([1, None, 3], dtype="Int64"),
+            "flag": pd.array([True, None, False], dtype="boolean"),
+            "word": pd.array(["=1+1", None, "\x1b[31m"], dtype="string"),
+            "any": pd.Series([1, "-x", None], dtype=object),
+        }
+    )
+    assert csv_text(frame).splitlines() == [
+        "number,whole,flag,word,any",
+        "0.1,1,True,'=1+1,1",
+        ",,,,'-x",
+        "1e-17,3,False,\\x1b[31m,",
+    ]
+
+
+def test_rows_are_written_one_a_line_and_read_back(tmp_path):
+    rows = [row(run_id=digest([at], 16), reason="postgresql://me:secret@db/x") for at in range(3)]
+    for some in (rows, rows[:1], []):
+        ReportData(title="t", protocol="p", reference="r", version="1", rows=some).write(tmp_path / "report.json")
+        text = (tmp_path / "report.json").read_text()
+        read = ReportData.read(tmp_path / "report.json")
+        assert [each.run_id for each in read.rows] == [each.run_id for each in some]
+        assert "secret" not in text and len(text.splitlines()) == len(some) + 2
+
+
+HEAD = b"index,timestamp,state,frame_error_trans_m,dynamic_share\n"
+DAMAGE = {
+    "no text": b"\xff\xfe\x00\x01",
+    "words": HEAD + b"0,1000.0,ok,much,0.1\n",
+    "no stamp": HEAD + b"0,,ok,0.1,0.1\n",
+    "no index": HEAD + b",1000.0,ok,0.1,0.1\n",
+    "huge index": HEAD + b"9" * 40 + b",1000.0,ok,0.1,0.1\n",
+    "another heading": b"a,b\n1,2\n",
+    "heading alone": HEAD,
+    "too many cells": HEAD + b"0,1000.0,ok,0.1,0.1,7,8,9\n",
+    "null bytes": b"\x00" * 64,
+}
+
+
+def test_damaged_files_of_a_store_cost_only_their_own_figures_and_are_named(store, tmp_path):
+    sound = [add_run(store, name, "s/a", error=error, n=40) for name, error in (("a", 0.01), ("b", 0.02))]
+    hurt = {add_run(store, "a", "s/a", seed, n=40): damage for seed, damage in enumerate(DAMAGE, start=2)}
+    for run_id in sound:
+        add_frames(store.folder(run_id), 40)
+    for run_id, damage in hurt.items():
+        (store.folder(run_id) / "frames.csv").write_bytes(DAMAGE[damage])
+    for name, text in (("d" * 16, "{"), ("e" * 16, '{"schema_version": 99, "new": 1}')):
+        (store.runs / name).mkdir()
+        (store.runs / name / "run.json").write_text(text)
+    paths = build_report(store, tmp_path / "report")
+    pages = {run_id: page_data(paths.html.parent, f"run-{run_id}") for run_id in (*sound, *hurt)}
+    for run_id, damage in hurt.items():
+        assert any("frames.csv" in note for note in pages[run_id]["notes"]), damage
+        assert "t" not in pages[run_id]["series"] and "track_x" in pages[run_id]["series"], damage
+    assert all("t" in pages[run_id]["series"] for run_id in sound)
+    assert "2 folders without a valid record" in paths.html.read_text()
+    assert {"d" * 16, "e" * 16} <= set(re.findall(r"runs/(\w{16})", (paths.html.parent / "reproduce.html").read_text()))
+
+
+def test_a_tracker_that_always_crashes_is_not_called_repeatable():
+    rows = [row("good", s, 0.1 + 0.01 * seed, seed=seed) for s in "st" for seed in (0, 1)]
+    rows += [crashed("c", s, seed=seed) for s in "st" for seed in (0, 1)]
+    rows += [row("half", "s", 0.2), row("half", "s", 0.3, seed=1), row("half", "t", 0.2), crashed("half", "t", seed=1)]
+    board = make_board(rows)
+    assert {cells[0].text: cells[1].text for cells in repeatability(board).rows} == {"GOOD": "2", "HALF": "1"}
+
+
+def test_figures_show_millimetres():
+    figure = mask_figure(make_board([row("a", "s", 0.025, mask_iou=0.7), row("b", "s", 0.05, mask_iou=0.8)]))
+    assert figure.layout.yaxis.title.text == "ATE (mm)"
+    assert sorted(trace.y[0] for trace in figure.data) == [25, 50]
+
+
+def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
+    """What the masks show of a frame is known if any run saw the frame, not only the first one of the sequence."""
+    store = RunStore(tmp_path / "r")
+    for name, count in (("crashed", 30), ("whole", 60)):
+        add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
+    runs = sorted(load_runs([store], PROTOCOL).rows, key=lambda row: row.tracker.id)
+    assert [*exact_shares(runs)] == [*range(60)]
+
+
+def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
+    """Under a protocol of the final trajectory, coverage and success are those of what is scored."""
+    store = RunStore(tmp_path / "r")
+    for name, kept in (("whole", None), ("thin", [0, 1, 2, 3])):
+        add_run(store, name, "s/a", error=0.01, final_error=0.005, final_frames=kept)
+    protocol = PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
+    rows = {row.tracker.id: row for row in load_runs([store], protocol).rows}
+    assert (rows["whole"].coverage, rows["whole"].failed) == (1.0, False)
+    thin = rows["thin"]
+    assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
+    assert "the final trajectory has poses of 4 of" in thin.reason and thin.ending.startswith("lost, 4/")
+    assert {row.tracker.id: row.failed for row in load_runs([store], PROTOCOL).rows} == dict.fromkeys(rows, False)
+
+
+def test_what_was_lost_as_it_came_and_found_in_the_end_is_a_success_of_the_final_trajectory(tmp_path):
+    store, protocol = RunStore(tmp_path / "r"), PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
+    add_run(store, "found", "s/a", error=0.01, status="lost", final_error=0.005, final_whole=True)
+    add_run(store, "sparse", "s/a", error=0.01, kind="imported", lost=[at for at in range(120) if at % 5])
+    rows = {row.tracker.id: row for row in load_runs([store], protocol).rows}
+    assert (rows["found"].status, rows["found"].failed, rows["found"].coverage) == ("ok", False, 1.0)
+    rows = {row.tracker.id: row for row in load_runs([store], PROTOCOL).rows}
+    assert rows["found"].failed and rows["found"].status == "lost"
+    assert not rows["sparse"].failed, "a file of keyframes says what it covers, and that no more was asked for"
+
+
+@pytest.fixture(scope="module")
+def pattern(tmp_path_factory):
+    """A store with runs of every kind, and the rows of a first report."""
+    store = fill(tmp_path_factory.mktemp("rows") / "results", sequences=["s/a", "s/b"], seeds=(0, 1))
+    add_run(store, "orb-slam2", "s/a", 7, lost=range(5), status="lost", n=60)
+    add_run(store, "orb-slam2", "s/a", 8, status="stopped", n=60)
+    add_run(store, "elsewhere", "s/b", kind="imported", n=60, online=False, final_error=0.02)
+    add_run(store, "no-truth", "s/c", ground_truth=False, n=60)
+    loaded_from(store)
+    return store
+
+
+@pytest.fixture
+def known(pattern, tmp_path):
+    """A copy of it, and the rows of a first report on the copy."""
+    shutil.copytree(pattern.root, tmp_path / "results", symlinks=True)
+    copy = RunStore(tmp_path / "results")
+    loaded_from(copy)
+    return copy
+
+
+def loaded_from(store):
+    """What a report knows of a store."""
+    loaded = load_runs([store], PROTOCOL)
+    rows = {row.run_id: row.model_dump() for row in loaded.rows}
+    return rows, loaded.stopped, loaded.superseded, sorted(loaded.unreadable)
+
+
+def test_unchanged_runs_are_not_read_and_rows_are_equal(known, tmp_path, reads):
+    kept = loaded_from(known)
+    assert reads == [] and kept[1] == 1 and len(kept[0]) == len(known.ids()) - 1
+    known.root.rename(tmp_path / "moved")
+    moved = RunStore(tmp_path / "moved")
+    rows = load_runs([moved], PROTOCOL).rows
+    assert reads == [] and all(row.folder.is_dir() and row.estimate(row.trajectory) for row in rows)
+    moved.index.path.unlink()
+    assert loaded_from(moved) == kept and sorted(reads) == moved.ids()
+
+
+CHANGES = {
+    "edited": lambda store, run: store.rewrite(store.read_whole(run), coverage=0.5),
+    "damaged": lambda store, run: (store.folder(run) / "run.json").write_text("{"),
+    "tracked otherwise": lambda store, run: write_tum(
+        store.folder(run) / "trajectory_online.txt", store.trajectory(run).select(slice(9))
+    ),
+    "true otherwise": lambda store, run: write_tum(
+        store.root / "sequences" / store.read_whole(run).sequence.part / "groundtruth.txt", truth_of("another")
+    ),
+    "forgotten": lambda store, run: store.index.forget(run),
+    "removed": lambda store, run: store.remove(run),
+    "linked": lambda store, run: (store.folder(run) / "frames.csv").symlink_to(store.root.parent),
+    "added": lambda store, run: add_run(store, "new", "s/a", n=60),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_changed_shows_at_once(known, reads, change):
+    before = loaded_from(known)
+    CHANGES[change](known, next(run_id for run_id, row in before[0].items() if row["status"] == "lost"))
+    reads.clear()
+    after = loaded_from(known)
+    assert len(set(reads)) <= len(known.ids()) // 2
+    known.index.path.unlink()
+    assert after == loaded_from(known) and (after == before) == (change == "forgotten")
+
+
+@pytest.mark.parametrize("change", ["value = '{'", "value = x'ff'", "run_id = '0000000000000000'", "state = 'x'"])
+def test_rows_that_somebody_made_count_as_missing(known, reads, change):
+    before = loaded_from(known)
+    first, second, *_ = known.ids()
+    report = f"name = 'report {PROTOCOL.digest()}'"
+    with sqlite3.connect(known.index.path) as index:
+        index.execute(f"UPDATE computed SET {change} WHERE {report} AND run_id = ?", (first,))
+        other = f"(SELECT max(value) FROM computed WHERE {report})"
+        index.execute(f"UPDATE computed SET value = {other} WHERE {report} AND run_id = ?", (second,))
+    assert loaded_from(known) == before and first in reads
+
+
+def test_each_protocol_has_rows_of_its_own(known, reads):
+    other = {row.protocol_id for row in load_runs([known], get_protocol("evo-default")).rows}
+    assert reads and other == {"evo-default"}
+    reads.clear()
+    assert {row.protocol_id for row in load_runs([known], PROTOCOL).rows} == {"tum-rgbd/v1"} and reads == []
+
+
+def test_nothing_is_made_where_no_run_is(tmp_path):
+    with pytest.raises(ReportError):
+        load_runs([RunStore(tmp_path / "nowhere")], PROTOCOL)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def cli(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as ended:
+            start([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return ended.value.code or 0, captured.out, captured.err
+
+    return call
+
+
+def test_the_sequences_to_rank_on_are_a_switch(store, cli, tmp_path):
+    for name in ("s/a", "s/b"):
+        add_run(store, "orb-slam2", name)
+        add_run(store, "ours", name, error=0.02)
+    add_run(store, "ours", "s/c", error=0.02)
+    assert cli("report", "results", "-o", "common")[0] == 0
+    assert cli("report", "results", "-o", "all", "--on", "all")[0] == 0
+    common, everything = ((tmp_path / name / "report.md").read_text() for name in ("common", "all"))
+    assert "The ranking stands on the 2 of 3 sequences that all ranked trackers have." in common
+    assert "| 1–2 | 2/2 | orb-slam2 |" in common
+    assert "Not ranked, since they lack sequences: orb-slam2." in everything
+    assert "| – lacks sequences | 2/2 | orb-slam2 |" in everything
+    assert "--on all" in (tmp_path / "all" / "reproduce.html").read_text()
+    code, _, error = cli("report", "results", "--on", "some")
+    assert (code, error) == (1, "error: --on is 'common' or 'all', got 'some'\n")
+
+
+def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
+    trial = {"error": 0.001, "overrides": {"features": 500}, "study": "mine"}
+    store, only = RunStore(tmp_path / "r"), RunStore(tmp_path / "only")
+    add_run(store, "orb-slam2", "s/a", study="mine")
+    for some in (store, only):
+        add_run(some, "orb-slam2", "s/a", **trial)
+    with pytest.raises(ReportError, match="--trials"):
+        build_report(only, tmp_path / "none")
+    for trials in (False, True):
+        paths = build_report(store, tmp_path / str(trials), trials=trials)
+        text, page = paths.markdown.read_text(), (paths.html.parent / "reproduce.html").read_text()
+        assert paths.trials == (not trials) and ("Left out: 1 runs that studies made" in text) == (not trials)
+        commands = page.split("The commands that")[1]
+        shown = "features=500" in text, "--trials" in commands, "trial of the study &#39;mine&#39;" in page
+        assert shown == (trials,) * 3
+
+
+def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
+    for place, value in (("a", 1), ("b", 2)):
+        add_run(RunStore(tmp_path / place), "ours", "s/a", overrides={"x": value})
+    code, out, _ = cli("report", "compare", "a", "b", "--json")
+    found = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
+    assert code == 0 and list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
+    assert [interval["low"] for interval in found["overall"].values()] == [None]
+    assert "B better on" in cli("report", "compare", "a", "b")[1]

@@ -4,14 +4,28 @@ import json
 
 import numpy as np
 import pytest
+import scikit_posthocs as posthocs
+from rank_groups import simulate
 from reports_fake_store import MACHINE, add_run
 from reports_rows import PROTOCOL, crashed, row
+from scipy import stats
 
 from dynslam_bench.cli.output import report_table
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import MONOCULAR, get_protocol
-from dynslam_bench.reports.model.board import category_boards, make_board
+from dynslam_bench.reports.html.board_page import ratios_content
+from dynslam_bench.reports.model.board import OVERALL, category_boards, compare_pairs, make_board
 from dynslam_bench.reports.model.load import load_runs
+from dynslam_bench.reports.model.statistics import (
+    holm,
+    mean_rank_test,
+    ratio_interval,
+    separable,
+    standings,
+    verdicts_against,
+)
+from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
+from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.leaderboard import false_motion, leaderboard, per_sequence, time_table
 from dynslam_bench.runs import RunStore
 
@@ -125,3 +139,246 @@ def test_a_protocol_without_scale_leaves_monocular_runs_out_and_counts_them(tmp_
     assert all(row.metrics["ate_rmse_m"] > 0 for row in scaled.rows)
     with pytest.raises(ReportError, match=f"--protocol {MONOCULAR}"):
         load_runs([mixed(tmp_path / "alone", ("orb-slam2-mono",))], get_protocol("tum-rgbd/v1"))
+
+
+def rows_of_truth(sizes, sequences, spread=0.05, seed=0):
+    """Runs of trackers whose errors are `sizes` of the category times a common hardness; `orb-slam2` has 1."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for category, number in sequences.items():
+        for i in range(number):
+            hardness = rng.uniform(0.02, 0.06)
+            for tracker, by_category in ({"orb-slam2": dict.fromkeys(sequences, 1.0)} | sizes).items():
+                error = hardness * by_category[category] * np.exp(rng.normal(0, spread))
+                tags = [category, *(["fast"] if i == 0 else [])]
+                name = f"synthetic/{category}?scene={i}"
+                rows.append(row(tracker, name, error, tags=tags, static_camera_ate_rmse_m=1.0))
+    return rows
+
+
+SIZES = {
+    "masks": {"high-dynamic": 0.2, "low-dynamic": 1.0},
+    "flow": {"high-dynamic": 0.2, "low-dynamic": 0.9},
+    "bad": {"high-dynamic": 3.0, "low-dynamic": 3.0},
+}
+
+
+def test_every_category_has_a_board_and_the_overall_one_is_a_mean_over_what_moves():
+    board = make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6}))
+    boards = category_boards(board)
+    assert {name: len(part.common) for name, part in boards.items()} == {
+        OVERALL: 18, "low dynamic": 6, "high dynamic": 12, "fast": 2,
+    }  # fmt: skip
+    ratio = {name: {s.key.split("|")[0]: s.ratio.value for s in part.standings} for name, part in boards.items()}
+    assert ratio["high dynamic"]["masks"] == pytest.approx(0.2, rel=0.05)
+    assert ratio["low dynamic"]["masks"] == pytest.approx(1.0, rel=0.05)
+    both = ratio["high dynamic"]["masks"] * ratio["low dynamic"]["masks"]
+    assert ratio[OVERALL]["masks"] == pytest.approx(np.sqrt(both)), "not the mean over 18 sequences"
+
+
+def test_verdicts_are_those_of_the_category():
+    boards = category_boards(make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6})))
+    verdicts = {name: {s.key.split("|")[0]: s.verdict for s in part.standings} for name, part in boards.items()}
+    assert verdicts["high dynamic"] == {
+        "masks": "better", "flow": "better", "orb-slam2": "reference", "bad": "worse",
+    }  # fmt: skip
+    assert verdicts["low dynamic"]["masks"] == "cannot tell"
+    assert set(verdicts["fast"].values()) == {"cannot tell", "reference"}, "two sequences"
+    table = tables.category_table(boards)
+    assert [column.name for column in table.columns] == ["tracker", OVERALL, "low dynamic", "high dynamic", "fast"]
+
+
+def test_the_headline_names_the_best_and_whether_they_can_be_told_apart():
+    boards = category_boards(make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6})))
+    said = headline(boards["high dynamic"])
+    assert said.startswith("On 12 high dynamic sequences ") and "ORB-SLAM2's error by" in said
+    assert "MASKS" in said and "FLOW" in said and said.endswith("these cannot be told apart.")
+    assert "below 5 sequences" in headline(boards["fast"])
+    alone = make_board(rows_of_truth({"bad": SIZES["bad"]}, {"high-dynamic": 12}))
+    assert (
+        headline(alone) == "On 12 high dynamic sequences no tracker is shown to be better than ORB-SLAM2; 1 is worse."
+    )
+    assert "not as evidence" in explanation(boards["fast"])
+    assert "2 are better, 1 is worse" in explanation(boards["high dynamic"])
+
+
+def test_all_pairs_stand_in_a_matrix():
+    board = make_board(rows_of_truth(SIZES, {"high-dynamic": 12}))
+    pairs = compare_pairs(board, board.ranked)
+    assert len(pairs) == 6
+    apart = {frozenset((board.labels[p.one], board.labels[p.other])): p.verdict != "cannot tell" for p in pairs}
+    assert not apart[frozenset({"MASKS", "FLOW"})] and sum(apart.values()) == 5
+    table = tables.pair_table(board)
+    assert [len(cells) for cells in table.rows] == [5] * 4
+    assert "critical" not in mean_rank_note(board) and "Nemenyi" in mean_rank_note(board)
+    assert tables.pair_table(make_board(rows_of_truth(SIZES, {"high-dynamic": 4}))) is None
+
+
+def test_two_trackers_side_by_side_have_the_numbers_of_the_board():
+    board = make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6}))
+    keys = [*board.trackers, *board.final_only]
+    assert len(set(board.weights.values())) == 2, "the categories have unequal sizes"
+    reference, shown = keys.index(board.reference), ratios_content(board)
+    assert len(shown) == len(keys) * (len(keys) - 1) // 2
+    for standing in board.standings:
+        place = keys.index(standing.key)
+        for a, b, *ratio, sequences, verdict in shown:
+            if {a, b} == {place, reference}:
+                value, low, high = ratio if a == reference else (1 / ratio[0], 1 / ratio[2], 1 / ratio[1])
+                expected = standing.ratio
+                assert (value, low, high) == pytest.approx((expected.value, expected.low, expected.high), rel=1e-3)
+                turned = {"better": "worse", "worse": "better"}.get(verdict, verdict)
+                assert standing.verdict == (verdict if a == reference else turned) and sequences == 18
+
+
+def test_exact_masks_are_a_bound_and_never_rank_beside_others():
+    rows = rows_of_truth(SIZES, {"high-dynamic": 12})
+    bound_info = dict(variant={"segmentation.source": "oracle"}, tags=["high-dynamic"], segmentation="oracle")
+    plain = [other for other in rows if other.tracker.id == "orb-slam2"]
+    exact = [row("masks", other.sequence.id, 0.1 * other.score_m, **bound_info) for other in plain]
+    board = make_board([*rows, *exact])
+    ratios = {s.key: s.ratio.value for s in board.standings}
+    bound = next(key for key in board.labels if "oracle" in key)
+    assert bound not in board.ranked and len(board.ranked) == 4 and ratios[bound] == pytest.approx(0.1)
+    assert make_board(exact).ranked == [bound], "alone they rank"
+
+
+def cells(rng, trackers, sequences=6, runs=4, spread=0.1):
+    hardness = rng.uniform(0.01, 0.5, sequences)
+    return {
+        name: {f"s{i}": list(hardness[i] * size * np.exp(rng.normal(0, spread, runs))) for i in range(sequences)}
+        for name, size in trackers.items()
+    }
+
+
+def test_ratio_is_the_geometric_mean_of_medians():
+    data = cells(np.random.default_rng(0), {"a": 0.5, "ref": 1.0})
+    (a, ref) = standings(data, data["ref"], ["a", "ref"])
+    expected = stats.gmean([np.median(data["a"][s]) / np.median(data["ref"][s]) for s in data["a"]])
+    assert a.key == "a"
+    assert a.ratio.value == pytest.approx(expected)
+    assert a.ratio.low < a.ratio.value < a.ratio.high
+    assert (ref.ratio.value, ref.ratio.low, ref.ratio.high) == (1, 1, 1)
+    assert (a.rank, ref.rank) == (1, 2)
+    assert (a.wins, ref.wins) == (6, 0)
+    assert (a.verdict, ref.verdict) == ("better", "cannot tell")
+
+
+def test_the_interval_of_a_ratio_is_students():
+    values = np.random.default_rng(1).normal(-0.3, 0.5, 12)
+    found = ratio_interval(np.append(values, np.nan))
+    low, high = np.exp(stats.ttest_1samp(values, 0).confidence_interval(0.95))
+    assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
+    few = ratio_interval(values[:4])
+    assert few.value == pytest.approx(np.exp(values[:4].mean())) and np.isnan([few.low, few.high]).all()
+
+
+def test_ranks_groups_and_mean_ranks():
+    data = cells(np.random.default_rng(2), {"best": 0.1, "middle": 0.5, "worst": 5.0}, spread=0.01)
+    places = [(s.key, s.group, s.mean_rank) for s in standings(data, data["middle"], ["worst", "middle", "best"])]
+    assert places == [("best", (1, 1), 1.0), ("middle", (2, 2), 2.0), ("worst", (3, 3), 3.0)]
+
+
+def test_below_five_sequences_there_is_one_group_and_from_five_on_clear_differences_show():
+    rng = np.random.default_rng(3)
+    for sequences, groups in ((4, [(1, 2), (1, 2)]), (5, [(1, 1), (2, 2)])):
+        data = cells(rng, {"a": 0.1, "b": 1.0}, sequences=sequences)
+        assert [s.group for s in standings(data, data["b"], ["a", "b"])] == groups
+
+
+def test_a_difference_that_one_sequence_decides_is_none():
+    data = {"a": {f"s{i}": [0.1] for i in range(6)}, "b": {f"s{i}": [0.1] for i in range(5)} | {"s5": [3.0]}}
+    assert [s.group for s in standings(data, data["b"], ["a", "b"])] == [(1, 2), (1, 2)]
+
+
+def test_pairs_are_tested_as_scipy_does_and_corrected_together():
+    rng = np.random.default_rng(4)
+    logs = {"a": rng.normal(0, 0.2, 7), "b": rng.normal(0.35, 0.2, 7), "c": rng.normal(2, 0.2, 7)}
+    found = separable(logs, np.ones(7))
+    p = holm([stats.ttest_rel(logs[a], logs[b]).pvalue for a, b in found])
+    assert [p_value for _, p_value in found.values()] == pytest.approx(p)
+    assert [apart for apart, _ in found.values()] == [*(p <= 0.04)] and found["a", "c"][0]
+
+
+def test_equal_trackers_share_their_rank():
+    one = cells(np.random.default_rng(3), {"a": 1.0})["a"]
+    found = standings({"a": one, "b": dict(one)}, one, ["a", "b"])
+    assert [(s.rank, s.group, s.mean_rank) for s in found] == [(1, (1, 2), 1.5)] * 2
+
+
+def test_unranked_and_incomplete_trackers_come_last_and_take_no_rank():
+    data = cells(np.random.default_rng(4), {"a": 0.5, "ref": 1.0, "oracle": 0.01})
+    data["partial"] = {"s0": data["a"]["s0"]}
+    found = standings(data, data["ref"], ["a", "ref"])
+    assert [s.key for s in found] == ["a", "ref", "oracle", "partial"]
+    assert [s.rank is None for s in found] == [False, False, True, True]
+    assert found[3].sequences == 1 and found[3].ratio.value == pytest.approx(
+        np.median(data["a"]["s0"]) / np.median(data["ref"]["s0"])
+    )
+
+
+def test_an_error_of_zero_has_a_ratio():
+    data = {"exact": {"s0": [0.0]}, "ref": {"s0": [0.01]}}
+    found = standings(data, data["ref"], ["exact", "ref"])
+    assert found[0].key == "exact"
+    assert found[0].ratio.value == pytest.approx(1e-4)
+
+
+def test_who_is_better_than_the_reference_is_tested_as_scipy_does_and_corrected_over_the_trackers():
+    rng = np.random.default_rng(7)
+    base = rng.normal(0, 1, 9)
+    logs = {f"t{i}": base + rng.normal(shift, 0.2, 9) for i, shift in enumerate((-1.0, 0.02, 0.0, 1.0))}
+    found = verdicts_against(logs | {"ref": base}, base, np.ones(9))
+    expected = holm([stats.ttest_rel(log, base).pvalue for log in logs.values()])
+    assert [found[key][1] for key in logs] == pytest.approx(expected)
+    assert [found[key][0] for key in logs] == ["better", "cannot tell", "cannot tell", "worse"]
+    assert found["ref"] == ("cannot tell", None)
+
+
+def test_weights_make_categories_count_alike_and_one_sequence_of_many_weights_is_no_evidence():
+    logs = np.concatenate([np.full(2, -1.0), np.full(20, 1.0)]) + np.random.default_rng(8).normal(0, 0.01, 22)
+    weights = np.concatenate([np.full(2, 1 / 2), np.full(20, 1 / 20)])
+    found = ratio_interval(logs, weights)
+    assert found.value == pytest.approx(np.exp((logs[:2].mean() + logs[2:].mean()) / 2))
+    assert found.low < 0.4 and found.high > 2.5, "two sequences carry half of the weight"
+    equal = ratio_interval(logs, np.full(22, 0.25))
+    assert (equal.low, equal.high) == pytest.approx(np.exp(stats.ttest_1samp(logs, 0).confidence_interval(0.95)))
+
+
+def test_the_critical_difference_is_demsars_and_the_ranks_are_those_of_friedmans_test():
+    rng = np.random.default_rng(9)
+    logs = {name: rng.normal(shift, 0.3, 12) for name, shift in (("a", 0.0), ("b", 1.0), ("c", 2.0), ("d", 3.0))}
+    found = mean_rank_test(logs)
+    assert list(found.ranks) == ["a", "b", "c", "d"] and sum(found.ranks.values()) == 10
+    assert found.p_value == pytest.approx(stats.friedmanchisquare(*logs.values()).pvalue)
+    assert found.critical_difference == pytest.approx(2.569 * np.sqrt(4 * 5 / (6 * 12)), rel=1e-3)  # his table 5
+    assert mean_rank_test({"a": logs["a"], "b": logs["b"]}) is None
+
+
+def test_nemenyis_differences_are_those_of_scikit_posthocs():
+    rng = np.random.default_rng(10)
+    logs = {str(i): rng.normal(0.4 * i, 0.5, 10) for i in range(6)}
+    found = mean_rank_test(logs)
+    p = posthocs.posthoc_nemenyi_friedman(np.stack(list(logs.values()), axis=1)).to_numpy()
+    ranks = np.array([found.ranks[str(i)] for i in range(6)])
+    apart = np.abs(ranks[:, None] - ranks) > found.critical_difference
+    assert (apart == (p < 0.05)).all() and apart.any() and not apart.all()
+
+
+@pytest.mark.parametrize(
+    ("p_values", "corrected"),
+    [
+        ([0.01, 0.04, 0.03], [0.03, 0.06, 0.06]),
+        ([0.6, 0.7], [1, 1]),
+        ([], []),
+    ],
+)
+def test_holm(p_values, corrected):
+    assert holm(p_values) == pytest.approx(corrected)
+
+
+@pytest.mark.parametrize("shape", ["normal", "heavy tails", "unequal spread", "skewed"])
+@pytest.mark.parametrize("sequences", [3, 5, 8, 20])
+def test_claims_of_simulated_boards_are_right(shape, sequences):
+    right, _ = simulate(shape, np.sort(np.random.default_rng(0).normal(0, 0.25, 5)), sequences, 200)
+    assert right.min() >= 0.95

@@ -1,19 +1,28 @@
 """What a glance at the report says is true: on uneven, failing, repeated, cached and confusable results."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 from reports_fake_store import add_frames, add_run
 from reports_rows import PROTOCOL, cell_of, crashed, page_data, row, rows_of
 
-from dynslam_bench.reports import build_report, load_frame
+from dynslam_bench.reports import build_report, compare, load_board, load_frame
 from dynslam_bench.reports.html.run_pages import RunPage, error_by_share, share_sums
-from dynslam_bench.reports.model.board import make_board, missing_commands, missing_note
+from dynslam_bench.reports.model.board import Board, make_board, missing_commands, missing_note
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.reports.model.published import is_excerpt
+from dynslam_bench.reports.model.names import make_labels, name_columns, shortened
+from dynslam_bench.reports.model.published import is_excerpt, least_length_s
+from dynslam_bench.reports.model.row import command_line, run_command
 from dynslam_bench.reports.tables.leaderboard import leaderboard, per_sequence, relative_errors
-from dynslam_bench.reports.tables.table import mm, percent
+from dynslam_bench.reports.tables.table import mm, percent, to_markdown
+from dynslam_bench.runs.record import IDENTITY_SCHEME
 from dynslam_bench.runs.store import RunStore
+from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
+from dynslam_bench.trackers import TRACKERS
 
 # -- what ranks
 
@@ -314,3 +323,283 @@ def test_what_is_no_better_than_not_moving_is_named():
     )
     assert [(cell.emphasis, cell.shade) for cell in cells] == [("", 0.0)] * 2, "neither bold nor blue"
     assert not any("no better" in text for name in ("GOOD", "CONTROL", "FLAKY") for text in small[name])
+
+
+def test_recordings_that_share_a_folders_name_keep_their_columns(store, tmp_path):
+    for place, error in (("/data/chess/seq-01", 0.01), ("/data/fire/seq-01", 0.2)):
+        for tracker in ("a", "b"):
+            add_run(store, tracker, "folder/seq-01", error=error, content=place, block=place[6:11], place=place)
+    paths = build_report(store, tmp_path / "report")
+    table = {r["tracker"]: r for r in rows_of(paths.csv["per_sequence"])}
+    assert float(table["a"]["chess/seq-01"]) < 0.05 < float(table["a"]["fire/seq-01"])
+    assert len(rows_of(paths.csv["runs"])) == 4
+    assert "Left out" not in paths.markdown.read_text()
+    found = compare(store, store)
+    assert {cells[1].text for cells in found.table.rows} == {"chess/seq-01", "fire/seq-01", "all 2 sequences"}
+
+
+def test_columns_of_two_cameras_are_named_by_them(store):
+    right = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
+    add_run(store, "a", "folder/s", camera=right, block="right")
+    add_run(store, "b", "folder/s", camera=right | {"fx": 400.0}, block="wrong")
+    board = make_board(load_runs([store], PROTOCOL).rows)
+    assert board.sequences == ["folder/s (camera 640x480, f 400 525)", "folder/s (camera 640x480, f 525 525)"]
+
+
+def test_the_same_frames_are_one_column_in_every_spelling(store):
+    add_run(store, "a", "synthetic/walking_xyz?frames=60", block="b1")
+    add_run(store, "b", "synthetic/walking_xyz", frames=(0, 60), block="b1")
+    add_run(store, "b", "synthetic/walking_xyz?noise=3", frames=(0, 60), block="b1", noise=3)
+    board = make_board(load_runs([store], PROTOCOL).rows)
+    assert board.sequences == ["synthetic/walking_xyz [0:60]"]
+    assert [len(cells[board.sequences[0]].rows) for _, cells in sorted(board.cells.items())] == [1, 2]
+
+
+def test_names_of_columns_are_never_alike():
+    same = dict(sequence="folder/x", content="c" * 12)
+    rows = [row(**same, block="b1"), row(**same, block="b2"), row(sequence="folder/x", content="d" * 12, block="b3")]
+    names = name_columns(rows)
+    assert len(set(names.values())) == 3
+    assert all(name.startswith("folder/x (") for name in names.values())
+    deep = [row(sequence="folder/x", block=str(i), place=p, frames=(0, 9)) for i, p in enumerate(["/a/1/x", "/b/1/x"])]
+    assert list(name_columns(deep).values()) == ["a/1/x [0:9]", "b/1/x [0:9]"]
+
+
+def test_sequences_are_grouped_from_static_to_dynamic():
+    tags = {"z": ["static"], "b": ["high-dynamic"], "a": ["low-dynamic"], "c": ["high-dynamic"], "d": []}
+    board = make_board([row(sequence=name, tags=names) for name, names in tags.items()])
+    groups = [(name, board.groups[name]) for name in board.sequences]
+    dynamic = [("a", "low dynamic"), ("b", "high dynamic"), ("c", "high dynamic")]
+    assert groups == [("z", "static"), *dynamic, ("d", "other")]
+
+
+@pytest.mark.parametrize(
+    ("names", "short"),
+    [
+        (
+            ["synthetic/walking_xyz?scene=0&frames=60", "synthetic/sitting_xyz?scene=0&frames=60"],
+            "walking_xyz sitting_xyz",
+        ),
+        (["synthetic/walking_xyz?scene=0&frames=60", "synthetic/a?scene=1"], "walking_xyz?scene=0&frames=60 a?scene=1"),
+        (["synthetic/a?scene=100&frames=60", "synthetic/a?scene=101&frames=60"], "a?scene=100 a?scene=101"),
+        (["tum/fr3/a", "tum/fr1/a", "bonn/a"], "tum/fr3/a tum/fr1/a bonn/a"),
+        (["tum/fr3/a [0:9]", "tum/fr3/b [0:9]"], "a [0:9] b [0:9]"),
+        (["tum/fr3/a"], "tum/fr3/a"),
+    ],
+)
+def test_names_lose_what_all_share(names, short):
+    assert list(shortened(names)) == names and " ".join(shortened(names).values()) == short
+
+
+def test_what_one_tracker_alone_was_asked_for_is_named_and_spelled_as_in_toml(store):
+    given = "/home/me/mine.py:SPEC"
+    for name, value in (("s/a", "True"), ("s/b", True)):
+        add_run(store, "mine", name, overrides={"loop": value}, settings={"loop": True}, given=given)
+    for tracker, name in (("a", "s/a"), ("a", "s/c"), ("b", "s/a")):
+        add_run(store, tracker, name, overrides={"masks": "oracle"})
+    rows = load_runs([store], PROTOCOL).rows
+    assert sorted(make_board(rows).labels.values()) == ["a", "b", "mine · loop=true"]
+    (mine,) = (each for each in rows if (each.tracker.id, each.sequence.id) == ("mine", "s/a"))
+    assert run_command(mine) == f"dynslam-bench run {given} s/a --set loop=true"
+    assert f"dynslam-bench run {given} s/c --set loop=true" in missing_commands(make_board(rows))
+
+
+def test_commands_name_the_camera_of_a_folder_and_no_results_folder_of_one_machine(store):
+    asked = ("dynslam-bench", "run", "ours", "mine", "--camera", "bonn", "--results", "/home/me/results")
+    add_run(store, "ours", "folder/mine", place="/home/me/mine", command=asked)
+    add_run(store, "mine", "s/a", command=asked)
+    rows = {row.tracker.id: row for row in load_runs([store], PROTOCOL).rows}
+    assert run_command(rows["ours"]) == "dynslam-bench run ours /home/me/mine --camera bonn"
+    assert "--camera" not in run_command(rows["mine"]), "a sequence with an id says its camera"
+    assert command_line(list(asked)) == "dynslam-bench run ours mine --camera bonn --results RESULTS"
+
+
+@pytest.mark.parametrize(
+    ("sources", "named"),
+    [
+        (
+            ("onnx:/home/me/nets/yolov8n-seg.onnx", "recorded:/data/masks/", "none"),
+            ("none", "onnx:yolov8n-seg", "recorded:masks"),
+        ),
+        (("onnx:/a/best.onnx", "onnx:/b/best.onnx"), ("onnx:/a/best.onnx", "onnx:/b/best.onnx")),
+    ],
+)
+def test_labels_name_files_without_their_folders_unless_two_would_be_alike(sources, named):
+    rows = [row(tracker="mask-rcnn", variant={"segmentation.source": source}) for source in sources]
+    assert sorted(make_labels(rows).values()) == [f"MASK-RCNN · segmentation.source={name}" for name in named]
+
+
+SEQUENCES = ("synthetic/walking_xyz", "synthetic/walking_static")
+
+
+def made_by(**parts: object) -> dict[str, object]:
+    return {"scheme": IDENTITY_SCHEME, **parts}
+
+
+def sequences_by_row(board: Board, tracker: str) -> dict[str, list[str]]:
+    """The sequences that each row of a tracker has runs on, by the row's name."""
+    keys = [key for key in board.labels if board.first(key).tracker.id == tracker]
+    return {board.labels[key]: sorted(board.cells[key]) for key in keys}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "name"),
+    [
+        ({"source": "1"}, {"source": "2"}, "code"),
+        ({"tracker_version": "1"}, {"tracker_version": "2"}, "code"),
+        ({"files": "1"}, {"files": "2"}, "code"),
+        ({"libraries": {"torch": "2.1"}}, {"libraries": {"torch": "2.2"}}, "torch"),
+        ({"weights": {"coco": "aaaa"}}, {"weights": {"coco": "bbbb"}}, "weights of coco"),
+    ],
+)
+def test_runs_of_two_programs_are_two_rows_and_the_older_is_not_ranked(
+    store: RunStore, before: dict[str, object], after: dict[str, object], name: str
+) -> None:
+    for sequence in SEQUENCES:
+        add_run(store, "orb-slam2", sequence, error=0.02)
+    add_run(store, "mine", SEQUENCES[0], error=0.01, identity=made_by(**before), started="2026-01-01T00:00:00+00:00")
+    add_run(store, "mine", SEQUENCES[1], error=0.50, identity=made_by(**after), started="2026-01-02T00:00:00+00:00")
+    board = load_board(store)
+    rows = sequences_by_row(board, "mine")
+    assert len(rows) == 2 and all(len(sequences) == 1 and f" {name} " in label for label, sequences in rows.items())
+    newer = {board.first(key).started[:10] for key in board.ranked if board.first(key).tracker.id == "mine"}
+    older = [board.first(key).is_current for key, label in board.labels.items() if label in rows]
+    assert newer <= {"2026-01-02"} and sorted(older) == [False, True]
+
+
+def test_a_program_that_ran_everything_again_supersedes_the_older_one(store: RunStore) -> None:
+    for day, source in enumerate("12", start=1):
+        for sequence in SEQUENCES:
+            started = f"2026-01-0{day}T00:00:00+00:00"
+            add_run(store, "mine", sequence, identity=made_by(source=source), started=started)
+    loaded = load_runs([store], PROTOCOL)
+    assert loaded.superseded == 2 and {row.started[:10] for row in loaded.rows} == {"2026-01-02"}
+    assert list(sequences_by_row(load_board(store), "mine")) == ["mine"]
+
+
+def test_masks_of_two_networks_on_two_kinds_of_sequences_are_one_row(store: RunStore) -> None:
+    add_run(store, "mine", SEQUENCES[0], identity=made_by(weights={"embedded": "aaaa"}))
+    add_run(store, "mine", "bonn/crowd", identity=made_by(weights={"coco": "bbbb"}))
+    assert list(sequences_by_row(load_board(store), "mine")) == ["mine"]
+
+
+@pytest.mark.parametrize(
+    ("made", "label"), [({"identity": {}}, "orb-slam2 · identity unverified"), ({"kind": "imported"}, "orb-slam2")]
+)
+def test_a_run_of_an_older_identity_scheme_and_an_import_are_never_the_reference(
+    store: RunStore, made: dict[str, object], label: str
+) -> None:
+    add_run(store, "orb-slam2", SEQUENCES[0], **made)
+    add_run(store, "mine", SEQUENCES[0])
+    board = load_board(store)
+    assert list(sequences_by_row(board, "orb-slam2")) == [label] and board.reference is None
+
+
+def test_a_verified_program_stays_ranked_beside_newer_runs_that_are_not_verified(store: RunStore) -> None:
+    add_run(store, "mine", SEQUENCES[0], identity=made_by(source="1"), started="2026-01-01T00:00:00+00:00")
+    add_run(store, "mine", SEQUENCES[1], identity={}, started="2026-01-02T00:00:00+00:00")
+    rows = load_runs([store], PROTOCOL).rows
+    assert {row.started[:10]: row.is_current for row in rows} == {"2026-01-01": True, "2026-01-02": False}
+
+
+def test_two_results_under_one_id_are_said_on_the_page(tmp_path: Path) -> None:
+    stores = [RunStore(tmp_path / name) for name in "ab"]
+    for store, error in zip(stores, (0.01, 0.3), strict=True):
+        add_run(store, "mine", SEQUENCES[0], error=error, run_id="0123456789abcdef")
+    loaded = load_runs(stores, PROTOCOL)
+    assert len(loaded.conflicts) == 1 and "0123456789abcdef" in loaded.conflicts[0]
+    page = build_report([store.root for store in stores], tmp_path / "report").html.read_text()
+    assert "0123456789abcdef" in page and "must be equal" in page
+    assert load_runs(stores[:1], PROTOCOL).conflicts == []
+
+
+OLD, NEW = "synthetic/walking_xyz?scene=3", "synthetic/walking_xyz?scene=103"
+
+
+@pytest.fixture
+def seen(tmp_path):
+    """Four trackers, two with the network's masks, on a scene of the training set and on a held-out one."""
+    store = RunStore(tmp_path / "results")
+    for sequence in (OLD, NEW):
+        add_run(store, "orb-slam2", sequence, error=0.05)
+        add_run(store, "mask-rcnn", sequence, error=0.01, masks="embedded")
+        add_run(store, "dynaslam", sequence, error=0.03, masks="embedded")
+        add_run(store, "ds-slam", sequence, error=0.02, masks="yolo")
+    return store
+
+
+@pytest.mark.parametrize(
+    ("source", "sequence", "seen"),
+    [
+        ("embedded", "synthetic/walking_xyz", True),
+        ("embedded", "synthetic/sitting_rpy?scene=99&frames=50&noise=4", True),
+        ("embedded", "synthetic/sitting_rpy?scene=100&frames=50", False),
+        ("embedded", "synthetic/somebody_elses", False),
+        ("embedded", "tum/fr3/walking_xyz", False),
+        ("oracle", "synthetic/walking_xyz", False),
+        ("", "synthetic/walking_xyz", False),
+    ],
+)
+def test_what_the_embedded_network_was_trained_on(source, sequence, seen):
+    assert seen_in_training(source, sequence) is seen
+
+
+def test_such_cells_do_not_rank_unless_asked_for(seen):
+    board = load_board(seen)
+    names = {board.first(key).tracker.id: key for key in board.labels}
+    assert board.common == [NEW] and set(board.ranked) == set(names.values())
+    everything = load_board(seen, rank_seen=True)
+    assert set(everything.common) == {OLD, NEW} and len(everything.ranked) == 4
+
+
+def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ranked(tmp_path):
+    store = RunStore(tmp_path / "results")
+    for tracker, masks in (("orb-slam2", ""), ("ds-slam", "yolo"), ("mask-rcnn", "embedded")):
+        add_run(store, tracker, OLD, masks=masks, error=0.001 if masks == "embedded" else 0.03)
+    board = load_board(store)
+    assert {board.first(key).tracker.id for key in board.ranked} == {"orb-slam2", "ds-slam"}
+    assert {board.first(key).tracker.id for key in board.trackers} == {"orb-slam2", "ds-slam", "mask-rcnn"}, "but shown"
+    assert len(load_board(store, rank_seen=True).ranked) == 3
+
+
+@pytest.mark.parametrize("rank_seen", [False, True])
+def test_every_format_carries_the_mark(seen, tmp_path, rank_seen):
+    paths = build_report(seen, tmp_path / "report", rank_seen=rank_seen)
+    markdown, latex = paths.markdown.read_text(), paths.latex.read_text()
+    page = "".join((paths.html.parent / f"{name}.html").read_text() for name in ("index", "errors", "reproduce"))
+    rule = "rank, since that was asked for" if rank_seen else "do not rank"
+    assert "trained on this very scene (the embedded one, on rendered scenes 0-99)" in markdown and rule in markdown
+    table = markdown.split("## Absolute trajectory")[1].split("\n## ")[0]
+    (line,) = [line for line in table.splitlines() if line.startswith("| mask-rcnn §")]
+    held_out, trained, where = [cell.strip() for cell in line.split("|")[2:-1]]
+    assert "§" not in held_out and "**" in held_out and "§" in trained and ("**" in trained) is rank_seen
+    assert where == "walking\\_xyz?scene=3"
+    assert page.count("mask-rcnn §") > 3 and "mask-rcnn \\S{}" in latex and "§" not in latex
+    errors = pd.read_csv(paths.csv["per_sequence"])
+    assert errors.set_index("tracker")["§ trained on"]["mask-rcnn §"] == "walking_xyz?scene=3"
+    runs = pd.read_csv(paths.csv["runs"])
+    marked = runs[runs["seen_in_training"]]
+    assert set(zip(marked["tracker"], marked["sequence"], strict=True)) == {("mask-rcnn", OLD), ("dynaslam", OLD)}
+    assert ("--rank-seen" in markdown + page) is rank_seen
+    assert "§" in to_markdown(compare(seen, seen).table)
+
+
+def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_path):
+    store = RunStore(tmp_path / "r")
+    for name in ("bonn/balloon", "tum/fr3/walking_rpy"):
+        add_run(store, "orb-slam2", name, block=name, duration_s=30.6)
+    markdown = build_report(store, tmp_path / "report").markdown.read_text()
+    assert "Published numbers stand beside bonn/balloon, whose full length is not known here" in markdown
+    assert least_length_s("bonn/balloon") is None and not is_excerpt("bonn/balloon", 1.0), "no source, no claim"
+
+
+def test_what_was_put_together_here_is_called_no_system_of_ours(tmp_path):
+    """The back end in the manner of ORB-SLAM2 and masks by Mask R-CNN are others' systems in our composition."""
+    store = RunStore(tmp_path / "results")
+    for tracker in ("orb-slam2", "mask-rcnn", "emfoa-oft"):
+        assert TRACKERS.get(tracker).provenance == "own"
+        add_run(store, tracker, NEW, provenance="own")
+    table = pd.read_csv(build_report(store, tmp_path / "report").csv["leaderboard"])
+    assert table["provenance"].tolist() == ["our composition"] * 3
+    meaning = "put together in this project: no one paper or program describes the whole"
+    assert (tmp_path / "report" / "index.html").read_text().count(meaning) == 3

@@ -66,20 +66,14 @@ def test_every_bad_end_is_one_line(attack, mode: str, status: str, reason: str) 
 
 @linux
 @pytest.mark.parametrize("start", ["fork", "fresh"])
-def test_nothing_survives_a_good_run(attack, monkeypatch, start: str) -> None:
+@pytest.mark.parametrize(
+    ("mode", "limits", "status", "count"),
+    [("children", {}, "ok", 3), ("hog-child", {"memory_mb": 1000, "frame_s": 60}, "out-of-memory", 1)],
+)
+def test_nothing_survives_a_run_that_ends_or_is_killed(attack, monkeypatch, start, mode, limits, status, count) -> None:
     monkeypatch.setenv("DYNSLAM_BENCH_START", start)
-    record, pids = attack("children")
-    assert record.status == "ok" and len(pids) == 3
-    assert alive(pids) == []
-
-
-@linux
-@pytest.mark.parametrize("start", ["fork", "fresh"])
-def test_nothing_survives_a_run_that_is_killed(attack, monkeypatch, start: str) -> None:
-    monkeypatch.setenv("DYNSLAM_BENCH_START", start)
-    record, pids = attack("hog-child", memory_mb=1000, frame_s=60)
-    assert record.status == "out-of-memory" and "the limit is 1000 MB" in record.reason
-    assert len(pids) == 1 and alive(pids) == []
+    record, pids = attack(mode, **limits)
+    assert (record.status, len(pids), alive(pids)) == (status, count, []), record.reason
 
 
 @linux

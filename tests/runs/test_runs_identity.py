@@ -4,6 +4,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -46,11 +47,6 @@ def edit(path: Path, old: str, new: str) -> Callable[[], None]:
     return change
 
 
-def rescale(path: Path, write_image: Callable[[Path, np.ndarray], None]) -> Callable[[], None]:
-    """Divide a depth image by 5 in place."""
-    return lambda: write_image(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5)
-
-
 def uncompressed(path: Path, image: np.ndarray) -> None:
     cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 0])
 
@@ -62,12 +58,11 @@ def sequence(tmp_path: Path) -> Path:
     return folder
 
 
-def a_change_of_data(name: str, folder: Path) -> Callable[[], None]:
+def a_change_of_data(name: str, folder: Path) -> Callable[[], object]:
     depth, colour = sorted((folder / "depth").iterdir())[3], sorted((folder / "rgb").iterdir())[3]
-    flipped = cv2.imread(str(colour))[::-1] if name == "colour" else None
     return {
-        "depth": rescale(depth, uncompressed),
-        "colour": lambda: cv2.imwrite(str(colour), flipped),
+        "depth": lambda: uncompressed(depth, cv2.imread(str(depth), cv2.IMREAD_UNCHANGED) // 5),
+        "colour": lambda: cv2.imwrite(str(colour), cv2.imread(str(colour))[::-1]),
         "truth": edit(folder / "groundtruth.txt", "100.1", "100.2"),
         "stamps": edit(folder / "rgb.txt", "100.066667 rgb", "100.066668 rgb"),
         "camera": edit(folder / "camera.toml", "fx = ", "fx =1"),
@@ -75,14 +70,17 @@ def a_change_of_data(name: str, folder: Path) -> Callable[[], None]:
     }[name]
 
 
+def makes_another_run(spec: RunSpec, change: Callable[[], object]) -> bool:
+    before = resolve(spec).run_id
+    assert resolve(spec).run_id == before
+    change()
+    return resolve(spec).run_id != before
+
+
 @pytest.mark.parametrize("name", ["depth", "colour", "truth", "stamps", "camera", "frame rate"])
 def test_changed_data_is_another_run(name: str, tmp_path: Path) -> None:
     folder = sequence(tmp_path)
-    spec = RunSpec(tracker="never-move", sequence=str(folder))
-    before, change = resolve(spec).run_id, a_change_of_data(name, folder)
-    assert resolve(spec).run_id == before
-    change()
-    assert resolve(spec).run_id != before
+    assert makes_another_run(RunSpec(tracker="never-move", sequence=str(folder)), a_change_of_data(name, folder))
 
 
 def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
@@ -114,9 +112,7 @@ def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
 )
 def test_a_changed_plug_in_is_another_run(file: str, old: str, new: str, tmp_path: Path) -> None:
     spec, folder = plugin(tmp_path)
-    before = resolve(spec).run_id
-    edit(folder / file, old, new)()
-    assert resolve(spec).run_id != before
+    assert makes_another_run(spec, edit(folder / file, old, new))
 
 
 @pytest.mark.parametrize(
@@ -132,10 +128,8 @@ def test_comments_docstrings_and_what_no_code_names_change_nothing(
     file: str, old: str, new: str, tmp_path: Path
 ) -> None:
     spec, folder = plugin(tmp_path)
-    before = resolve(spec).run_id
     path = folder / file
-    path.write_text(path.read_text().replace(old, new))
-    assert resolve(spec).run_id == before
+    assert not makes_another_run(spec, lambda: path.write_text(path.read_text().replace(old, new)))
 
 
 @pytest.mark.parametrize(
@@ -146,9 +140,7 @@ def test_a_data_file_counts_however_its_name_is_put_together(named: str, tmp_pat
     write(folder / "helper.py", f"FILE = {named}\n")
     for name in ("gain_3.txt", "my gain_3.txt"):
         write(folder / name, "1111")
-    before = resolve(spec).run_id
-    edit(folder / ("my gain_3.txt" if "my" in named else "gain_3.txt"), "1111", "2222")()
-    assert resolve(spec).run_id != before
+    assert makes_another_run(spec, edit(folder / ("my gain_3.txt" if "my" in named else "gain_3.txt"), "1111", "2222"))
 
 
 @pytest.mark.parametrize(
@@ -162,9 +154,7 @@ def test_an_import_counts_however_it_is_written(
     module = write(tmp_path / "elsewhere" / "identity_toy_module.py", "gain = 1\n")
     monkeypatch.syspath_prepend(str(module.parent))
     write(folder / "mine.py", f"{PLUGIN}\ndef later():\n    {statement}\n")
-    before = resolve(spec).run_id
-    edit(module, "1", "2")()
-    assert resolve(spec).run_id != before
+    assert makes_another_run(spec, edit(module, "1", "2"))
 
 
 def test_what_a_plug_in_imports_from_elsewhere_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,13 +162,15 @@ def test_what_a_plug_in_imports_from_elsewhere_counts(tmp_path: Path, monkeypatc
     library = write(tmp_path / "elsewhere" / "identity_toy_library" / "__init__.py", "gain = 1\n")
     monkeypatch.syspath_prepend(str(library.parents[1]))
     write(folder / "helper.py", "import identity_toy_library, numpy\n")
-    before = resolve(spec).run_id
-    library.write_text("gain = 2\n")
-    after = resolve(spec).run_id
-    assert after != before
+    assert makes_another_run(spec, lambda: library.write_text("gain = 2\n"))
     real = fingerprint.distribution_version
-    monkeypatch.setattr(fingerprint, "distribution_version", lambda name: "0" if name == "numpy" else real(name))
-    assert resolve(spec).run_id != after
+    newer = partial(
+        monkeypatch.setattr,
+        fingerprint,
+        "distribution_version",
+        lambda name: "0" if name == "numpy" else real(name),
+    )
+    assert makes_another_run(spec, newer)
 
 
 def a_program(tmp_path: Path) -> Path:
@@ -230,10 +222,7 @@ def test_a_changed_program_is_another_run(command: str, file: str, old: str, new
         sequence=str(write_folder(tmp_path / "toy", 4)),
         settings={"folder": str(folder)},
     )
-    before = resolve(spec).run_id
-    assert resolve(spec).run_id == before
-    edit(folder / file, old, new)()
-    assert resolve(spec).run_id != before
+    assert makes_another_run(spec, edit(folder / file, old, new))
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None or shutil.which("ldd") is None, reason="needs gcc and ldd")
@@ -244,10 +233,8 @@ def test_a_rebuilt_shared_library_is_another_run(tmp_path: Path) -> None:
     build = f"cd {folder} && gcc -shared -fPIC -o libpart.so part.c"
     assert os.system(f"{build} && gcc -o slam main.c -L. -lpart -Wl,-rpath,'$ORIGIN'") == 0
     spec = RunSpec(tracker=f"subprocess:{folder}/slam", sequence=str(write_folder(tmp_path / "toy", 4)))
-    before = resolve(spec).run_id
     write(folder / "part.c", "int part(void) { return 2; }\n")
-    assert os.system(build) == 0
-    assert resolve(spec).run_id != before
+    assert makes_another_run(spec, lambda: os.system(build))
 
 
 def test_libraries_weights_and_own_code_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,19 +3,30 @@
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from envs_toys import TARGET, ToySequence, write_folder
 
-from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
+from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.envs import SlamEnv
+from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.geometry.stamps import format_ns, from_seconds
 from dynslam_bench.geometry.trajectory_files import read_tum
+from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.reports.model.names import make_labels
+from dynslam_bench.reports.model.row import make_row, run_command
 from dynslam_bench.runs import RunRecord, RunSpec, RunStore, resolve, run_many, run_one, score
+from dynslam_bench.runs.artifacts import keep_map
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
+from dynslam_bench.runs.identity import check_unchanged, start_map_of
+from dynslam_bench.runs.store import run_row, runs_frame
+from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
+from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 
 
 def leftovers(store: RunStore) -> list[str]:
@@ -317,43 +328,32 @@ def test_a_data_set_of_the_users_may_state_its_nanoseconds() -> None:
 
 
 @pytest.fixture
-def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[str, str]]:
-    """A name for each mistake: what is set as the source, and the words of the error."""
+def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with no network, no weights, and masks of a third of the frames."""
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights"))
     (tmp_path / "garbage.onnx").write_bytes(b"no network at all" * 20)
     (tmp_path / "masks").mkdir()
     for index in range(20):
         cv2.imwrite(str(tmp_path / "masks" / f"{index:06d}.png"), np.zeros((120, 160), np.uint8))
-    return {
-        "no onnx": (f"onnx:{tmp_path}/none.onnx", r"cannot read the network .*none\.onnx"),
-        "no network": (f"onnx:{tmp_path}/garbage.onnx", r"garbage\.onnx is not an ONNX model \(340 bytes\)"),
-        "no weights": (f"weights:{tmp_path}/none.pt", r"cannot read the checkpoint .*none\.pt"),
-        "no checkpoint": (f"weights:{tmp_path}/garbage.onnx", r"is no torch checkpoint of plain weights"),
-        "no folder": (f"recorded:{tmp_path}/none", r"recorded masks .*none does not exist"),
-        "too few masks": (f"recorded:{tmp_path}/masks", r"has none for 40 of 60 frames of '.*', the first is frame 20"),
-        "oracle": ("oracle", r"has no exact masks"),
-        "auto": ("auto", r"no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH"),
-        "plugin": ("plugin:mine", r"unknown segmenter 'mine'"),
-    }
+    return tmp_path
 
 
-NAMES = (
-    "no onnx",
-    "no network",
-    "no weights",
-    "no checkpoint",
-    "no folder",
-    "too few masks",
-    "oracle",
-    "auto",
-    "plugin",
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("onnx:{}/none.onnx", r"cannot read the network .*none\.onnx"),
+        ("onnx:{}/garbage.onnx", r"garbage\.onnx is not an ONNX model \(340 bytes\)"),
+        ("weights:{}/none.pt", r"cannot read the checkpoint .*none\.pt"),
+        ("weights:{}/garbage.onnx", r"is no torch checkpoint of plain weights"),
+        ("recorded:{}/none", r"recorded masks .*none does not exist"),
+        ("recorded:{}/masks", r"has none for 40 of 60 frames of '.*', the first is frame 20"),
+        ("oracle", r"has no exact masks"),
+        ("auto", r"no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH"),
+        ("plugin:mine", r"unknown segmenter 'mine'"),
+    ],
 )
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_masks_that_cannot_be_had(store: RunStore, toy_folder: str, mistakes, name: str) -> None:
-    source, words = mistakes[name]
-    settings = {"segmentation.source": source}
+def test_masks_that_cannot_be_had(store: RunStore, toy_folder: str, odd_masks: Path, source: str, words: str) -> None:
+    settings = {"segmentation.source": source.format(odd_masks)}
     spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings=settings)
     for attempt in (
         lambda: run_one(spec, store),
@@ -379,7 +379,7 @@ def test_coco_without_a_network(store: RunStore, toy_folder: str, monkeypatch, t
     assert store.ids() == []
 
 
-def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_folder: str, mistakes) -> None:
+def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_folder: str, odd_masks) -> None:
     def hint(tracker: str) -> str:
         spec = RunSpec(tracker=tracker, sequence=toy_folder, settings={"segmentation.source": "auto"})
         with pytest.raises(DynslamError) as caught:
@@ -482,3 +482,96 @@ def test_one_bad_sequence_stops_no_other(store: RunStore, damaged, tmp_path: Pat
     assert [sequence for sequence, _ in told] == [missing, folder]
     with pytest.raises(DynslamError, match="missing"):  # nobody is told: raised at the end
         run_many(specs, results=store)
+
+
+SEQUENCE = "synthetic/walking_xyz"
+PLAIN = RunSpec(tracker="orb-slam2", sequence=SEQUENCE, frames=(0, 3), save_map=True)
+
+
+def begun(file: Path, **changes: object) -> RunSpec:
+    """A run on later frames of the scene that begins in a map and leaves it alone."""
+    settings = {"backend.map.file": str(file), "backend.map.localisation_only": True}
+    return PLAIN.model_copy(update={"frames": (3, 6), "settings": settings, **changes})
+
+
+def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_path: Path) -> None:
+    file = tmp_path / MAP_FILE
+    first = SlamEnv(SEQUENCE, "orb-slam2", frames=(0, 3))
+    with pytest.raises(TrackerError, match="has not begun"):
+        first.save_map(file)
+    first.reset(seed=0)
+    first.step(0)
+    first.save_map(str(file), "another run")
+    (found,) = run_many([begun(file)], results=store)
+    assert found.status == "ok" and found.n_tracked == 3 and found.maps == 1
+    own = read_map(store.folder(found.run_id) / MAP_FILE)
+    assert "frames 3:6, seed 0" in own.header.made_by
+    assert all(own.arrays[name].tobytes() == array.tobytes() for name, array in read_map(file).arrays.items())
+    begun_in = found.start_map
+    assert begun_in is not None and begun_in.localisation_only and begun_in.made_by == "another run"
+    assert (begun_in.keyframes, begun_in.points) == (found.keyframes, found.map_points)
+    assert any("of another run, localisation only" in note for note in found.notes)
+    keyframes = (store.folder(found.run_id) / "keyframes.csv").read_text().splitlines()
+    assert len(keyframes) == 1 + found.keyframes and all(line.split(",")[1:3] == ["", ""] for line in keyframes[1:])
+
+    copy, link = tmp_path / "copy.npz", tmp_path / "latest"
+    copy.write_bytes(file.read_bytes())
+    link.symlink_to(file)
+    assert resolve(begun(copy)).run_id == found.run_id, "what counts is the map, not where it lies"
+    assert begun(link).absolute().settings["backend.map.file"] == str(file), "another run moves the link"
+    asked = found.asked
+    assert asked == found.model_copy(update={"overrides": {"backend.map.localisation_only": "true"}}).asked
+
+    other = tmp_path / "other.npz"  # another map at the same path is another run, and no repeat of the first
+    changed = SavedMap(read_map(file).header.model_copy(update={"made_by": "somebody"}), read_map(file).arrays)
+    write_map(other, changed)
+    other.replace(file)
+    again = resolve(begun(file))
+    assert again.run_id != found.run_id and again.start_map is not None
+    with pytest.raises(RunError, match="has changed since the run was asked for"):
+        check_unchanged(begun_in, again.settings)
+    row = make_row(store, found, get_protocol("tum-rgbd/v1"))
+    other_map = found.model_copy(update={"start_map": again.start_map})
+    assert row.variant_key != make_row(store, other_map, get_protocol("tum-rgbd/v1")).variant_key
+    assert not row.ranked, "it knows more than one that begins without"
+    assert make_board([row]).reference is None
+    name = f"map={begun_in.digest[:8]}"
+    assert name in make_labels([row])[row.variant_key], "named though no other variant stands beside it"
+    assert f"--map {file}" in run_command(row) and "backend.map.localisation_only=true" in run_command(row)
+    for said in (run_row(found, None)["settings"], runs_frame([(found, None)])["settings"][0]):
+        assert f"map={begun_in.digest[:8]}" in said
+
+
+def test_a_map_that_does_not_fit_is_refused_before_the_run(store: RunStore, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="which is no file"):
+        run_many([begun(tmp_path / "none.npz")], results=store)
+    (tmp_path / "odd.npz").write_bytes(b"no archive")
+    with pytest.raises(SettingsError, match="holds no arrays"):
+        run_many([begun(tmp_path / "odd.npz")], results=store)
+    assert not store.ids()
+
+
+def test_a_tracker_without_a_map_says_why_there_is_no_file(store: RunStore) -> None:
+    (record,) = run_many([PLAIN.model_copy(update={"tracker": "never-move"})], results=store)
+    assert record.status == "ok" and record.maps is None
+    assert record.notes == [f"no {MAP_FILE}: tracker 'never-move' cannot save its map"]
+
+
+def test_maps_that_never_met_are_said(tmp_path: Path) -> None:
+    numbers = [0, 0, 1, 1, 1, 3]
+    keyframes = tuple(KeyframeRecord(i, i, i / 30, np.eye(4), 9, 9, number) for i, number in enumerate(numbers))
+    none = np.zeros(0, np.int64)
+    outputs = MapOutputs(keyframes, none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none)
+    spec = RunSpec(tracker="a", sequence="b")
+    _, counts, notes = keep_map(SimpleNamespace(map_outputs=lambda: outputs, exact_stamps={}), tmp_path, spec)
+    assert counts["maps"] == 3
+    assert notes[0].startswith("3 maps that never met: 4 of 6 keyframes lie in others than the first")
+    one = MapOutputs(keyframes[:2], none, outputs.positions, outputs.colours, none)
+    _, counts, notes = keep_map(SimpleNamespace(map_outputs=lambda: one, exact_stamps={}), tmp_path, spec)
+    assert counts["maps"] == 1 and notes == []
+
+
+def test_features_of_another_kind_begin_in_no_map() -> None:
+    backend = BackendSettings(map=StartMapSettings(file="map.npz"))
+    with pytest.raises(SettingsError, match="features are none that maps are made of"):
+        start_map_of(SimpleNamespace(backend=backend, features=None), None, "rgbd", {})
