@@ -34,6 +34,14 @@ def cell_mean(
     return np.where(count > 0, total / np.maximum(count, 1), empty)
 
 
+def neighbourhood_sum(
+    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int], size: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Sum of values ``[N]`` in the cells around each cell of a grid; `size` in cells, odd; cells as in `cell_index`."""
+    total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1]).reshape(grid)
+    return cv2.boxFilter(total, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT).ravel()
+
+
 def failing_regions(
     failing: NDArray[np.bool_],
     tested: NDArray[np.bool_],
@@ -57,10 +65,6 @@ def failing_regions(
         return failing
     index, grid = cell_index(xy, CELL, size)
     failures, tests = (
-        cv2.boxFilter(
-            np.bincount(index, weights=flags, minlength=grid[0] * grid[1]).reshape(grid),
-            -1, NEIGHBOURHOOD, normalize=False, borderType=cv2.BORDER_CONSTANT,
-        ).ravel()[index]
-        for flags in (failing & tested, tested)
-    )  # fmt: skip
+        neighbourhood_sum(flags, index, grid, NEIGHBOURHOOD)[index] for flags in (failing & tested, tested)
+    )
     return np.asarray(failing & (failures >= MIN_FAILING) & (failures >= share * tests))
