@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
-from dynslam_bench.core.errors import RunError, SettingsError, did_you_mean
+from dynslam_bench.core import RunError, SettingsError, did_you_mean
 from dynslam_bench.core.records import Record
 from dynslam_bench.runs import DEFAULT_PROTOCOL, Limits, RunRecord, RunSpec, RunStore, load_frames, run_many
 from dynslam_bench.trackers import TRACKERS

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from dynslam_bench.contracts import Sequence, timestamps_ns
-from dynslam_bench.core.errors import SequenceError, SettingsError
+from dynslam_bench.core import SequenceError, SettingsError
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry import refuse_close
 from dynslam_bench.sequences import PreprocessingSettings, SequenceView, open_sequence

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Trajectory
-from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core import EvaluationError
 from dynslam_bench.evaluation import OnlineSample, Protocol, evaluate
 from dynslam_bench.geometry import se3
 

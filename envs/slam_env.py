@@ -19,8 +19,14 @@ import dynslam_bench
 from dynslam_bench.contracts import Frame, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory, exact_stamps
 from dynslam_bench.contracts import Sequence as FrameSequence
 from dynslam_bench.contracts.checks import check_frame, check_result, check_sensors, check_trajectory, tracker_code
-from dynslam_bench.core.errors import DynslamError, EvaluationError, SequenceError, SettingsError, TrackerError
-from dynslam_bench.core.folders import stage_cache_folder
+from dynslam_bench.core import (
+    DynslamError,
+    EvaluationError,
+    SequenceError,
+    SettingsError,
+    TrackerError,
+    stage_cache_folder,
+)
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
 from dynslam_bench.envs.arguments import (

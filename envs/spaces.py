@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Camera, Frame, TrackResult
-from dynslam_bench.core.errors import SettingsError, did_you_mean
+from dynslam_bench.core import SettingsError, did_you_mean
 from dynslam_bench.core.settings import (
     Parameter,
     Scalar,

@@ -16,7 +16,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, stage_seconds
-from dynslam_bench.core.errors import SettingsError
+from dynslam_bench.core import SettingsError
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.spaces import MAX_DEPTH_M

@@ -14,9 +14,7 @@ from typing import Any
 from urllib.parse import quote
 
 import dynslam_bench
-from dynslam_bench.core.errors import ReportError
-from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.reading import read_json
+from dynslam_bench.core import ReportError, read_json, write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports import figures
 from dynslam_bench.reports.html.board_page import MEANINGS, entries_of, ratios_content, side_content

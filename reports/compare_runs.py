@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.core.errors import ReportError
-from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.toml import setting_text
+from dynslam_bench.core import ReportError, setting_text, write_atomic
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.html.board_page import ratio_numbers
 from dynslam_bench.reports.html.page import render, write_side

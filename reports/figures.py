@@ -13,7 +13,7 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import ArrayLike
 
-from dynslam_bench.core.toml import label_text
+from dynslam_bench.core import label_text
 from dynslam_bench.reports.model.board import Board
 from dynslam_bench.reports.model.statistics import FLOOR_M
 from dynslam_bench.reports.tables.leaderboard import CACHED_MARK, LOST_MARK, STATISTICS, has_lost, medians, timed

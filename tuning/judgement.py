@@ -15,9 +15,8 @@ import numpy as np
 from optuna.trial import TrialState
 from pydantic import Field
 
-from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.reading import read_text
-from dynslam_bench.core.records import Record, write_atomic
+from dynslam_bench.core import StudyError, read_text, write_atomic
+from dynslam_bench.core.records import Record
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
     FEWEST_SCENES,

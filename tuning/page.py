@@ -13,10 +13,8 @@ import optuna
 import plotly.graph_objects as go
 from optuna.trial import TrialState
 
-from dynslam_bench.core.reading import read_text
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core import read_text, setting_text, write_atomic
 from dynslam_bench.core.settings import Parameter, Scalar
-from dynslam_bench.core.toml import setting_text
 from dynslam_bench.reports.build_report import sections_page
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, figure_of, guide
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets

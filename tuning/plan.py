@@ -12,7 +12,7 @@ import numpy as np
 import optuna
 import pandas as pd
 
-from dynslam_bench.core.errors import StudyError, did_you_mean
+from dynslam_bench.core import StudyError, did_you_mean, read_settings
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.settings import (
     Parameter,
@@ -24,7 +24,6 @@ from dynslam_bench.core.settings import (
     parameters,
     why_unused,
 )
-from dynslam_bench.core.toml import read_settings
 from dynslam_bench.runs import RunRecord, RunStore, load_frames
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.trackers import TRACKERS

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
-from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.folders import find_data_root
+from dynslam_bench.core import StudyError, find_data_root
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry.camera import Camera

@@ -30,10 +30,8 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
-from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.reading import read_json
+from dynslam_bench.core import HIDDEN, StudyError, read_json, without_passwords
 from dynslam_bench.core.records import Record, validated
-from dynslam_bench.core.sanitise import HIDDEN, without_passwords
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.study_file import StudySpec

@@ -19,11 +19,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import optuna
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from dynslam_bench.core.errors import StudyError
-from dynslam_bench.core.records import digest, validated, write_atomic
-from dynslam_bench.core.sanitise import storable, words_without_passwords
+from dynslam_bench.core import StudyError, read_settings, storable, words_without_passwords, write_atomic
+from dynslam_bench.core.records import digest, validated
 from dynslam_bench.core.settings import Scalar
-from dynslam_bench.core.toml import read_settings
 from dynslam_bench.runs import RunEvent, run_many
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.record import program_of

@@ -14,10 +14,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from dynslam_bench.contracts.sequence import Sequence
-from dynslam_bench.core.errors import SequenceError, StudyError, did_you_mean
+from dynslam_bench.core import SequenceError, StudyError, did_you_mean, read_toml, without_passwords
 from dynslam_bench.core.records import Record, validated
-from dynslam_bench.core.sanitise import without_passwords
-from dynslam_bench.core.toml import read_toml
 from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.sequences.catalogue import entry_of, open_sequence, parse_frames

@@ -25,7 +25,7 @@ from dynslam_bench.cli import (
 )
 from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START, ShortHelp
 from dynslam_bench.cli.output import download_bar, set_json_mode, write_error
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core import DynslamError
 
 INTERRUPT_CODE = 130
 LISTS = ("--seed", "--offset")

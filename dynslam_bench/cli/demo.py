@@ -107,7 +107,7 @@ def study_spec(frames: int, trials: int) -> StudySpec:
 
 def render(sequences: set[str]) -> None:
     """Render sequences ahead of the runs, so that no run waits for another's frames."""
-    from dynslam_bench.core.folders import find_data_root
+    from dynslam_bench.core import find_data_root
     from dynslam_bench.sequences.synthetic import render_synthetic
 
     for name in sorted(sequences):

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from dynslam_bench.cli.output import set_json_mode
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core import DynslamError
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts import TrackerSpec
@@ -237,8 +237,8 @@ def gather_settings(assignments: list[str] | None, file: Path | None = None) -> 
     Raises:
         SettingsError: The file cannot be read, or an assignment is not of the form NAME=VALUE.
     """
+    from dynslam_bench.core import read_settings
     from dynslam_bench.core.settings import parse_assignments
-    from dynslam_bench.core.toml import read_settings
 
     overrides = {} if file is None else read_settings(file)
     return overrides | parse_assignments(assignments or ())

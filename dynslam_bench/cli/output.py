@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import from_json, to_json
 
-from dynslam_bench.core.sanitise import printable
+from dynslam_bench.core import printable
 
 if TYPE_CHECKING:
+    from dynslam_bench.core import DynslamError
     from dynslam_bench.core.download import Report
-    from dynslam_bench.core.errors import DynslamError
     from dynslam_bench.reports.tables.table import Table
 
 SOME_RUNS_FAILED = 3

@@ -28,12 +28,11 @@ from dynslam_bench.cli.output import (
     write_error,
 )
 from dynslam_bench.cli.runs import recording_note, show_files, show_runs, training_scene_note
-from dynslam_bench.core.errors import RunError
-from dynslam_bench.core.toml import label_text
+from dynslam_bench.core import RunError, label_text
 
 if TYPE_CHECKING:
     from dynslam_bench.api import RunResult
-    from dynslam_bench.core.errors import DynslamError
+    from dynslam_bench.core import DynslamError
     from dynslam_bench.segmentation.networks.checkpoints import Checkpoint
 
 
@@ -315,7 +314,7 @@ def finish(
 
 def confirm_fetch(checkpoint: Checkpoint) -> bool:
     """Ask on a terminal whether a network may be downloaded; elsewhere the answer is no."""
-    from dynslam_bench.core.folders import weights_folder
+    from dynslam_bench.core import weights_folder
 
     if not is_interactive():
         return False

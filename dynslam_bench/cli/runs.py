@@ -33,9 +33,7 @@ from dynslam_bench.cli.output import (
     warn,
     write,
 )
-from dynslam_bench.core.errors import RunError, did_you_mean, raising
-from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.toml import assignments, label_text
+from dynslam_bench.core import RunError, assignments, did_you_mean, label_text, raising, write_atomic
 from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:

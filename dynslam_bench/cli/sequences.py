@@ -31,7 +31,7 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List all sequences and whether they are on this machine."""
-    from dynslam_bench.core.errors import SequenceError, did_you_mean
+    from dynslam_bench.core import SequenceError, did_you_mean
     from dynslam_bench.sequences.catalogue import summaries
 
     everything = summaries(data_root=data_root)
@@ -179,7 +179,7 @@ def render(
     threads: Annotated[Optional[int], typer.Option(min=1, help="Frames rendered at a time.")] = None,  # noqa: UP045
 ) -> None:
     """Render sequences now, in place of when they are first read."""
-    from dynslam_bench.core.folders import find_data_root
+    from dynslam_bench.core import find_data_root
     from dynslam_bench.sequences.synthetic import render_synthetic
 
     for name in names:

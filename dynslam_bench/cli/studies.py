@@ -122,7 +122,7 @@ def best(
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")] = None,  # noqa: UP045
 ) -> None:
     """Write a study's settings as a preset that `run --settings` takes."""
-    from dynslam_bench.core.records import write_atomic
+    from dynslam_bench.core import write_atomic
 
     text = tuning.read_preset_text(tuning.read_study(study), results, trial)
     if output is not None:

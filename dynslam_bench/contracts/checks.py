@@ -16,7 +16,7 @@ import numpy as np
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec, TrackingState, TrackResult
-from dynslam_bench.core.errors import SequenceError, TrackerError
+from dynslam_bench.core import SequenceError, TrackerError
 from dynslam_bench.geometry import Camera, Trajectory, se3
 
 STATES = get_args(TrackingState)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core import EvaluationError
 from dynslam_bench.evaluation.protocol import Alignment
 from dynslam_bench.geometry import Array, se3
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core import EvaluationError
 from dynslam_bench.evaluation.comparison import Comparison, compare, hold
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry import Array, Trajectory, associate, se3

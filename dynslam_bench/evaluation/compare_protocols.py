@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from functools import partial
 
-from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core import EvaluationError
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_loaded
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Alignment, Protocol, RPESpec
 from dynslam_bench.geometry import Trajectory, TumFile

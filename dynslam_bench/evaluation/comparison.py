@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core import EvaluationError
 from dynslam_bench.core.records import Record
 from dynslam_bench.evaluation.alignment import Similarity, align
 from dynslam_bench.evaluation.protocol import Protocol

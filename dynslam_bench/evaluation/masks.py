@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core import EvaluationError
 
 
 @dataclass(frozen=True)

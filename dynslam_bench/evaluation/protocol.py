@@ -11,7 +11,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from dynslam_bench.core.errors import EvaluationError, did_you_mean
+from dynslam_bench.core import EvaluationError, did_you_mean
 from dynslam_bench.core.records import digest
 
 Alignment = Literal["none", "origin", "se3", "sim3", "yaw"]

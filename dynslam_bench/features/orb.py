@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Keypoints
+from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import inside
 

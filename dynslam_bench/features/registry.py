@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
-from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core import PluginError
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
 from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.records import digest

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynslam_bench.core.errors import TrajectoryError
+from dynslam_bench.core import TrajectoryError
 
 Index = NDArray[np.intp]
 

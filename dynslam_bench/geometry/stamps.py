@@ -14,7 +14,7 @@ from decimal import ROUND_HALF_EVEN, Context, Decimal, InvalidOperation
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core import DynslamError
 
 NS_PER_S = 1_000_000_000
 LEAST_GAP_NS = 1000

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import TrajectoryError
+from dynslam_bench.core import TrajectoryError
 from dynslam_bench.geometry.stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
 
 

@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import TrajectoryError
-from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core import TrajectoryError, read_lines, write_atomic
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory

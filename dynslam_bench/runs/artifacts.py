@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import MapOutputs, TrackResult
-from dynslam_bench.core.errors import RunError, TrackerError, raising
-from dynslam_bench.core.reading import read_npz
+from dynslam_bench.core import RunError, TrackerError, raising, read_npz
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align

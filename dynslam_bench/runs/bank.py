@@ -15,12 +15,22 @@ from pathlib import Path
 
 from pydantic import ConfigDict, Field
 
+from dynslam_bench.core import (
+    DynslamError,
+    InfrastructureError,
+    RunError,
+    TemporaryFolder,
+    compare_sums,
+    file_sha256,
+    raising,
+    read_lines,
+    read_toml,
+    replace_folder,
+    turn,
+    write_atomic,
+)
 from dynslam_bench.core.download import download
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError, raising
-from dynslam_bench.core.files import TemporaryFolder, replace_folder, turn, write_atomic
-from dynslam_bench.core.reading import compare_sums, file_sha256, read_lines
 from dynslam_bench.core.records import Record, digest, validated
-from dynslam_bench.core.toml import read_toml
 from dynslam_bench.runs.exchange.transfer import Which, import_trajectory
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, merge, open_store

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from dynslam_bench.core.errors import RunError, raising
+from dynslam_bench.core import RunError, find_data_root, raising
 from dynslam_bench.core.fingerprint import package_digest, versions
-from dynslam_bench.core.folders import find_data_root
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.arguments import resolve_device
 from dynslam_bench.runs.identity import CODE_PACKAGES

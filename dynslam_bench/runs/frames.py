@@ -16,9 +16,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, field_validator
 from pydantic.dataclasses import dataclass as validated
 
 from dynslam_bench.contracts import stage_seconds
-from dynslam_bench.core.errors import DynslamError, RunError, reason_of
-from dynslam_bench.core.reading import read_lines
-from dynslam_bench.core.sanitise import storable
+from dynslam_bench.core import DynslamError, RunError, read_lines, reason_of, storable
 from dynslam_bench.geometry import Trajectory, format_ns, ns_of, se3, write_tum
 from dynslam_bench.runs.record import RunRecord, StageTime
 from dynslam_bench.runs.store import RunStore

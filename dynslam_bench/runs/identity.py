@@ -10,7 +10,7 @@ from typing import Any
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.contracts.checks import check_sensors
-from dynslam_bench.core.errors import PluginError, RunError, SettingsError, did_you_mean, raising
+from dynslam_bench.core import PluginError, RunError, SettingsError, did_you_mean, raising
 from dynslam_bench.core.fingerprint import (
     code_digest,
     contents_digest,

@@ -23,16 +23,16 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from dynslam_bench.contracts import exact_stamps, timestamps_ns
-from dynslam_bench.core.errors import (
+from dynslam_bench.core import (
     DynslamError,
     InfrastructureError,
     RunError,
     SequenceError,
+    TemporaryFolder,
     TrajectoryError,
     raising,
     reason_of,
 )
-from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import ConfigDict, Field, field_validator
 
-from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core import SequenceError
 from dynslam_bench.core.records import Record
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 

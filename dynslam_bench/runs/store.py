@@ -20,19 +20,24 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import (
+from dynslam_bench.core import (
     DynslamError,
     EvaluationError,
     InfrastructureError,
     RunError,
+    TemporaryFolder,
+    assignments,
+    claimed,
     did_you_mean,
     raising,
+    read_lines,
+    replace_folder,
+    sweep_temporary,
+    temporary_folder,
+    write_atomic,
 )
-from dynslam_bench.core.files import TemporaryFolder, claimed, replace_folder, sweep_temporary, temporary_folder
 from dynslam_bench.core.fingerprint import package_digest
-from dynslam_bench.core.reading import read_lines
-from dynslam_bench.core.records import digest, write_atomic
-from dynslam_bench.core.toml import assignments
+from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
 from dynslam_bench.evaluation.hints import hints
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, get_protocol

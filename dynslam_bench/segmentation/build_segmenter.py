@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dynslam_bench.contracts import Frame, Instances, MaskSource, Segmenter, SegmenterContext, SegmenterSpec, Sequence
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core import SegmentationError
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, path_digest
 from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.records import digest

@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, Instances, MaskSource, SegmenterContext, Sequence
-from dynslam_bench.core.errors import SegmentationError, raising
-from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core import SegmentationError, raising, read_json, write_atomic
 from dynslam_bench.core.images import read_image
-from dynslam_bench.core.reading import read_json
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, weights_digest
 from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from dynslam_bench.core.errors import SegmentationError, did_you_mean
+from dynslam_bench.core import SegmentationError, did_you_mean
 from dynslam_bench.core.settings import Settings, tunable
 
 COCO_NAMES: tuple[str, ...] = (

@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import SequenceError, raising
-from dynslam_bench.core.files import atomic_folder
+from dynslam_bench.core import SequenceError, atomic_folder, raising
 from dynslam_bench.geometry import Camera, parse_ns
 from dynslam_bench.sequences.cameras import CAMERA_FILE, write_camera
 from dynslam_bench.sequences.catalogue import open_folder

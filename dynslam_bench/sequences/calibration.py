@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from dynslam_bench.contracts import Sequence
-from dynslam_bench.core.errors import SequenceError, raising
+from dynslam_bench.core import SequenceError, raising
 from dynslam_bench.geometry import Array, Camera
 from dynslam_bench.geometry.se3 import hat
 from dynslam_bench.sequences.rgbd_motion import follow_corners

@@ -7,10 +7,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from dynslam_bench.core.errors import SequenceError, SettingsError
-from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core import SequenceError, SettingsError, read_toml, write_atomic
 from dynslam_bench.core.settings import Settings, build
-from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry import Camera
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM
 

@@ -15,11 +15,9 @@ from typing import Any, Literal, cast
 from pydantic import Field
 
 from dynslam_bench.contracts import DatasetSpec, Sequence
-from dynslam_bench.core.errors import SequenceError, did_you_mean
-from dynslam_bench.core.folders import find_data_root, is_writable, user_cache
+from dynslam_bench.core import SequenceError, did_you_mean, find_data_root, is_writable, read_toml, user_cache
 from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.settings import Settings, build
-from dynslam_bench.core.toml import read_toml
 from dynslam_bench.geometry import Camera
 from dynslam_bench.sequences.cameras import CAMERAS, MARKER_TO_CAMERA, chosen_camera, find_camera
 from dynslam_bench.sequences.readers.layouts import find_layout, is_bag, layout_of

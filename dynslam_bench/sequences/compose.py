@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from dynslam_bench.contracts import Frame, Sequence
-from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.files import atomic_folder, write_atomic
+from dynslam_bench.core import SequenceError, atomic_folder, write_atomic
 from dynslam_bench.geometry import Array, Camera, Trajectory, se3, write_tum
 from dynslam_bench.sequences.cameras import write_camera
 from dynslam_bench.sequences.readers.layouts import PEOPLE_LIST

@@ -11,10 +11,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Sequence
-from dynslam_bench.core.errors import DynslamError, SequenceError, raising
-from dynslam_bench.core.files import replacing, turn
+from dynslam_bench.core import STAGES_VARIABLE, DynslamError, SequenceError, raising, replacing, turn
 from dynslam_bench.core.fingerprint import opencv_version, package_digest
-from dynslam_bench.core.folders import STAGES_VARIABLE
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.sequences.view import Wrapped, part_of

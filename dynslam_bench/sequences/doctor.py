@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from dynslam_bench.contracts import Frame, Sequence
-from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
+from dynslam_bench.core import DynslamError, SequenceError, TrajectoryError
 from dynslam_bench.geometry import Array, Camera, Trajectory, nearest_gap, se3
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.rgbd_motion import (

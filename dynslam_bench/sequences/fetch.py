@@ -15,13 +15,20 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple, cast
 
+from dynslam_bench.core import (
+    DynslamError,
+    SequenceError,
+    atomic_folder,
+    compare_sums,
+    did_you_mean,
+    find_data_root,
+    is_inside,
+    read_text,
+    without_passwords,
+    write_atomic,
+)
 from dynslam_bench.core.download import CHUNK, MOST_BYTES, Progress, Report, download
-from dynslam_bench.core.errors import DynslamError, SequenceError, did_you_mean
-from dynslam_bench.core.files import atomic_folder, write_atomic
-from dynslam_bench.core.folders import find_data_root
-from dynslam_bench.core.reading import compare_sums, read_text
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.core.sanitise import is_inside, without_passwords
 from dynslam_bench.sequences.cameras import chosen_camera, find_camera
 from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource, Sequence, timestamps_ns
-from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core import SequenceError
 from dynslam_bench.core.records import digest
 
 

@@ -9,11 +9,9 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 
-from dynslam_bench.core.errors import RunError, did_you_mean
-from dynslam_bench.core.reading import read_text
+from dynslam_bench.core import RunError, did_you_mean, parse_toml, read_text
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.settings import field_names
-from dynslam_bench.core.toml import parse_toml
 from dynslam_bench.runs.spec import Limits, RunSpec
 from dynslam_bench.trackers.registry import TRACKERS
 

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from importlib import metadata
 
-from dynslam_bench.core.folders import find_data_root, is_writable, stage_cache_folder, weights_folder
+from dynslam_bench.core import find_data_root, is_writable, stage_cache_folder, weights_folder
 from dynslam_bench.core.version import install_hint, version
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint, embedded_weights
 from dynslam_bench.sequences.catalogue import summaries

@@ -12,9 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core import errors
-from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.files import TemporaryFolder
+from dynslam_bench.core import DynslamError, TemporaryFolder, errors
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_YET, Verdict, bound_log, supervise

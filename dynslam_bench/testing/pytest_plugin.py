@@ -35,7 +35,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
     """Run the checks of every subject that was asked for, and add an item for each."""
-    from dynslam_bench.core.errors import DynslamError
+    from dynslam_bench.core import DynslamError
 
     for kind in OPTIONS:
         for subject in config.getoption(f"--dynslam-{kind}"):
@@ -110,8 +110,7 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
 
 def _open(subject: str) -> Any:
     """A sequence by its name, or the first one of a `DatasetSpec`."""
-    from dynslam_bench.core.errors import PluginError
-    from dynslam_bench.core.folders import find_data_root
+    from dynslam_bench.core import PluginError, find_data_root
     from dynslam_bench.core.plugins import load_object
     from dynslam_bench.sequences.catalogue import DATASETS
 

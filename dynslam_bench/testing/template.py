@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from dynslam_bench.core.errors import PluginError
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core import PluginError, write_atomic
 
 _TEMPLATE = '''"""@TITLE@: a tracker for dynslam-bench.
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dynslam_bench.contracts import Frame, Sequence, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory
 from dynslam_bench.contracts.checks import Fault, blemishes, faults, trajectory_faults
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core import DynslamError
 from dynslam_bench.core.settings import Settings, apply_overrides, build, online_parameters
 from dynslam_bench.evaluation.hints import hints
 from dynslam_bench.testing.report import (

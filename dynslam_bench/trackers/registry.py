@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.contracts import Tracker, TrackerContext, TrackerSpec
-from dynslam_bench.core.errors import PluginError, TrackerError
+from dynslam_bench.core import PluginError, TrackerError
 from dynslam_bench.core.plugins import Registry, build_plugin, load_object
 from dynslam_bench.core.settings import Settings, apply_overrides
 from dynslam_bench.trackers.adapters.specs import ADAPTERS

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from dynslam_bench.core.toml import setting_text
+from dynslam_bench.core import setting_text
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.model.board import Board, Cell, compare_pairs

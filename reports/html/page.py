@@ -16,7 +16,7 @@ from jinja2 import Environment, FunctionLoader
 from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
-from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core import write_atomic
 from dynslam_bench.reports.figures import THEMES
 from dynslam_bench.reports.tables.table import Table
 

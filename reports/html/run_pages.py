@@ -18,9 +18,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dynslam_bench.core.errors import DynslamError, RunError
+from dynslam_bench.core import TABLE_BYTES, DynslamError, RunError, read_bytes
 from dynslam_bench.core.fingerprint import package_digest
-from dynslam_bench.core.reading import TABLE_BYTES, read_bytes
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.evaluate import pose_errors
 from dynslam_bench.evaluation.protocol import Protocol, RPESpec

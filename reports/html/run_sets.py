@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.toml import setting_text
+from dynslam_bench.core import setting_text, write_atomic
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.html.board_page import cell_content
 from dynslam_bench.reports.html.page import render, write_assets, write_side

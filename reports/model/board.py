@@ -16,8 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import ReportError, did_you_mean
-from dynslam_bench.core.toml import assignments
+from dynslam_bench.core import ReportError, assignments, did_you_mean
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import OUR_BACK_END, OUR_OWN, make_labels, name_columns, shortened

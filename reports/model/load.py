@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 import dynslam_bench
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError, raising
+from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, raising
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from dynslam_bench.core.toml import label_text, setting_text
+from dynslam_bench.core import label_text, setting_text
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
 from dynslam_bench.runs.store import part_words
 

@@ -13,11 +13,8 @@ from typing import Any, ClassVar, Literal, TypeVar
 
 from pydantic import ConfigDict, Field
 
-from dynslam_bench.core.errors import DynslamError
-from dynslam_bench.core.files import write_lines
-from dynslam_bench.core.reading import TABLE_BYTES
+from dynslam_bench.core import TABLE_BYTES, DynslamError, setting_text, write_lines
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.core.toml import setting_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
 from dynslam_bench.evaluation.evaluate import Evaluation

@@ -11,7 +11,7 @@ from statistics import median
 
 import numpy as np
 
-from dynslam_bench.core.toml import label_text
+from dynslam_bench.core import label_text
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.model.board import (

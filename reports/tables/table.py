@@ -13,7 +13,7 @@ from typing import Literal
 
 import pandas as pd
 
-from dynslam_bench.core.sanitise import printable
+from dynslam_bench.core import printable
 from dynslam_bench.reports.model.names import OUR_BACK_END
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]

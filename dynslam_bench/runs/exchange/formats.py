@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dynslam_bench.core.errors import RunError, TrajectoryError, raising
-from dynslam_bench.core.files import temporary_folder, write_atomic
-from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core import RunError, TrajectoryError, raising, read_lines, temporary_folder, write_atomic
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.geometry import Array, Camera, FileNotes, Trajectory, TumFile, is_number, load_trajectory, se3
 from dynslam_bench.sequences.bags import read_bag_poses

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Sequence
-from dynslam_bench.core.errors import RunError, raising
+from dynslam_bench.core import RunError, raising
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.rendering import CULLED, ESTIMATE, KEPT, MASK, TRUTH
 from dynslam_bench.geometry import Camera, Trajectory, se3

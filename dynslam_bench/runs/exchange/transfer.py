@@ -14,8 +14,7 @@ import numpy as np
 
 import dynslam_bench
 from dynslam_bench.contracts import Sequence, timestamps_ns
-from dynslam_bench.core.errors import DynslamError, RunError, did_you_mean
-from dynslam_bench.core.files import atomic_folder, write_atomic
+from dynslam_bench.core import DynslamError, RunError, atomic_folder, did_you_mean, write_atomic
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.envs.arguments import Frames, open_frames

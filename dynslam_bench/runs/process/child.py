@@ -29,17 +29,17 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import (
+from dynslam_bench.core import (
     DynslamError,
     InfrastructureError,
     PluginError,
     SegmentationError,
     SequenceError,
     SettingsError,
+    TemporaryFolder,
     TrackerTimeoutError,
     TrajectoryError,
 )
-from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
 from dynslam_bench.runs.process.fork_server import adopt_orphans, die_with_parent
 

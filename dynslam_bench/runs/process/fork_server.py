@@ -35,8 +35,7 @@ from typing import Any
 
 import psutil
 
-from dynslam_bench.core.errors import InfrastructureError
-from dynslam_bench.core.files import sweep
+from dynslam_bench.core import InfrastructureError, sweep
 
 _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dynslam_bench.core import DownloadError, SegmentationError, SequenceError, weights_folder
 from dynslam_bench.core.download import Report, download
-from dynslam_bench.core.errors import DownloadError, SegmentationError, SequenceError
-from dynslam_bench.core.folders import weights_folder
 from dynslam_bench.sequences.synthetic import TUNE_SCENES, parse_synthetic_id
 
 ATTEMPTS = 3

@@ -16,8 +16,7 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from dynslam_bench.core.errors import SegmentationError, raising
-from dynslam_bench.core.files import replacing
+from dynslam_bench.core import SegmentationError, raising, replacing
 from dynslam_bench.segmentation.networks.backbone import COCO_CLASSES, NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 

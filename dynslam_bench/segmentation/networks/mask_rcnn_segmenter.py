@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Instances, SegmenterContext
-from dynslam_bench.core.errors import SegmentationError
+from dynslam_bench.core import SegmentationError
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynslam_bench.core.errors import SegmentationError, raising
-from dynslam_bench.core.files import replacing
+from dynslam_bench.core import SegmentationError, raising, replacing
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
 from dynslam_bench.segmentation.networks.loading import load_network

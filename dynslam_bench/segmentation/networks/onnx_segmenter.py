@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Instances, SegmenterContext
-from dynslam_bench.core.errors import SegmentationError, raising
+from dynslam_bench.core import SegmentationError, raising
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, NMS_IOU, VOC_NAMES, SegmentationSettings

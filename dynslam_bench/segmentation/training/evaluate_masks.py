@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 
 from dynslam_bench.contracts import Frame
-from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core import SegmentationError, write_atomic
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest

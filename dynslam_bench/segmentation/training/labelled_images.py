@@ -14,12 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Sequence as RgbdSequence
-from dynslam_bench.core.errors import SegmentationError, did_you_mean, raising
-from dynslam_bench.core.files import atomic_folder
+from dynslam_bench.core import (
+    TABLE_BYTES,
+    SegmentationError,
+    atomic_folder,
+    did_you_mean,
+    inside,
+    raising,
+    read_json,
+    read_lines,
+)
 from dynslam_bench.core.images import read_image
-from dynslam_bench.core.reading import TABLE_BYTES, read_json, read_lines
 from dynslam_bench.core.records import digest
-from dynslam_bench.core.sanitise import inside
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.segmentation.postprocess import boxes_of

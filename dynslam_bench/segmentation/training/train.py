@@ -14,9 +14,7 @@ import pandas as pd
 import torch
 from torch import nn
 
-from dynslam_bench.core.errors import SegmentationError, raising
-from dynslam_bench.core.files import replacing, write_atomic
-from dynslam_bench.core.reading import read_json
+from dynslam_bench.core import SegmentationError, raising, read_json, replacing, write_atomic
 from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.backbone import EMBEDDED, RESNET18, NetworkConfig

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.core.errors import SequenceError, TrajectoryError
-from dynslam_bench.core.reading import read_text
+from dynslam_bench.core import SequenceError, TrajectoryError, read_text
 from dynslam_bench.geometry import (
     Array,
     Camera,

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core import MEGABYTE, SequenceError, read_bytes, read_lines
 from dynslam_bench.core.images import image_size
-from dynslam_bench.core.reading import MEGABYTE, read_bytes, read_lines
 from dynslam_bench.geometry import Camera, Trajectory, format_ns, ns_of, parse_ns, refuse_close, to_seconds
 
 MOST_LINES = 1_000_000

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
-from dynslam_bench.core.errors import SequenceError
+from dynslam_bench.core import SequenceError, inside
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
-from dynslam_bench.core.sanitise import inside
 from dynslam_bench.geometry import Camera, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
 from dynslam_bench.sequences.readers.lists import Contents, Dropped, ImageList

@@ -13,8 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import SequenceError, TrajectoryError, raising
-from dynslam_bench.core.reading import read_lines, read_text
+from dynslam_bench.core import SequenceError, TrajectoryError, raising, read_lines, read_text
 from dynslam_bench.geometry import Array, Trajectory, is_number, parse_ns, refuse_close, se3, to_seconds
 from dynslam_bench.sequences.readers.lists import MOST_LINES
 

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from dynslam_bench.core.errors import SequenceError, did_you_mean
+from dynslam_bench.core import SequenceError, did_you_mean
 from dynslam_bench.sequences.synthetic.families import (
     CONDITIONS,
     CROWDS,

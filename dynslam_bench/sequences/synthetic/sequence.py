@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dynslam_bench.contracts import Frame, FrameMasks
-from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.reading import read_lines
+from dynslam_bench.core import SequenceError, read_lines, write_atomic
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import Camera, Trajectory, write_tum
 from dynslam_bench.sequences.cameras import write_camera

@@ -15,9 +15,8 @@ import numpy as np
 import psutil
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackResult
+from dynslam_bench.core import TemporaryFolder, TrackerError, TrackerTimeoutError, TrajectoryError, raising
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.errors import TrackerError, TrackerTimeoutError, TrajectoryError, raising
-from dynslam_bench.core.files import TemporaryFolder
 from dynslam_bench.geometry import Camera, Trajectory, nearest_gap, read_table, read_tum, se3
 from dynslam_bench.trackers.adapters.orbslam3 import settings_yaml
 from dynslam_bench.trackers.adapters.specs import BatchProgram, BatchSettings, OrbSlam3Settings

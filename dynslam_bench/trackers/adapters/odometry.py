@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, TrackingState, TrackResult
-from dynslam_bench.core.errors import TrackerError
+from dynslam_bench.core import TrackerError
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.trackers.adapters.specs import Open3dOdometrySettings, OpenCvOdometrySettings
 

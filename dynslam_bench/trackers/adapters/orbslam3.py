@@ -14,10 +14,7 @@ from typing import Any
 import numpy as np
 
 from dynslam_bench.contracts import TrackerContext
-from dynslam_bench.core.errors import TrackerError, raising
-from dynslam_bench.core.files import write_atomic
-from dynslam_bench.core.folders import vocabularies_folder
-from dynslam_bench.core.reading import MEGABYTE, read_bytes
+from dynslam_bench.core import MEGABYTE, TrackerError, raising, read_bytes, vocabularies_folder, write_atomic
 from dynslam_bench.geometry import Camera
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 from dynslam_bench.trackers.adapters.subprocess_tracker import (

@@ -17,10 +17,9 @@ from typing import Literal
 from pydantic import ConfigDict, Field
 
 from dynslam_bench.contracts import TrackerSpec
-from dynslam_bench.core.errors import SettingsError, raising
+from dynslam_bench.core import SettingsError, raising, read_toml
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.settings import Settings, names, tunable
-from dynslam_bench.core.toml import read_toml
 from dynslam_bench.core.version import install_hint
 
 

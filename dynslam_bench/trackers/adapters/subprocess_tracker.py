@@ -27,10 +27,16 @@ import numpy as np
 
 import dynslam_bench
 from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
+from dynslam_bench.core import (
+    SHARED_MEMORY,
+    DynslamError,
+    InfrastructureError,
+    TemporaryFolder,
+    TrackerError,
+    parse_json,
+    raising,
+)
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, TrackerError, raising
-from dynslam_bench.core.files import SHARED_MEMORY, TemporaryFolder
-from dynslam_bench.core.reading import parse_json
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings

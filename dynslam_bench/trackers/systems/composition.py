@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, cast
 from pydantic import Field, create_model
 
 from dynslam_bench.contracts import DynamicFilter, Tracker, TrackerContext, TrackerSpec
-from dynslam_bench.core.errors import SegmentationError, SettingsError
+from dynslam_bench.core import SegmentationError, SettingsError
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.settings import GuardSettings, Unmatched
