@@ -1,6 +1,18 @@
 """Every layout that is read, against a writer of its published format: poses, cameras, traps, and wrong folders."""
 
+import gzip
+import io
+import resource
+import struct
+import subprocess
+import sys
+import tarfile
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,14 +20,24 @@ import pytest
 from published_folders import WRITERS, image, lines, random_poses, write_seven_scenes
 from sequence_folders import SHARED, make_folder, needs_shared, rewrite
 
-from dynslam_bench.core.errors import DynslamError, SequenceError
+from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
+from dynslam_bench.core.folders import STAGES_VARIABLE
+from dynslam_bench.core.images import read_image
+from dynslam_bench.core.stage_cache import StageCache
+from dynslam_bench.envs import SlamEnv
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory_files import read_tum
+from dynslam_bench.geometry.trajectory_files import load_tum, read_tum
 from dynslam_bench.sequences import PreprocessingSettings, Sequence, SequenceView, open_sequence
+from dynslam_bench.sequences import fetch as archives
+from dynslam_bench.sequences.bags import unpack_bag
 from dynslam_bench.sequences.catalogue import catalogue
+from dynslam_bench.sequences.decoded import Decoded
+from dynslam_bench.sequences.fetch import MANIFEST, verify
+from dynslam_bench.sequences.readers import recorded
 from dynslam_bench.sequences.readers.layouts import LAYOUTS, find_layout, layout_of
-from dynslam_bench.testing import check_sequence
+from dynslam_bench.sequences.readers.lists import read_image_list
+from dynslam_bench.testing import CornerSequence, check_sequence
 
 OTHERS = [layout.name for layout in LAYOUTS if layout.name != "tum"]
 FOCAL = {
@@ -418,3 +440,388 @@ def test_a_change_behind_a_linked_folder_is_another_content(tmp_path):
     images = sorted((tmp_path / "elsewhere").iterdir())
     images[0].write_bytes(images[1].read_bytes() + b"\0")
     assert open_sequence(str(folder)).digest() != before
+
+
+rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="needs the extra [bags]")
+rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra [bags]")
+typesys = pytest.importorskip("rosbags.typesys", reason="needs the extra [bags]")
+
+SIZE, START = (16, 12), 1_700_000_000
+RNG = np.random.default_rng(0)
+COLOUR = RNG.integers(0, 256, (3, 12, 16, 3), dtype=np.uint8)
+MILLIMETRES = RNG.integers(500, 9000, (3, 12, 16), dtype=np.uint16)
+POSES = random_poses(4)
+
+
+class Bag:
+    """Writes messages of either version of ROS."""
+
+    def __init__(self, path, kind):
+        self.one = kind == "ros1"
+        self.path = path.with_suffix(".bag") if self.one else path
+        self.types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self.one else typesys.Stores.ROS2_HUMBLE)
+        plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
+        self.writer = rosbag1.Writer(self.path) if self.one else rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        self.connections = {}
+
+    def make(self, name, **fields):
+        return self.types.types[name](**fields)
+
+    def header(self, i, frame):
+        stamp = self.make("builtin_interfaces/msg/Time", sec=START, nanosec=i * 33_333_333)
+        extra = {"seq": i} if self.one else {}
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **extra)
+
+    def add(self, topic, name, i, message):
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
+        raw = (self.types.serialize_ros1 if self.one else self.types.serialize_cdr)(message, name)
+        self.writer.write(self.connections[topic], 10**18 + i, raw)
+
+    def image(self, topic, i, pixels, encoding, frame="camera", padding=0):
+        rows = pixels.reshape(pixels.shape[0], -1).view(np.uint8)
+        rows = np.pad(rows, ((0, 0), (0, padding)))
+        message = self.make(
+            "sensor_msgs/msg/Image", header=self.header(i, frame), height=12, width=16, encoding=encoding,
+            is_bigendian=0, step=rows.shape[1], data=rows.ravel(),
+        )  # fmt: skip
+        self.add(topic, "sensor_msgs/msg/Image", i, message)
+
+    def info(self, topic, model="plumb_bob"):
+        k = np.array([300.0, 0, 8, 0, 301.0, 6, 0, 0, 1])
+        fields = {"d": np.array([0.1, -0.2, 1e-3, 2e-3, 0.3]), "k": k, "r": np.eye(3).ravel(), "p": np.zeros(12)}
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        message = self.make(
+            "sensor_msgs/msg/CameraInfo", header=self.header(0, "camera"), height=12, width=16, distortion_model=model,
+            binning_x=0, binning_y=0, roi=roi, **{(key.upper() if self.one else key): v for key, v in fields.items()},
+        )  # fmt: skip
+        self.add(topic, "sensor_msgs/msg/CameraInfo", 0, message)
+
+    def pose(self, topic, i, pose):
+        (x, y, z), (qx, qy, qz, qw) = (part.tolist() for part in se3.to_quaternion(pose))
+        inner = self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+        name = "geometry_msgs/msg/PoseStamped"
+        self.add(topic, name, i, self.make(name, header=self.header(i, "map"), pose=inner))
+
+
+@pytest.fixture
+def write(tmp_path):
+    def made(kind, *, metres=False, second_depth=False, info="/cam/color/camera_info", depth_frame="camera", **model):
+        bag = Bag(tmp_path / f"bag_{kind}", kind)
+        with bag.writer:
+            if info:
+                bag.info(info, **model)
+            for i in range(3):
+                bag.image("/cam/color/image_raw", i, COLOUR[i], "rgb8", padding=5)
+                depth = (MILLIMETRES[i] / np.float32(1000)).astype(np.float32) if metres else MILLIMETRES[i]
+                bag.image("/cam/aligned/image", i, depth, "32FC1" if metres else "16UC1", depth_frame)
+                if second_depth:
+                    bag.image("/cam/raw/image", i, MILLIMETRES[i], "16UC1")
+                bag.pose("/mocap", i, POSES[i])
+        return bag.path
+
+    return made
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
+def test_a_bag_is_unpacked_to_the_last_bit(write, tmp_path, kind):
+    bag = write(kind)
+    found = unpack_bag(bag, tmp_path / "out")
+    assert (found.colour, found.depth, found.truth) == ("/cam/color/image_raw", "/cam/aligned/image", "/mocap")
+    sequence = open_sequence(tmp_path / "out")
+    assert len(sequence) == found.frames == 3
+    for i in range(3):
+        assert (sequence[i].rgb == COLOUR[i]).all()
+        assert np.array_equal(sequence[i].depth, MILLIMETRES[i].astype(np.float32) / np.float32(1000))
+    assert np.allclose(sequence.timestamps, START + np.arange(3) * 0.033333333, atol=1e-6, rtol=0)
+    assert np.abs(sequence.ground_truth.T_world_cam - POSES).max() < 1e-12
+    camera = sequence.camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (16, 12, 300.0, 301.0, 8.0, 6.0)
+    assert camera.distortion == (0.1, -0.2, 1e-3, 2e-3, 0.3)
+    with pytest.raises(SequenceError, match=r"is a bag \(unpack it first: dynslam-bench sequences unpack"):
+        open_sequence(bag)
+
+
+def test_a_single_mcap_file_and_depth_in_metres(write, tmp_path):
+    (file,) = write("mcap", metres=True, depth_frame="ir").glob("*.mcap")
+    found = unpack_bag(file, tmp_path / "out", truth="none")
+    assert found.truth == "" and "depth is in the frame 'ir', colour in 'camera'" in found.notes[0]
+    sequence = open_sequence(tmp_path / "out")
+    assert sequence.ground_truth is None
+    assert np.array_equal(sequence[2].depth, (MILLIMETRES[2] / np.float32(1000)).astype(np.float32))
+
+
+def test_several_topics_are_a_question(write, tmp_path):
+    bag = write("ros2", second_depth=True)
+    with pytest.raises(SequenceError, match=r"2 topics of depth images: /cam/aligned/image, /cam/raw/image.*--depth"):
+        unpack_bag(bag, tmp_path / "out")
+    with pytest.raises(SequenceError, match=r"no topic '/x' of depth images \(there are: /cam/aligned/image"):
+        unpack_bag(bag, tmp_path / "out", depth="/x")
+    assert not (tmp_path / "out").exists()
+    assert unpack_bag(bag, tmp_path / "out", depth="/cam/raw/image").depth == "/cam/raw/image"
+    with pytest.raises(SequenceError, match="exists already"):
+        unpack_bag(bag, tmp_path / "out", depth="/cam/raw/image")
+
+
+def test_wrong_bags_give_one_clear_line(write, tmp_path):
+    with pytest.raises(SequenceError, match="0 topics of calibration"):
+        unpack_bag(write("ros1", info=""), tmp_path / "out")
+    with pytest.raises(SequenceError, match="distortion 'equidistant', only plumb_bob"):
+        unpack_bag(write("mcap", model="equidistant"), tmp_path / "out")
+    with pytest.raises(SequenceError, match="there is no bag"):
+        unpack_bag(tmp_path / "none.bag", tmp_path / "out")
+    damaged = tmp_path / "damaged.bag"
+    damaged.write_bytes((tmp_path / "bag_ros1.bag").read_bytes()[:900])
+    for bag in (damaged, tmp_path / "bag_mcap" / "metadata.yaml"):
+        with pytest.raises(SequenceError, match="cannot be read") as caught:
+            unpack_bag(bag, tmp_path / "out")
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StageCache:
+    monkeypatch.setenv(STAGES_VARIABLE, str(tmp_path / "cache"))
+    return StageCache()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return make_folder(tmp_path / "recording", frames=6)[0]
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The colour images that are decoded from now on."""
+    names: list[str] = []
+    read = recorded.read_colour
+
+    def counted(path: Path, **how: object) -> np.ndarray:
+        names.append(path.name)
+        return read(path, **how)
+
+    monkeypatch.setattr(recorded, "read_colour", counted)
+    return names
+
+
+def files(cache: StageCache) -> list[Path]:
+    return sorted(cache.folder.rglob("*.*"))
+
+
+def same(one: object, other: object) -> bool:
+    pairs = list(zip(one, other, strict=True))
+    return all(
+        a.timestamp == b.timestamp and a.index == b.index and (a.rgb == b.rgb).all() and (a.depth == b.depth).all()
+        for a, b in pairs
+    )
+
+
+def frames(sequence: object) -> Iterator[object]:
+    return (sequence[index] for index in range(len(sequence)))
+
+
+def test_frames_are_the_same_and_decoded_once(folder: Path, reads: list[str], cache: StageCache) -> None:
+    plain = open_sequence(folder)
+    mapped = Decoded(plain)
+    reads.clear()
+    again = Decoded(open_sequence(folder))
+    assert len(reads) == 1, "opening decodes the first frame"
+    assert same(frames(mapped), frames(again)) and len(reads) == 1
+    assert same(frames(mapped), frames(plain)) and mapped[-1].index == 5
+    assert (mapped.id, mapped.digest(), mapped.camera) == (plain.id, plain.digest(), plain.camera)
+    assert mapped[0].rgb.dtype == np.uint8 and mapped[0].depth.dtype == np.float32
+    assert len(files(cache)) == 1 and cache.info()["entries_by_stage"] == {"frames": 1}
+    with pytest.raises(ValueError, match="read-only"):
+        mapped[0].rgb[0] = 0
+
+
+def test_other_frames_are_another_file(folder: Path, cache: StageCache) -> None:
+    whole = open_sequence(folder)
+    smaller = open_sequence(folder, preprocessing=PreprocessingSettings(width=16, height=16))
+    variants = [whole, SequenceView(whole, 1), SequenceView(whole, 0, None, 2), smaller]
+    for count, variant in enumerate(variants, 1):
+        assert same(frames(Decoded(variant)), frames(variant)) and len(files(cache)) == count
+    image = sorted((folder / "rgb").iterdir())[3]
+    cv2.imwrite(str(image), 255 - cv2.imread(str(image)))
+    changed = open_sequence(folder)
+    assert same(frames(Decoded(changed)), frames(changed)) and len(files(cache)) == 5
+    assert not same(frames(Decoded(changed)), frames(Decoded(whole)))
+
+
+def test_of_several_processes_one_decodes(folder: Path, cache: StageCache) -> None:
+    code = (
+        "import sys\n"
+        "from dynslam_bench.sequences import decoded, open_sequence\n"
+        "write, count = decoded._write, []\n"
+        "decoded._write = lambda *a: (count.append(1), write(*a))\n"
+        "decoded.Decoded(open_sequence(sys.argv[1]))\n"
+        "print(len(count))\n"
+    )
+    started = [
+        subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE, text=True) for _ in range(3)
+    ]
+    assert sorted(process.communicate()[0].strip() for process in started) == ["0", "0", "1"]
+    assert len(files(cache)) == 1
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(folder: Path, cache: StageCache) -> None:
+    sequence = open_sequence(folder)
+    sequence.digest()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # as if the disk were full
+    try:
+        with pytest.raises(DynslamError, match=r"cannot write the 0 MB of decoded frames .*free some space") as caught:
+            Decoded(sequence)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(caught.value) and files(cache) == []
+    assert len(Decoded(sequence)) == 6
+
+
+def test_more_frames_than_the_cache_holds_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(StageCache.__init__, "__defaults__", (None, 20_000))
+    with pytest.raises(SequenceError, match=r"6 decoded frames of .*choose part of the sequence by frames"):
+        Decoded(open_sequence(folder))
+
+
+def test_a_damaged_image_is_named(folder: Path, cache: StageCache) -> None:
+    image = sorted((folder / "depth").iterdir())[3]
+    sequence = open_sequence(folder)
+    image.write_bytes(image.read_bytes()[:40])
+    with pytest.raises(SequenceError, match=image.name):
+        Decoded(sequence)
+    assert files(cache) == []
+
+
+@pytest.mark.parametrize("tracker", ["orb-slam2", "emfoa-oft?masks=none", "opencv-odometry", "mask-rcnn"])
+def test_an_episode_is_the_same_to_the_bit(tracker: str) -> None:
+    sequence = "synthetic/walking_xyz?scene=0&frames=6" if tracker == "mask-rcnn" else CornerSequence(6)
+    episodes = []
+    for memory_map in (False, True):
+        env = SlamEnv(sequence, tracker, observation=["stats", "rgb", "depth", "gray"], memory_map=memory_map)
+        steps = [env.reset(seed=0)[0]] + [env.step(0)[0] for _ in range(5)]
+        episodes.append([value.tobytes() for step in steps for value in step.values()])
+        episodes[-1].append(env.online_trajectory().T_world_cam.tobytes())
+    assert episodes[0] == episodes[1]
+
+
+def lying_png(width: int, height: int) -> bytes:
+    """A PNG of a few hundred bytes that claims any size, with right checksums."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    pixels = chunk(b"IDAT", zlib.compress(bytes(99)))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + pixels + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth"])
+def test_an_image_that_claims_to_be_huge_costs_nothing(tmp_path: Path, kind: str) -> None:
+    folder, *_ = make_folder(tmp_path / "seq")
+    (folder / kind / "2.png").write_bytes(lying_png(40_000, 35_000))
+    sequence = open_sequence(folder)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(SequenceError, match="is 40000x35000, but"):
+        sequence[2]
+    with pytest.raises(SequenceError, match=r"claims to be 40000x35000, at most 64 megapixels"):
+        read_image(folder / kind / "2.png", kind=SequenceError)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # KB
+
+
+def test_a_png_whose_chunk_claims_gigabytes_is_refused(tmp_path: Path) -> None:
+    data = lying_png(16, 12)
+    at = data.index(b"IDAT") - 4
+    (tmp_path / "1.png").write_bytes(data[:at] + b"\xff\xff\xff\xff" + data[at + 4 :])
+    with pytest.raises(SequenceError, match="is truncated"):
+        read_image(tmp_path / "1.png", kind=SequenceError)
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/passwd", "rgb/../../secret.png", "a\\..\\b.png"])
+def test_lists_name_nothing_outside_their_folder(tmp_path: Path, name: str) -> None:
+    folder, *_ = make_folder(tmp_path / "seq")
+    cv2.imwrite(str(tmp_path / "secret.png"), np.zeros((24, 32, 3), np.uint8))
+    (folder / "rgb.txt").write_text((folder / "rgb.txt").read_text() + f"99.0 {name}\n")
+    with pytest.raises(SequenceError, match="does not lie in"):
+        open_sequence(folder)
+
+
+def test_a_manifest_that_leads_outside_is_a_fault(tmp_path: Path) -> None:
+    folder, *_ = make_folder(tmp_path / "seq")
+    for content in (f"{'0' * 64}  ../../etc/passwd\n".encode(), b"\xff\xfe"):
+        (folder / MANIFEST).write_bytes(content)
+        (fault,) = verify(str(folder)).faults
+        assert "does not lie in" in fault or "is not a text file" in fault
+
+
+def test_ten_million_lines_are_refused_early_and_cheaply(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_bytes(b"#\n" * 4_000_001)
+    with pytest.raises(TrajectoryError, match="has more than 4000000 lines"):
+        load_tum(path)
+    with pytest.raises(SequenceError, match="has more than 1000000 lines"):
+        read_image_list(path)
+
+
+def refuses(archive: Path, words: str) -> None:
+    with tempfile.TemporaryDirectory() as target, pytest.raises(SequenceError, match=words):
+        archives.extract(archive, Path(target))
+
+
+def test_a_bomb_is_refused(tmp_path: Path) -> None:
+    archive = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file, file.open("zeros", "w", force_zip64=True) as out:
+        for _ in range(150):
+            out.write(bytes(1_000_000))
+    refuses(archive, "unpacks to more than")
+
+
+def tar_header(name: bytes, size: int, kind: bytes) -> bytes:
+    """A tar header of any size, with a right checksum."""
+    block = bytearray(tarfile.TarInfo(name.decode()).tobuf(tarfile.GNU_FORMAT)[:512])
+    block[124:136] = b"\x80" + size.to_bytes(11, "big")
+    block[156:157] = kind
+    block[148:156] = b" " * 8
+    block[148:156] = b"%06o\0 " % sum(block)
+    return bytes(block)
+
+
+@pytest.mark.parametrize("kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK])
+def test_a_tar_header_that_claims_gigabytes_costs_nothing(tmp_path: Path, kind: bytes) -> None:
+    archive = tmp_path / "a.tgz"
+    archive.write_bytes(gzip.compress(tar_header(b"x", 3 << 30, kind) + bytes(10 << 20), 1))
+    refuses(archive, "a header claims 3221225472 bytes")
+
+
+def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(archives, "MAX_MEMBERS", 20)
+    archive = tmp_path / "a.tar"
+    with tarfile.open(archive, "w") as tar:
+        for number in range(30):
+            tar.addfile(tarfile.TarInfo(f"seq/{number}"))
+    refuses(archive, "holds more than 20 files, refused")
+    with zipfile.ZipFile(archive, "w") as made:
+        for number in range(30):
+            made.writestr(f"zip/{number}", "")
+    refuses(archive, "holds more than 20 files, refused")
+
+
+def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as tar:
+        tar.addfile(tarfile.TarInfo("seq/rgb.txt"))
+    archive = tmp_path / "a.tgz"
+    archive.write_bytes(gzip.compress(buffer.getvalue(), 1) + gzip.compress(bytes(140_000_000), 9))
+    refuses(archive, r"unpacks to more than 0\.1 GB")
+
+
+def test_other_compressions_are_refused(tmp_path: Path) -> None:
+    """LZMA takes as much memory as the file asks for."""
+    archive = tmp_path / "a.zip"
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_LZMA) as made:
+        made.writestr("seq/rgb.txt", "x")
+    refuses(archive, "compressed in a way that is not unpacked here")

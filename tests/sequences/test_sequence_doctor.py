@@ -4,24 +4,27 @@ import re
 import shutil
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
+from weakref import finalize
 
 import cv2
 import numpy as np
 import pytest
+from envs_toys import write_sequence
 from scipy.spatial.transform import Rotation
-from sequence_folders import SHARED, Altered, make_folder, needs_shared, scaled
+from sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_shared, scaled
 
 from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences import PreprocessingSettings, open_sequence
+from dynslam_bench.geometry import Camera, Trajectory, se3
+from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, Sequence, open_sequence
 from dynslam_bench.sequences.calibration import Window, adjust, calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
+from dynslam_bench.sequences.compose import compose
 from dynslam_bench.sequences.doctor import Diagnosis, Finding, _turn, diagnose, examine, stretches, truth_findings
-from dynslam_bench.sequences.preprocessing import Preprocessed
+from dynslam_bench.sequences.preprocessing import Preprocessed, intensity, normalise
 from dynslam_bench.sequences.rgbd_motion import READINGS, read_as, rgbd_pairs
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
+from dynslam_bench.sequences.view import Part, Wrapped, part_of
 
 FRAMES = 80
 
@@ -217,7 +220,7 @@ def test_real_recordings_have_no_fault(name):
 # Readout time, delay of depth and depth factor, from exact points, a rendered sequence, and what cannot tell them.
 
 
-CAMERA = Camera(320, 240, 260.0, 262.0, 160.0, 118.0)
+PINHOLE = Camera(320, 240, 260.0, 262.0, 160.0, 118.0)
 FPS, WINDOW = 30.0, 12
 NORMAL, DISTANCE = np.array([0.35, 0.5, 1.0]), 2.0
 """The world is the plane NORMAL . X = DISTANCE."""
@@ -233,9 +236,9 @@ def pose(times):
 
 def depth_image(stamp, readout_s):
     """Depth of the plane, every row from its own pose."""
-    v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(float)
-    R, centre = pose(stamp + ((np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5) * readout_s)
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1)
+    v, u = np.mgrid[0 : PINHOLE.height, 0 : PINHOLE.width].astype(float)
+    R, centre = pose(stamp + ((np.arange(PINHOLE.height) + 0.5) / PINHOLE.height - 0.5) * readout_s)
+    rays = np.stack([(u - PINHOLE.cx) / PINHOLE.fx, (v - PINHOLE.cy) / PINHOLE.fy, np.ones_like(u)], axis=-1)
     along = np.einsum("rij,rcj,i->rc", R, rays, NORMAL)
     return ((DISTANCE - centre @ NORMAL)[:, None] / along).astype(np.float32)
 
@@ -245,9 +248,9 @@ def seen(points, stamp, readout_s):
     late = np.zeros(len(points))
     for _ in range(8):
         R, centre = pose(stamp + late)
-        pixels = CAMERA.project(np.einsum("nji,nj->ni", R, points - centre))
-        late = ((pixels[:, 1] + 0.5) / CAMERA.height - 0.5) * readout_s
-    outside = ((pixels < 4) | (pixels > (CAMERA.width - 5, CAMERA.height - 5))).any(axis=1)
+        pixels = PINHOLE.project(np.einsum("nji,nj->ni", R, points - centre))
+        late = ((pixels[:, 1] + 0.5) / PINHOLE.height - 0.5) * readout_s
+    outside = ((pixels < 4) | (pixels > (PINHOLE.width - 5, PINHOLE.height - 5))).any(axis=1)
     return np.where(outside[:, None], np.nan, pixels)
 
 
@@ -259,7 +262,7 @@ def window(first, readout_s, delay_s, rng):
     pixels = np.stack([seen(points, stamp, readout_s) for stamp in stamps], axis=1)
     pixels += rng.normal(0, 0.1, pixels.shape)
     depth = np.stack([depth_image(stamp + delay_s, readout_s) for stamp in stamps])
-    return Window(CAMERA, stamps, pixels[np.isfinite(pixels[..., 0]).sum(1) >= 4], depth, np.zeros(WINDOW))
+    return Window(PINHOLE, stamps, pixels[np.isfinite(pixels[..., 0]).sum(1) >= 4], depth, np.zeros(WINDOW))
 
 
 @pytest.mark.parametrize(("readout_s", "delay_s"), [(0.0, 0.0), (0.03, -0.034)])
@@ -315,7 +318,7 @@ def still(tmp_path):
     """A camera at rest before a textured wall."""
     folder, *_ = make_folder(tmp_path / "still", frames=18, width=320, height=240)
     (folder / "groundtruth.txt").unlink()
-    write_camera(folder / "camera.toml", CAMERA, fps=FPS)
+    write_camera(folder / "camera.toml", PINHOLE, fps=FPS)
     noise = np.random.default_rng(1).integers(0, 255, (60, 80, 3), dtype=np.uint8)
     texture = cv2.resize(noise, (320, 240), interpolation=cv2.INTER_CUBIC)
     for i in range(18):
@@ -328,7 +331,7 @@ def test_a_camera_at_rest_tells_nothing(still):
     found = calibrate(open_sequence(still))
     assert [each.observable for each in found.quantities] == [False] * 3
     assert all(each.reason for each in found.quantities)
-    assert found.camera == CAMERA
+    assert found.camera == PINHOLE
 
 
 @pytest.mark.parametrize("fault", ["frames", "black", "depth"])
@@ -343,3 +346,365 @@ def test_recordings_that_cannot_be_used_are_one_clear_line(still, fault):
         calibrate(sequence)
     assert {"frames": "1 frame", "black": "points", "depth": "depth"}[fault] in str(error.value)
     assert error.value.hint
+
+
+ROOM_CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+
+
+class Room:
+    """A wall of noise at some distance; a box of another colour walks before it if `walker` says so."""
+
+    fps, license, citation, masks = 30.0, "", "", None
+
+    def __init__(self, id, frames=10, *, wall_m=3.0, walker=False, moving=False, seed=0):
+        rng = np.random.default_rng(seed)
+        self.id, self.camera, self.walker, self.wall_m = id, ROOM_CAMERA, walker, wall_m
+        self.wall = rng.integers(60, 200, (120, 160, 3)).astype(np.uint8)
+        self.timestamps = 1000 + np.arange(frames) / 30
+        poses = np.tile(np.eye(4), (frames, 1, 1))
+        poses[:, 0, 3] = 0.005 * np.arange(frames) * moving
+        self.ground_truth = Trajectory(self.timestamps, poses)
+
+    def __len__(self):
+        return len(self.timestamps)
+
+    def __getitem__(self, index):
+        rgb, depth = self.wall.copy(), np.full((120, 160), self.wall_m, np.float32)
+        if self.walker and 2 <= index < len(self) - 2:
+            left = 20 + 6 * index
+            rgb[20:110, left : left + 25] = (200, 40, 40)
+            depth[20:110, left : left + 25] = 2.0
+        return Frame(index, float(self.timestamps[index]), rgb, depth)
+
+
+class Watched(Wrapped):
+    """The same; `most` counts the largest number of its images that existed at once."""
+
+    def __init__(self, base):
+        self.base, self.now, self.most = base, 0, 0
+
+    def __len__(self):
+        return len(self.base)
+
+    def __getitem__(self, index):
+        frame = self.base[index]
+        self.now += 1
+        self.most = max(self.most, self.now)
+        finalize(frame.rgb, self.released)
+        return frame
+
+    def released(self):
+        self.now -= 1
+
+
+class Shifted(Wrapped):
+    """The same seen by a camera that turns: each image lies 4 px further to the right."""
+
+    ground_truth = None
+
+    def __init__(self, base):
+        self.base = base
+
+    def __len__(self):
+        return len(self.base)
+
+    def __getitem__(self, index):
+        frame = self.base[index]
+        rgb, depth = (np.roll(image, 4 * index, axis=1) for image in (frame.rgb, frame.depth))
+        return Frame(index, frame.timestamp, rgb, depth)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Host, people and the composite of instance 0, as folders."""
+    folder = tmp_path_factory.mktemp("composites")
+    host = write_sequence(folder / "host", Room("host", 4, moving=True, seed=1))
+    people = write_sequence(folder / "people", Room("people", 10, walker=True))
+    compose(open_sequence(str(host)), open_sequence(str(people)), folder / "made", 0)
+    return folder
+
+
+@pytest.fixture
+def host(folder):
+    return open_sequence(str(folder / "host"))
+
+
+@pytest.fixture
+def people(folder):
+    return open_sequence(str(folder / "people"))
+
+
+def test_only_people_and_their_shadow_differ_from_the_host(host, folder):
+    composed = open_sequence(str(folder / "made"))
+    assert len(composed) == 4
+    assert np.array_equal(composed.ground_truth.T_world_cam, host.ground_truth.T_world_cam)
+    shares = []
+    for before, after in zip((host[i] for i in range(4)), (composed[i] for i in range(4)), strict=True):
+        masks = composed.masks[after.index]
+        person = masks.instances > 0
+        assert masks.moving == set(np.unique(masks.instances)) - {0} and set(masks.class_names.values()) <= {"person"}
+        around = cv2.dilate(person.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        assert np.array_equal(after.rgb[~around], before.rgb[~around])
+        core = cv2.erode(person.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        assert (after.rgb[core][:, 0] > after.rgb[core][:, 1] + 20).all(), "the walker is red"
+        shadow = ~person & (after.depth == 0)
+        assert np.array_equal(after.depth[~person & ~shadow], before.depth[~person & ~shadow])
+        assert (after.depth[person] < before.depth[person]).all(), "people hide what is behind them"
+        assert shadow.sum() < 0.3 * max(person.sum(), 1)
+        shares.append(person.mean())
+    assert np.mean(shares) > 0.03
+
+
+def test_an_instance_repeats_and_another_one_differs(host, people, folder, tmp_path):
+    again, other = compose(host, people, tmp_path / "made", 0), compose(host, people, tmp_path / "other" / "made", 1)
+    digests = [open_sequence(str(place)).digest() for place in (folder / "made", again.folder, other.folder)]
+    assert digests[0] == digests[1] != digests[2]
+    assert again.share == np.mean([np.mean(open_sequence(str(again.folder)).masks[i].instances > 0) for i in range(4)])
+
+
+def test_images_are_not_held(host, tmp_path):
+    people = Watched(Room("people", 60, walker=True))
+    compose(host, people, tmp_path / "made", 2)
+    assert people.most < 20
+
+
+def test_masks_count_as_content_and_have_to_be_there(folder, tmp_path):
+    made = shutil.copytree(folder / "made", tmp_path / "made")
+    before, path = open_sequence(str(made)).digest(), min((made / "people").iterdir())
+    cv2.imwrite(str(path), np.zeros((120, 160), np.uint8))
+    assert open_sequence(str(made)).digest() != before
+    path.unlink()
+    with pytest.raises(SequenceError, match="1 of 4 mask images"):
+        open_sequence(str(made))
+    (made / "people.txt").write_text("\n".join((made / "people.txt").read_text().splitlines()[1:]))
+    with pytest.raises(SequenceError, match="1 of 4 frames"):
+        open_sequence(str(made))
+
+
+@pytest.mark.parametrize(
+    "fault, message",
+    [
+        ("no truth", "no ground truth"),
+        ("truth elsewhere", "4 of 4 frames .* lie outside"),
+        ("no depth", "nobody can be seen"),
+        ("people already", "has people already"),
+        ("moving", "moves"),
+        ("moving without truth", r"moves: its images shift by \d"),
+        ("nobody", "nobody walks"),
+        ("folder", "exists already"),
+    ],
+)
+def test_what_cannot_be_composed_is_said(host, people, folder, tmp_path, fault, message):
+    truth, made = host.ground_truth, tmp_path / "made"
+    if fault == "no truth":
+        host.ground_truth = None
+    elif fault == "truth elsewhere":
+        host.ground_truth = Trajectory(truth.timestamps + 1000, truth.T_world_cam)
+    elif fault == "no depth":
+        host = Room("dark", 4, wall_m=0.0)
+    elif fault == "people already":
+        host = open_sequence(str(folder / "made"))
+    elif fault == "moving":
+        people.ground_truth = Trajectory(people.timestamps, se3.exp(0.01 * np.arange(10)[:, None] * np.eye(6)[0]))
+    elif fault == "moving without truth":
+        people = Shifted(people)
+    elif fault == "folder":
+        made.mkdir()
+        (made / "thesis.tex").write_text("work")
+    else:
+        people = Room("empty")
+    with pytest.raises(SequenceError, match=message):
+        compose(host, people, made)
+    assert not made.exists() or (made / "thesis.tex").read_text() == "work"
+
+
+@needs_shared
+def test_a_real_person_is_pasted_into_a_real_recording(tmp_path):
+    host = open_sequence(str(SHARED / "data/tum/rgbd_dataset_freiburg1_rpy"), frames="0:4")
+    made = compose(host, open_sequence(str(SHARED / "data/fixed_camera/man_130")), tmp_path / "made", 5)
+    composed = open_sequence(str(tmp_path / "made"))
+    assert 0.1 < made.share < 0.7 and composed.camera == host.camera
+    person = composed.masks[2].instances > 0
+    assert np.median(composed[2].depth[person]) < np.median(host[2].depth[person & (host[2].depth > 0)])
+
+
+LENS = Camera(160, 120, 130.0, 131.0, 80.5, 58.0, (0.26, -0.95, -0.005, 0.003, 1.16))
+
+
+class Memory:
+    """One frame in memory, with masks."""
+
+    id, license, citation, fps, ground_truth = "memory", "", "", 30.0, None
+    camera = LENS
+
+    def __init__(self, rgb, depth):
+        self._frame = Frame(0, 1.0, rgb, depth)
+        self.timestamps = np.array([1.0])
+        self.masks = [FrameMasks((depth > 2).astype(np.int32), {1: "person"}, frozenset({1}))]
+
+    def digest(self):
+        return "d"
+
+    def __len__(self):
+        return 1
+
+    def __getitem__(self, index):
+        return self._frame
+
+
+def dots(points):
+    """A black image with soft white dots at float pixel positions."""
+    v, u = np.mgrid[: LENS.height, : LENS.width]
+    image = np.zeros(u.shape)
+    for x, y in points:
+        image += np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 1.5**2))
+    return np.repeat((255 * image.clip(0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def centroid(image, near, radius=5):
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    weight = image[..., 0] * (np.hypot(u - near[0], v - near[1]) <= radius)
+    return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
+
+
+def test_undistortion_moves_points_where_the_camera_model_says():
+    ideal = np.array([[30.0, 25.0], [120.0, 30.0], [40.0, 95.0], [125.0, 90.0], [80.0, 60.0]])
+    distorted = LENS.distort_points(ideal)
+    assert np.abs(distorted - ideal).max() > 1  # the lens matters here
+    sequence = Preprocessed(
+        Memory(dots(distorted), np.ones((120, 160), np.float32)), PreprocessingSettings(undistort=True)
+    )
+    assert not sequence.camera.is_distorted and sequence.camera.fx == LENS.fx
+    for point in ideal:
+        assert np.abs(centroid(sequence[0].rgb, point) - point).max() < 0.1
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 60), (320, 240), (100, 90)])
+def test_resize_scales_the_intrinsics_along(width, height):
+    points = np.array([[30.0, 25.0], [121.0, 31.0], [40.0, 95.0]])
+    settings = PreprocessingSettings(width=width, height=height)
+    sequence = Preprocessed(Memory(dots(points), np.full((120, 160), 2.0, np.float32)), settings)
+    frame, camera = sequence[0], sequence.camera
+    assert frame.rgb.shape == (height, width, 3) and frame.depth.shape == (height, width)
+    for point in points:
+        ray = LENS.unproject(point, np.array(2.0))
+        assert np.abs(centroid(frame.rgb, camera.project(ray), 6) - camera.project(ray)).max() < 0.12
+
+
+def test_depth_and_masks_are_never_averaged():
+    depth = np.where(np.mgrid[:120, :160][1] < 77, 1.0, 4.0).astype(np.float32)
+    depth[10:20, 10:20] = 0
+    settings = PreprocessingSettings(width=100, height=70, undistort=True)
+    sequence = Preprocessed(Memory(dots([]), depth), settings)
+    frame, masks = sequence[0], sequence.masks[0]
+    assert set(np.unique(frame.depth)) == {0.0, 1.0, 4.0}
+    assert masks.instances.shape == (70, 100) and masks.instances.dtype == np.int32
+    assert ((masks.instances == 1) == (frame.depth > 2)).all()
+    assert masks.moving == {1}
+
+
+def test_digest_depends_on_the_settings():
+    memory = Memory(dots([]), np.ones((120, 160), np.float32))
+    digests = {
+        Preprocessed(memory, PreprocessingSettings(undistort=u, clahe_clip=c)).digest() for u in (0, 1) for c in (1, 2)
+    }
+    assert len(digests) == 4
+    assert isinstance(Preprocessed(memory, PreprocessingSettings(undistort=True)), Sequence)
+
+
+def test_mean_std_reaches_its_target():
+    rng = np.random.default_rng(0)
+    grey = np.repeat(rng.normal(60, 12, (120, 160, 1)).clip(0, 255).astype(np.uint8), 3, axis=2)
+    settings = PreprocessingSettings(normalisation="mean-std", target_mean=0.5, target_std=0.2)
+    result = intensity(normalise(grey, settings))
+    assert result.mean() == pytest.approx(0.5, abs=0.005) and result.std() == pytest.approx(0.2, abs=0.01)
+    flat = normalise(np.full((8, 8, 3), 200, np.uint8), settings)
+    assert flat.std() == 0 and flat.mean() == pytest.approx(127, abs=1)
+
+
+def test_equalisation_spreads_a_dark_image_and_keeps_the_hue():
+    rng = np.random.default_rng(1)
+    dark = rng.integers(0, 40, (120, 160, 3), dtype=np.uint8)
+    for name in ("equalise", "clahe"):
+        result = normalise(dark, PreprocessingSettings(normalisation=name))
+        assert result.dtype == np.uint8 and result.shape == dark.shape
+        assert intensity(result).std() > 1.5 * intensity(dark).std()
+    gray = np.repeat(dark[..., :1], 3, axis=2)
+    balanced = normalise(gray, PreprocessingSettings(normalisation="equalise"))
+    assert (np.ptp(balanced.astype(int), axis=2) <= 1).all()
+    assert (balanced[..., 0] == cv2.equalizeHist(gray[..., 0])).mean() > 0.99
+
+
+# What part of which sequence is seen: one identity for every spelling, and for repeats of one problem instance.
+
+
+WALK = "synthetic/walking_xyz"
+
+
+def part(name: object, offset: int = 0, **how: object) -> Part:
+    return part_of(open_sequence(str(name), **how), offset)
+
+
+def test_all_spellings_of_the_same_frames_are_one_part() -> None:
+    first = part(f"{WALK}?frames=60")
+    spellings = [
+        part(WALK, frames="0:60"),
+        part(f"{WALK}?scene=0", frames=(0, 60)),
+        part(f"{WALK}?scene=000&frames=60"),
+        part(f"{WALK}?frames=100", frames=":60"),
+        part(f"{WALK}?frames=60", frames="0:90"),
+        part(f"{WALK}?frames=60", frames="0:"),
+    ]
+    assert all(each == first for each in spellings) and first.id == f"{WALK}?scene=0"
+    assert part(WALK) == part(f"{WALK}?frames=600")
+
+
+def test_other_frames_scenes_strides_and_cameras_are_other_problem_instances() -> None:
+    others = [
+        part(WALK),
+        part(WALK, frames="0:60"),
+        part(WALK, frames="1:60"),
+        part(WALK, frames="0:60", stride=2),
+        part(f"{WALK}?scene=1", frames="0:60"),
+        part("synthetic/walking_rpy", frames="0:60"),
+    ]
+    assert len({each.block for each in others}) == len(others)
+
+
+def test_offset_and_noise_are_repeats_of_one_problem_instance() -> None:
+    plain = part(WALK, frames="0:60")
+    late = part(WALK, frames="3:60", offset=3)
+    noisy = part(f"{WALK}?noise=7", frames="0:60")
+    assert plain.block == late.block == noisy.block
+    assert part(WALK, frames="3:60").block != plain.block, "without an offset these are other frames"
+    assert noisy.content != plain.content and noisy.noise == 7 and noisy.id != plain.id
+    assert noisy.content != part(f"{WALK}?noise=8").content
+
+
+def test_recorded_folders_by_any_path_and_preprocessing(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a")[0]
+    first = part(folder)
+    assert part(f"{tmp_path}/./a", frames="0:4") == first
+    small = part(folder, preprocessing=PreprocessingSettings(width=24, height=18))
+    assert small.block == first.block, "preprocessing is a tracker's setting, not another recording"
+    shutil.copytree(folder, tmp_path / "else" / "a")
+    assert part(tmp_path / "else" / "a") == first, "a copy is the same recording"
+    camera = (folder / "camera.toml").read_text()
+    (tmp_path / "camera.toml").write_text(camera.replace("fx = 30.0", "fx = 31.0"))
+    assert part(folder, camera=tmp_path / "camera.toml").block != first.block
+    other = make_folder(tmp_path / "b" / "a", start=200.0)[0]
+    assert part(other).block != first.block, "another recording in a folder of the same name is not"
+
+
+def test_a_noise_seed_changes_the_noise_and_nothing_else(tmp_path: Path) -> None:
+    ids = [f"{WALK}?scene=3&frames=2{noise}" for noise in ("", "&noise=1", "&noise=2")]
+    plain, one, two = (open_synthetic(name, tmp_path) for name in ids)
+    assert frame_hash(plain[1])[:16] == "8ed2db9ef4f896d1", "scenes keep their bytes"
+    assert len({frame_hash(each[1]) for each in (plain, one, two)}) == 3
+    assert frame_hash(one[1]) == frame_hash(open_synthetic(f"{WALK}?scene=3&frames=2&noise=1", None)[1])
+    assert frame_hash(one[1]) == frame_hash(one[1]), "read back from a folder of its own"
+    assert np.array_equal(plain.exact_depth(1), one.exact_depth(1))
+    assert np.array_equal(plain.masks[1].instances, one.masks[1].instances)
+    assert np.array_equal(plain.ground_truth.T_world_cam, one.ground_truth.T_world_cam)
+    difference = np.abs(plain[1].rgb.astype(int) - one[1].rgb.astype(int))
+    assert 0.3 < difference.mean() < 5 and difference.max() < 40, "grey levels: noise, no other picture"
