@@ -2,35 +2,40 @@
 
 import copy
 import pickle
-import sys
-import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_toys import TARGET, ToySequence
+from envs_play import QUIET, checked, play, rest, stepped
+from envs_toys import SPEC, STEP_M, TARGET, ToySequence, ToyTracker, truth
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils.env_checker import check_env
 
 import dynslam_bench.envs
-from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.envs import GENERIC_ID, DegradeFrames, SlamEnv, env_id, register_envs
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.envs import (
+    GENERIC_ID,
+    REWARDS,
+    DegradeFrames,
+    Episode,
+    FrameOutcome,
+    SlamEnv,
+    TrackerContractError,
+    env_id,
+    register_envs,
+)
+from dynslam_bench.evaluation.evaluate import evaluate
+from dynslam_bench.evaluation.online import OnlineError
+from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol, get_protocol
+from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import sequence_ids
 from dynslam_bench.sequences.synthetic.ids import SYNTHETIC_IDS
-from dynslam_bench.testing import CornerSequence
-from dynslam_bench.trackers import TRACKERS
 
 SYNTHETIC = SYNTHETIC_IDS[::4]
 CONTROL = ["noise.level_m", "noise.clip", "noise.passes", "noise.enabled"]
-
-
-def checked(env: gym.Env) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped)
-    env.close()
 
 
 @pytest.mark.parametrize("name", SYNTHETIC)
@@ -122,53 +127,20 @@ def rollout(env: SlamEnv, steps: int, seed: int) -> bytes:
 # Copies of an environment in mid-episode: they go on alike, and apart.
 
 
-STILL = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
-PROGRAM = f"""
-import json, sys
-for line in sys.stdin:
-    request = json.loads(line)
-    answer = {{"ok": True}} if request["op"] == "reset" else {{"state": "ok", "T_world_cam": {STILL}}}
-    print(json.dumps(answer | {{key: request[key] for key in request if key == "index"}}), flush=True)
-"""
-
-
-def go_on(env: gym.Env[Any, Any], action: Any = None) -> tuple[list[float], np.ndarray, np.ndarray]:
-    """Rewards of the steps that are left, the online poses, and the last observation."""
-    inner = env.unwrapped
-    assert isinstance(inner, SlamEnv)
-    rewards = []
-    while not inner.episode.over:
-        observation, reward, *_ = env.step(inner.neutral_action if action is None else action)
-        rewards.append(float(reward))
-    return rewards, inner.online_trajectory().T_world_cam, observation
-
-
-def started(env: gym.Env[Any, Any], steps: int) -> gym.Env[Any, Any]:
-    env.reset(seed=3)
-    for _ in range(steps):
-        env.step(env.unwrapped.neutral_action)  # type: ignore[attr-defined]
-    return env
-
-
-def check_alike(env: gym.Env[Any, Any], duplicate: gym.Env[Any, Any]) -> None:
-    first, second = go_on(env), go_on(duplicate)
-    assert first[0] == second[0] and len(first[0]) > 1
-    np.testing.assert_array_equal(first[1], second[1])
-    np.testing.assert_array_equal(first[2], second[2])
-
-
 def test_a_copy_goes_on_from_the_same_frame_to_the_bit() -> None:
-    env = started(SlamEnv(ToySequence(12), TARGET, control=["noise.level_m"]), 4)
+    env = stepped(SlamEnv(ToySequence(12), TARGET, control=["noise.level_m"]), 4)
     duplicate = copy.deepcopy(env)
     assert isinstance(duplicate, SlamEnv) and duplicate.sequence is env.sequence and duplicate.episode.next_index == 5  # type: ignore[attr-defined]
-    check_alike(env, duplicate)
+    assert rest(env) == rest(duplicate)
     assert env.reset()[0] == pytest.approx(duplicate.reset()[0]), "the seeds that follow are the same, too"
 
 
 def test_copies_go_their_own_ways() -> None:
-    env = started(SlamEnv(ToySequence(12), TARGET, control=["noise.level_m"]), 4)
+    env = stepped(SlamEnv(ToySequence(12), TARGET, control=["noise.level_m"]), 4)
     loud, quiet = copy.deepcopy(env), copy.deepcopy(env)
-    loud_poses, quiet_poses = go_on(loud, np.ones(1))[1], go_on(quiet, -np.ones(1))[1]
+    rest(loud, np.ones(1))
+    rest(quiet, -np.ones(1))
+    loud_poses, quiet_poses = (each.unwrapped.online_trajectory().T_world_cam for each in (loud, quiet))
     assert np.abs(loud_poses[5:] - quiet_poses[5:]).max() > 0.01
     np.testing.assert_array_equal(loud_poses[:5], quiet_poses[:5])
     assert env.episode.next_index == 5  # type: ignore[attr-defined]
@@ -177,7 +149,7 @@ def test_copies_go_their_own_ways() -> None:
 
 
 def test_wrappers_are_copied_with_it() -> None:
-    env = started(DegradeFrames(SlamEnv(ToySequence(10), TARGET, observation="rgbd"), noise=0.2), 2)
+    env = stepped(DegradeFrames(SlamEnv(ToySequence(10), TARGET, observation="rgbd"), noise=0.2), 2)
     duplicate = copy.deepcopy(env)
     transforms = duplicate.unwrapped.frame_transforms  # type: ignore[attr-defined]
     assert len(transforms) == 1 and duplicate.unwrapped is not env.unwrapped
@@ -187,27 +159,364 @@ def test_wrappers_are_copied_with_it() -> None:
 
 def test_copies_before_and_after_an_episode() -> None:
     env = SlamEnv(ToySequence(4), TARGET)
-    check_alike(started(env, 0), started(copy.deepcopy(env), 0))
+    assert rest(stepped(env, 0)) == rest(stepped(copy.deepcopy(env), 0))
     assert copy.deepcopy(env).episode_metrics() == env.episode_metrics()
 
 
+MOTION_M = float(np.hypot(STEP_M, 0.002))
+
+
 @pytest.mark.parametrize(
-    "tracker", ["orb-slam2", "emfoa-oft?masks=none", "never-move", "dynaslam-g", "opencv-odometry"]
+    ("reward", "error"), [("neg_rpe", "frame_error_trans_m"), ("neg_pose_error", "pose_error_trans_m")]
 )
-def test_built_in_trackers_go_on_to_the_bit(tracker: str) -> None:
-    if TRACKERS.get(tracker).missing():
-        pytest.skip(f"{tracker} is not installed")
-    env = started(SlamEnv(CornerSequence(6), tracker, threads=2), 3)
-    duplicate = copy.deepcopy(env)
-    check_alike(env, duplicate)
-    finals = [each.unwrapped.final_trajectory() for each in (env, duplicate)]  # type: ignore[attr-defined]
-    assert finals == [None, None] or np.array_equal(finals[0].T_world_cam, finals[1].T_world_cam)
+def test_rewards_are_minus_the_errors_in_info(reward: str, error: str) -> None:
+    rewards, infos, _ = play(SlamEnv(ToySequence(12), TARGET, reward=reward))
+    assert rewards == [-info[error] for info in infos[1:]] and min(rewards) < 0
 
 
-def test_a_program_is_refused_and_stays_usable(tmp_path: Path) -> None:
-    (tmp_path / "still.py").write_text(PROGRAM)
-    env = started(SlamEnv(ToySequence(5), f"subprocess:{sys.executable} {tmp_path / 'still.py'}"), 1)
-    with pytest.raises(TrackerError, match="cannot be copied"):
-        copy.deepcopy(env)
-    env.step(0)
+def test_pose_error_against_an_independent_computation() -> None:
+    env = SlamEnv(ToySequence(12), TARGET)
+    _, infos, _ = play(env)
+    estimate, true = env.online_trajectory().T_world_cam, truth(12)
+    assert len(infos) == 12
+    for i, info in enumerate(infos):
+        error = np.linalg.inv(np.linalg.inv(true[0]) @ true[i]) @ (np.linalg.inv(estimate[0]) @ estimate[i])
+        assert info["pose_error_trans_m"] == pytest.approx(np.linalg.norm(error[:3, 3]), abs=1e-12)
+        angle = np.rad2deg(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)))
+        assert info["pose_error_rot_deg"] == pytest.approx(angle, abs=1e-5)
+
+
+def test_lost_frames_cost_twice_the_way_and_the_way_back_nothing() -> None:
+    env = SlamEnv(ToySequence(12), TARGET, settings=QUIET | {"mode": "lost", "at": 4, "until": 7})
+    rewards, infos, _ = play(env)
+    assert np.allclose(rewards[:3], 0, atol=1e-9) and np.allclose(rewards[6:], 0, atol=1e-9)
+    assert np.allclose(rewards[3:6], -2 * MOTION_M, atol=1e-9)  # frames 4, 5, 6
+    assert [info["tracking_state"] for info in infos[4:7]] == ["lost"] * 3
+    assert all("pose" not in info for info in infos[4:7])
+    assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(9 / 12)
+
+
+@pytest.mark.parametrize("reward", ["neg_rpe", "neg_pose_error"])
+def test_quitting_never_pays(reward: str) -> None:
+    lost = QUIET | {"mode": "lost", "at": 4}
+    whole, _, _ = play(SlamEnv(ToySequence(20), TARGET, settings=lost, reward=reward))
+    short, infos, ends = play(SlamEnv(ToySequence(20), TARGET, settings=lost, reward=reward, lost_after=3))
+    assert len(short) == 6 and ends[-1] == (True, False)
+    assert sum(short) == pytest.approx(sum(whole), abs=1e-12)
+    assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(4 / 20)
+
+
+def test_a_tracker_that_never_begins_is_charged_too() -> None:
+    rewards, infos, _ = play(SlamEnv(ToySequence(8), TARGET, settings={"mode": "initialising", "at": 0}))
+    assert np.allclose(rewards, -2 * MOTION_M, atol=1e-9)
+    assert "ate_rmse_m" not in infos[-1]["episode_metrics"]
+    assert infos[-1]["episode_metrics"]["coverage"] == 0
+
+
+def test_without_ground_truth_or_scale_errors_are_left_out() -> None:
+    """A monocular tracker has errors under a Sim(3) protocol alone."""
+    monocular = replace(SPEC, sensors="rgb")
+    for env in (SlamEnv(ToySequence(8, has_truth=False), TARGET), SlamEnv(ToySequence(8), monocular)):
+        rewards, infos, _ = play(env)
+        assert rewards == [0.0] * 7
+        assert not any(key.startswith(("pose_error", "frame_error")) for info in infos for key in info)
+        assert infos[-1]["episode_metrics"] == {"coverage": 1.0, "frames": 8.0, "tracked_frames": 8.0}
+    _, infos, _ = play(SlamEnv(ToySequence(8), monocular, protocol=MONOCULAR))
+    assert infos[-1]["episode_metrics"]["ate_rmse_m"] > 0
+
+
+def test_a_tracker_that_needs_depth_is_refused_where_there_is_none() -> None:
+    sequence = ToySequence(8)
+    sequence.has_depth = False
+    with pytest.raises(TrackerError, match="needs depth"):
+        SlamEnv(sequence, SPEC)
+    assert len(play(SlamEnv(sequence, replace(SPEC, sensors="rgb")))[0]) == 7
+
+
+def test_a_hole_in_the_ground_truth() -> None:
+    _, infos, _ = play(SlamEnv(ToySequence(12, hole=(4, 8)), TARGET))
+    have = ["pose_error_trans_m" in info for info in infos]
+    assert have == [True] * 4 + [False] * 4 + [True] * 4
+    assert "frame_error_trans_m" not in infos[8] and "frame_error_trans_m" in infos[9]
+    assert all(np.isfinite(value) for info in infos for value in info.values() if isinstance(value, float))
+
+
+def test_the_last_info_carries_the_metrics_of_the_protocol() -> None:
+    env = SlamEnv(ToySequence(40), TARGET, protocol="evo-default")
+    _, infos, _ = play(env)
+    assert "episode_metrics" not in infos[-2] and infos[-1]["protocol"] == "evo-default"
+    want = evaluate(
+        env.online_trajectory(), env.sequence.ground_truth, "evo-default", input_timestamps=env.sequence.timestamps
+    ).metrics
+    assert {key: infos[-1]["episode_metrics"][key] for key in want} == want
+
+
+def test_info_holds_the_pose_and_no_times_and_timings_do() -> None:
+    env = SlamEnv(ToySequence(5), TARGET)
+    _, infos, _ = play(env)
+    assert not any("time" in key and key != "timestamp" for info in infos for key in info)
+    assert len(env.timings) == 5 and list(env.timings[0]) == ["read", "total", "processor", "features", "tracking"]
+    poses = np.array([info["pose"] for info in infos])
+    again = se3.from_quaternion(poses[:, :3], poses[:, 3:])
+    assert poses.dtype == np.float64 and np.allclose(again, env.online_trajectory().T_world_cam, atol=1e-12)
+
+
+def test_frames_and_stride_cut_the_sequence(toy_folder: str) -> None:
+    env = SlamEnv(toy_folder, TARGET, frames="10:40", stride=3)
+    assert len(env.sequence) == 10
+    _, infos, _ = play(env)
+    assert infos[1]["timestamp"] - infos[0]["timestamp"] == pytest.approx(0.1, abs=1e-5)
+    in_memory = SlamEnv(ToySequence(60), TARGET, frames=[10, 40], stride=3)
+    assert np.allclose(in_memory.sequence.timestamps, env.sequence.timestamps, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        ("nan", r"frame 4 returned a pose with 16 values that are not finite"),
+        ("scaled", r"frame 4 returned a pose that is no rigid transformation: .* det R = 8"),
+        ("mirrored", r"frame 4 returned a pose that is no rigid transformation: .* det R = -1"),
+        ("far", r"frame 4 returned a pose 1e\+200 m away"),
+        ("none", r"frame 4 returned state 'ok' without a pose"),
+        ("string", r"frame 4 returned a str"),
+    ],
+)
+def test_a_tracker_that_breaks_its_contract(mode: str, message: str) -> None:
+    env = SlamEnv(ToySequence(12), TARGET, settings={"mode": mode})
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(0)
+    with pytest.raises(TrackerContractError, match=message):
+        env.step(0)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"tracker": "emfoa-otf"}, DynslamError, "unknown tracker 'emfoa-otf'.*emfoa-oft"),
+        ({"settings": {"nois.level_m": 1}}, SettingsError, "unknown setting 'nois.level_m'.*noise.level_m"),
+        ({"settings": {"noise.level_m": 7.0}}, SettingsError, "'noise.level_m' is 7.0"),
+        ({"control": ["noise.levelm"]}, SettingsError, "unknown setting 'noise.levelm'.*noise.level_m"),
+        ({"control": ["noise.seedless"]}, SettingsError, "'noise.seedless' may not change in mid-episode"),
+        ({"control": ["mode"]}, SettingsError, "'mode' may not change in mid-episode"),
+        ({"control": ["noise.clip", "noise.clip"]}, SettingsError, "twice"),
+        ({"control": "noise.clip"}, SettingsError, "list of setting names"),
+        ({"reward": "neg_ate"}, SettingsError, "unknown reward 'neg_ate'"),
+        ({"observation": "pixels"}, SettingsError, "unknown observation 'pixels'"),
+        ({"protocol": "tum-rgbd/v2"}, DynslamError, "unknown protocol 'tum-rgbd/v2'.*tum-rgbd/v1"),
+        ({"device": "gpu"}, SettingsError, "unknown device 'gpu'"),
+        ({"device": "cuda:99"}, SettingsError, "cuda:99"),
+        ({"render_mode": "human"}, SettingsError, "unknown render mode"),
+        ({"lost_after": 0}, SettingsError, "lost_after is 0"),
+        ({"threads": 0}, SettingsError, "threads is 0"),
+        ({"stride": 0}, SequenceError, "stride is 0"),
+        ({"frames": (5, 6)}, SequenceError, "1 frames here, an episode needs 2"),
+        ({"frames": (50, 60)}, SequenceError, "hold none of the 12 frames"),
+        ({"frames": (5, 2)}, SequenceError, "5:2"),
+        ({"frames": (1, 2, 3)}, SequenceError, "no range of frames"),
+        ({"sequence": "tum/fr3/walkingxyz"}, SequenceError, "did you mean 'tum/fr3/walking_xyz'"),
+    ],
+)
+def test_bad_input_is_one_clear_line(kwargs: dict, error: type, message: str) -> None:
+    arguments = {"sequence": ToySequence(12), "tracker": TARGET} | kwargs
+    with pytest.raises(error, match=message) as caught:
+        SlamEnv(**arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_steps_out_of_order() -> None:
+    env = SlamEnv(ToySequence(3), TARGET)
+    with pytest.raises(DynslamError, match="before reset"):
+        env.step(0)
+    play(env)
+    with pytest.raises(DynslamError, match="episode is over after frame 2"):
+        env.step(0)
     env.close()
+    env.reset(seed=1)
+    env.step(0)
+
+
+def test_reset_options() -> None:
+    env = SlamEnv(ToySequence(6), TARGET)
+    env.reset(seed=0)
+    env.reset(seed=0, options={"settings": {"noise.enabled": False}, "sequence": ToySequence(9)})
+    assert len(env.sequence) == 9 and env.settings.noise.enabled is False
+    assert env.step(0)[4]["frame_error_trans_m"] == pytest.approx(0, abs=1e-12), "another tracker"
+    with pytest.raises(SettingsError, match="unknown reset option 'sequnce'"):
+        env.reset(options={"sequnce": "x"})
+
+
+def test_a_tracker_that_cannot_be_steered(toy_folder: str) -> None:
+    env = SlamEnv(toy_folder, TARGET.replace(":SPEC", ":FIXED"), control=["noise.clip"])
+    with pytest.raises(TrackerError, match="toy-fixed' cannot change its settings in mid-episode"):
+        env.reset()
+
+
+def test_the_final_trajectory_is_that_of_the_frames_so_far() -> None:
+    """Asking in mid-episode freezes nothing: the end's metrics are those of a run that was never asked."""
+    final = Protocol.model_validate(get_protocol("tum-rgbd/v1").model_dump() | {"id": "f/v1", "trajectory": "final"})
+    asked, quiet = (SlamEnv(ToySequence(12), TARGET, protocol=final) for _ in range(2))
+    for env in (asked, quiet):
+        env.reset(seed=1)
+    for index in range(1, 12):
+        for env in (asked, quiet):
+            env.step(env.neutral_action)
+        trajectory = asked.final_trajectory()
+        assert trajectory is not None and len(trajectory) == index + 1
+        assert asked.episode_metrics()["coverage"] == 1.0
+    assert asked.episode_metrics() == quiet.episode_metrics()
+
+
+def test_coverage_is_that_of_the_trajectory_that_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tracker that answers `finalize` with a few poses does not get the coverage of its online states."""
+    final = Protocol.model_validate(get_protocol("tum-rgbd/v1").model_dump() | {"id": "f/v1", "trajectory": "final"})
+    whole = ToyTracker.finalize
+    monkeypatch.setattr(ToyTracker, "finalize", lambda self: whole(self).select(slice(0, 4)))
+    spec = replace(SPEC, entry_point="envs_toys:ToyTracker")
+    for protocol, tracked in ((final, 4), (get_protocol("tum-rgbd/v1"), 12)):
+        _, infos, _ = play(SlamEnv(ToySequence(12), spec, protocol=protocol))
+        metrics = infos[-1]["episode_metrics"]
+        assert (metrics["tracked_frames"], metrics["coverage"]) == (tracked, tracked / 12)
+
+
+def test_asking_for_the_final_trajectory_changes_no_later_pose() -> None:
+    """With all of the map refined at the end, which a run that goes on takes back."""
+    poses = []
+    for asks in (True, False):
+        settings = {"backend.bundle_adjustment.full": True}
+        env = SlamEnv("synthetic/fast_walking?scene=100&frames=14", "orb-slam2", settings=settings)
+        env.reset(seed=0)
+        for _ in range(13):
+            if asks:
+                env.final_trajectory()
+            env.step(env.neutral_action)
+        poses.append(env.online_trajectory().T_world_cam)
+    assert np.array_equal(*poses)
+
+
+def test_a_reset_that_fails_ends_the_episode_and_changes_nothing(tmp_path: Path) -> None:
+    (damaged := tmp_path / "damaged.npz").write_bytes(b"no map")
+    env = SlamEnv(ToySequence(12), "emfoa-oft?masks=none")
+    env.reset(seed=0)
+    settings, sequence = env.settings, env.sequence
+    for options, words in (
+        ({"settings": {"backend.map.localisation_only": True}}, "needs a map"),
+        ({"settings": _only_localising(settings)}, "needs a map"),
+        ({"settings": {"epipolar.threshold_px": 1.25}, "sequence": "no/such"}, "no/such"),
+        ({"colour": 1}, "unknown reset option"),
+        ({"settings": {"backend.map.file": str(damaged)}}, "damaged.npz"),
+    ):
+        with pytest.raises(DynslamError, match=words):
+            env.reset(options=options)
+        assert (env.settings, env.sequence) == (settings, sequence) and env.final_trajectory() is None
+        with pytest.raises(DynslamError, match="before reset"):
+            env.step(env.neutral_action)
+    with pytest.raises(SettingsError, match="needs a map"):
+        SlamEnv(ToySequence(12), "emfoa-oft?masks=none", settings=_only_localising(settings))
+    env.reset(seed=0)
+    env.step(env.neutral_action)
+
+
+def _only_localising(settings: Any) -> Any:
+    """Complete settings that do not go together."""
+    start = settings.backend.map.model_copy(update={"localisation_only": True})
+    backend = settings.backend.model_copy(update={"map": start})
+    return settings.model_copy(update={"backend": backend})
+
+
+@pytest.mark.parametrize(
+    "stamps", [[0.0, 0.1, 0.1, 0.2], [0.0, 0.2, 0.1, 0.3], [0.0, 0.1, np.nan, 0.3], [0.0, 0.1, 0.1 + 2e-7, 0.2]]
+)
+def test_stamps_that_do_not_tell_frames_apart_are_refused_before_anything_runs(stamps: list[float]) -> None:
+    sequence = ToySequence(4)
+    sequence.timestamps = np.array(stamps)
+    with pytest.raises(SequenceError, match=r"stamps|ns apart"):
+        SlamEnv(sequence, TARGET)
+
+
+# What episodes earn, over random ones: with `neg_pose_error`, getting lost never pays.
+
+
+EPISODES = 12
+
+
+def walk(rng: np.random.Generator, step: float, frames: int = 40) -> np.ndarray:
+    """Random poses ``[N, 4, 4]``; `step` metres and radians a frame."""
+    poses = [se3.exp(rng.normal(size=6))]
+    for _ in range(frames - 1):
+        poses.append(poses[-1] @ se3.exp(rng.normal(0, step, 6)))
+    return np.array(poses)
+
+
+def episode(seed: int) -> tuple[Trajectory, np.ndarray, np.ndarray]:
+    """A true path with holes, estimates that drift little or wildly, and which frames are tracked."""
+    rng = np.random.default_rng(seed)
+    true = walk(rng, 0.02)
+    drift = np.cumsum(rng.normal(0, 10 ** rng.uniform(-4, 0), (len(true), 6)), axis=0)
+    stamps = np.arange(len(true)) / 30.0
+    known = rng.random(len(true)) > rng.choice([0.0, 0.3])
+    known[0] = True
+    return Trajectory(stamps[known], true[known]), true @ se3.exp(drift), rng.random(len(true)) > rng.choice([0.0, 0.4])
+
+
+def rewards(name: str, truth: Trajectory, poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
+    online, so_far, earned = OnlineError(truth), Episode(), []
+    for index, (pose, ok) in enumerate(zip(poses, tracked, strict=True)):
+        error = online.update(index / 30.0, pose if ok else None)
+        so_far.add(FrameOutcome(index, index / 30.0, "ok", None, {}, {}, error))
+        earned.append(REWARDS[name](so_far))
+    return np.array(earned)
+
+
+@pytest.mark.parametrize("seed", range(EPISODES))
+def test_losing_a_tracked_frame_raises_no_frames_reward(seed: int) -> None:
+    """Of every frame but the one that begins the frame of reference, alone, and from it on to the end."""
+    truth, poses, tracked = episode(seed)
+    earned = rewards("neg_pose_error", truth, poses, tracked)
+    first = int(np.argmax(tracked))
+    for frame in range(first + 1, len(poses)):
+        once, ever = tracked.copy(), tracked.copy()
+        once[frame] = ever[frame:] = False
+        for lost in (once, ever):
+            assert (rewards("neg_pose_error", truth, poses, lost) <= earned + 1e-12).all()
+
+
+@pytest.mark.parametrize("seed", range(EPISODES))
+def test_no_episode_earns_less_than_one_that_is_lost_throughout(seed: int) -> None:
+    truth, poses, tracked = episode(seed)
+    nothing = rewards("neg_pose_error", truth, poses, np.zeros(len(poses), bool))
+    way = np.r_[0, np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))]
+    known = np.isin(np.arange(len(poses)) / 30.0, truth.timestamps)
+    assert nothing[known] == pytest.approx(-way, abs=1e-12) and not nothing[~known].any()
+    assert (rewards("neg_pose_error", truth, poses, tracked) >= nothing - 1e-12).all()
+    still = rewards("neg_pose_error", truth, np.repeat(np.eye(4)[None], len(poses), axis=0), np.ones(len(poses), bool))
+    assert (still >= nothing - 1e-12).all()
+
+
+@pytest.mark.parametrize("seed", range(EPISODES))
+def test_under_neg_rpe_admitting_a_loss_never_earns_more_than_repeating_the_last_pose(seed: int) -> None:
+    truth, poses, tracked = episode(seed)
+    tracked[0] = True
+    repeated = poses[np.maximum.accumulate(np.where(tracked, np.arange(len(poses)), 0))]
+    admitted = rewards("neg_rpe", truth, poses, tracked)
+    kept = rewards("neg_rpe", truth, repeated, np.ones(len(poses), bool))
+    assert (np.cumsum(admitted) <= np.cumsum(kept) + 1e-12).all(), "wherever the episode ends"
+    assert admitted[tracked & np.r_[True, tracked[:-1]]] == pytest.approx(kept[tracked & np.r_[True, tracked[:-1]]])
+    if not tracked.all():
+        assert admitted.sum() < kept.sum()
+
+
+def test_under_neg_rpe_the_way_back_costs_nothing_and_a_wrong_one_its_error() -> None:
+    stamps = np.arange(60) / 30.0
+    true = np.repeat(np.eye(4)[None], 60, axis=0)
+    true[:, 0, 3] = np.cumsum(np.r_[0, np.full(59, 0.01)])
+    tracked = np.ones(60, bool)
+    tracked[20:50] = False
+    truth = Trajectory(stamps, true)
+    earned = rewards("neg_rpe", truth, true, tracked)
+    assert earned[20:50] == pytest.approx(-0.02) and not np.delete(earned, np.s_[20:50]).any()
+    wrong = true.copy()
+    wrong[50:, 0, 3] += 0.3
+    assert rewards("neg_rpe", truth, wrong, tracked)[50] == pytest.approx(-0.3)
+    tracked[50:] = False
+    assert rewards("neg_rpe", truth, true, tracked).sum() < earned.sum(), "to stay lost does not pay"

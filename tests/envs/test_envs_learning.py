@@ -1,7 +1,9 @@
 """What agents learn with: windows, copies of an episode, fixed infos, costs, choices and further observations."""
 
+import copy
 import pickle
 import sys
+import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +12,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_toys import SPEC, TARGET, ToySequence, ToyTracker, write_folder
-from gymnasium.utils.env_checker import check_env
+from envs_play import QUIET, checked, play, rest, stepped
+from envs_toys import FIXED, SPEC, TARGET, FixedTracker, ToySequence, ToyTracker, images, write_folder
 
+import dynslam_bench.envs  # noqa: F401
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.envs import (
@@ -21,30 +25,28 @@ from dynslam_bench.envs import (
     PRIVILEGED_LAYOUT,
     REWARDS,
     AccuracyMinusCost,
+    Degradation,
+    DegradeFrames,
     DiscreteActions,
     DropFrames,
     Episode,
     NegWindowError,
+    RecordTimings,
+    RecordTrajectory,
     SequenceSampler,
     SlamEnv,
+    SmallImages,
 )
 from dynslam_bench.envs.episode import metric_names
+from dynslam_bench.envs.spaces import MAX_DEPTH_M
+from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.testing import CornerSequence
 
-QUIET = {"noise.enabled": False}
 PARTS = ["stats", "rgb", "depth", "gray", "keypoints", "privileged"]
 
 
-def play(env: gym.Env, action: Any = None, **reset: Any) -> tuple[list[float], list[dict]]:
-    """Rewards and infos of an episode."""
-    rewards, infos, over = [], [env.reset(**reset)[1]], False
-    while not over:
-        asked = env.unwrapped.neutral_action if action is None else action
-        _, reward, terminated, truncated, info = env.step(asked)
-        rewards.append(float(reward))
-        infos.append(info)
-        over = terminated or truncated
-    return rewards, infos
+def made(sequence: Any, tracker: str = TARGET, **arguments: Any) -> gym.Env:
+    return gym.make(GENERIC_ID, sequence=sequence, tracker=tracker, render_mode="rgb_array", **arguments)
 
 
 # Windows.
@@ -57,7 +59,7 @@ def test_a_window_is_the_episode_of_these_frames_alone(sequence: Any) -> None:
     env = SlamEnv(sequence, tracker, settings=settings)
     cut = SlamEnv(sequence, tracker, settings=settings, frames=(5, 11))
     env.reset(seed=1)
-    rewards, infos = play(env, seed=3, options={"window": (5, 11)})
+    rewards, infos, _ = play(env, seed=3, options={"window": (5, 11)})
     assert rewards == play(cut, seed=3)[0] and len(rewards) == 5
     assert infos[0]["window"].tolist() == infos[-1]["window"].tolist() == [5, 11]
     assert infos[-1]["episode_metrics"]["frames"] == 6
@@ -96,28 +98,17 @@ def test_a_window_longer_than_the_sequence() -> None:
 # Copies of an episode.
 
 
-def stepped(env: gym.Env, steps: int, seed: int = 3) -> gym.Env:
-    env.reset(seed=seed)
-    for _ in range(steps):
-        env.step(env.unwrapped.neutral_action)
-    return env
-
-
-def rest(env: SlamEnv, action: Any = None) -> tuple[list[float], bytes, bytes]:
-    """Rewards of the steps that are left, the online poses and the last observation."""
-    rewards = []
-    while not env.episode.over:
-        observation, reward, *_ = env.step(env.neutral_action if action is None else action)
-        rewards.append(float(reward))
-    return rewards, env.online_trajectory().T_world_cam.tobytes(), observation.tobytes()
-
-
-@pytest.mark.parametrize("tracker", ["orb-slam2", "emfoa-oft?masks=none", "opencv-odometry", "mask-rcnn"])
-def test_a_restored_episode_goes_on_to_the_bit(tracker: str) -> None:
+@pytest.mark.parametrize(
+    "tracker", ["orb-slam2", "emfoa-oft?masks=none", "never-move", "dynaslam-g", "opencv-odometry", "mask-rcnn"]
+)
+def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
     sequence = "synthetic/walking_xyz?scene=0&frames=8" if tracker == "mask-rcnn" else CornerSequence(8)
-    env = stepped(SlamEnv(sequence, tracker), 3)
-    state = env.clone_state()
+    env = stepped(SlamEnv(sequence, tracker, threads=2), 3)
+    state, duplicate = env.clone_state(), copy.deepcopy(env)
     first = rest(env)
+    assert rest(duplicate) == first and len(first[0]) == 4
+    finals = [each.final_trajectory() for each in (env, duplicate)]
+    assert finals == [None, None] or np.array_equal(finals[0].T_world_cam, finals[1].T_world_cam)
     for _ in range(2):
         env.restore_state(state)
         assert env.episode.next_index == 4 and rest(env) == first
@@ -171,7 +162,7 @@ def test_a_state_of_another_sequence_tracker_control_or_version_is_refused(monke
         SlamEnv(ToySequence(9), TARGET).clone_state()
 
 
-def test_external_programs_cannot_be_cloned(tmp_path: Path) -> None:
+def test_external_programs_cannot_be_copied_and_stay_usable(tmp_path: Path) -> None:
     still = '{"state": "ok", "T_world_cam": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}'
     (tmp_path / "still.py").write_text(
         "import json, sys\n"
@@ -181,8 +172,10 @@ def test_external_programs_cannot_be_cloned(tmp_path: Path) -> None:
         "    print(json.dumps(answer | {key: request[key] for key in request if key == 'index'}), flush=True)\n"
     )
     env = stepped(SlamEnv(ToySequence(5), f"subprocess:{sys.executable} {tmp_path / 'still.py'}"), 1)
-    with pytest.raises(TrackerError, match="cannot be copied"):
-        env.clone_state()
+    for way in (env.clone_state, lambda: copy.deepcopy(env)):
+        with pytest.raises(TrackerError, match="cannot be copied"):
+            way()
+    env.step(0)
     env.close()
 
 
@@ -289,9 +282,9 @@ def test_vector_environments_take_every_part(tmp_path: Path, fixed: bool) -> Non
 def test_a_network_call_costs_its_weight() -> None:
     sequence = "synthetic/sitting_xyz?frames=7"
     settings = {"segmentation.source": "oracle", "segmentation.schedule": "every_nth", "segmentation.n": 3}
-    plain, infos = play(SlamEnv(sequence, "mask-rcnn", settings=settings), seed=0)
-    default, _ = play(SlamEnv(sequence, "mask-rcnn", settings=settings, reward="accuracy_minus_cost"), seed=0)
-    dear, _ = play(SlamEnv(sequence, "mask-rcnn", settings=settings, reward=AccuracyMinusCost(weight=0.5)), seed=0)
+    plain, infos, _ = play(SlamEnv(sequence, "mask-rcnn", settings=settings), seed=0)
+    default, *_ = play(SlamEnv(sequence, "mask-rcnn", settings=settings, reward="accuracy_minus_cost"), seed=0)
+    dear, *_ = play(SlamEnv(sequence, "mask-rcnn", settings=settings, reward=AccuracyMinusCost(weight=0.5)), seed=0)
     calls = np.array([info["stats"]["segmented"] for info in infos[1:]])
     assert calls.tolist() == [0, 0, 1, 0, 0, 1]
     np.testing.assert_allclose(default, plain - 0.001 * calls, atol=1e-15)
@@ -300,7 +293,7 @@ def test_a_network_call_costs_its_weight() -> None:
 
 def test_processor_time_is_the_other_cost() -> None:
     env = SlamEnv(ToySequence(6), TARGET, reward=AccuracyMinusCost(weight=2.0, cost="processor_s"))
-    rewards, infos = play(env)
+    rewards, infos, _ = play(env)
     spent = [timing["processor"] for timing in env.timings[1:]]
     errors = [info["frame_error_trans_m"] for info in infos[1:]]
     np.testing.assert_allclose(rewards, -np.array(errors) - 2.0 * np.array(spent), atol=1e-15)
@@ -308,7 +301,7 @@ def test_processor_time_is_the_other_cost() -> None:
 
 def test_the_windowed_error_is_the_relative_error_over_the_window() -> None:
     env = SlamEnv(ToySequence(12), TARGET, reward=NegWindowError(frames=4))
-    rewards, _ = play(env)
+    rewards, *_ = play(env)
     estimate, true = env.online_trajectory().T_world_cam, env.sequence.ground_truth.T_world_cam
     for frame in range(1, 12):
         start = max(frame - 4, 0)
@@ -344,24 +337,14 @@ def test_a_callable_earns_what_it_returns_and_sees_the_episode() -> None:
         return 0.5 if episode.outcomes[-1].state == "ok" else -1.0
 
     settings = {"mode": "lost", "at": 4}
-    rewards, _ = play(SlamEnv(ToySequence(10), TARGET, settings=settings, reward=reward, lost_after=2))
+    rewards, *_ = play(SlamEnv(ToySequence(10), TARGET, settings=settings, reward=reward, lost_after=2))
     assert rewards == [0.5, 0.5, 0.5, -1.0, -1.0 - 4.0] and lengths == [*range(1, 11)]
-    with pytest.raises(SettingsError, match="unknown reward 'neg_ate'"):
-        SlamEnv(ToySequence(10), TARGET, reward="neg_ate")
 
 
 @pytest.mark.parametrize("reward", [*REWARDS, AccuracyMinusCost(weight=0.1)])
 def test_every_reward_passes_the_checker(reward: Any) -> None:
     for sequence in (ToySequence(9), ToySequence(9, has_truth=False), ToySequence(9, hole=(0, 4))):
-        checked(sequence, reward=reward, lost_after=3, window=6)
-
-
-def checked(sequence: Any, tracker: str = TARGET, **kwargs: Any) -> None:
-    env = gym.make(GENERIC_ID, sequence=sequence, tracker=tracker, render_mode="rgb_array", **kwargs)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped)
-    env.close()
+        checked(made(sequence, reward=reward, lost_after=3, window=6))
 
 
 # Choices.
@@ -419,8 +402,8 @@ def test_no_other_choice_is_taken() -> None:
 
 def test_every_part_passes_the_checker_alone_and_together() -> None:
     for parts in (*([part] for part in PARTS), PARTS):
-        checked(ToySequence(6), observation=parts)
-    checked(ToySequence(6), TARGET.replace(":SPEC", ":FIXED"), observation=PARTS)
+        checked(made(ToySequence(6), observation=parts))
+    checked(made(ToySequence(6), TARGET.replace(":SPEC", ":FIXED"), observation=PARTS))
 
 
 def test_keypoints_are_padded_and_thinned_and_say_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -471,11 +454,6 @@ def test_the_truth_is_in_its_own_key_alone() -> None:
         assert told["motion_x"] == pytest.approx(np.tanh(0.1), abs=1e-3)
 
 
-def test_unknown_parts_are_named() -> None:
-    with pytest.raises(SettingsError, match=r"unknown observation 'colour'.*keypoints"):
-        SlamEnv(ToySequence(8), TARGET, observation=["stats", "colour"])
-
-
 def test_stable_baselines3_takes_choices_and_parts() -> None:
     checks = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra [rl] is not installed")
     env = SlamEnv(
@@ -484,3 +462,206 @@ def test_stable_baselines3_takes_choices_and_parts() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checks.check_env(DiscreteActions(env, [{}, {"noise.passes": 3}]))
+
+
+def test_record_timings() -> None:
+    env = RecordTimings(SlamEnv(ToySequence(6), TARGET))
+    for info in (env.reset(seed=0)[1], *(env.step(0)[4] for _ in range(5))):
+        assert info["timings"]["features"] == 0.001 and info["timings"]["total"] > 0
+    assert env.summary()["features"] == {"median": 0.001, "p95": 0.001}
+
+
+def test_record_trajectory(tmp_path) -> None:
+    base = SlamEnv(ToySequence(6), TARGET, settings={"mode": "lost", "at": 2, "until": 4})
+    env = RecordTrajectory(base, tmp_path / "run_{episode}.txt")
+    for episode in range(2):
+        play(env)
+        written = read_tum(tmp_path / f"run_{episode}.txt")
+        assert len(written) == 4
+        assert np.allclose(written.T_world_cam, base.online_trajectory().T_world_cam, atol=1e-8)
+    assert [path.name for path in env.written] == ["run_0.txt", "run_1.txt"]
+
+
+@pytest.mark.parametrize(
+    ("frame_time_s", "speed", "tracked"),
+    [
+        (0.9 / 30, 1.0, [*range(1, 11)]),
+        (1.9 / 30, 1.0, [1, 3, 5, 7, 9, 10]),
+        (0.9 / 30, 2.0, [1, 3, 5, 7, 9, 10]),
+        (100.0, 1.0, [10]),  # slower than the whole sequence: it still gets the last frame
+    ],
+)
+def test_a_busy_tracker_misses_frames(frame_time_s: float, speed: float, tracked: list[int]) -> None:
+    env = DropFrames(SlamEnv(ToySequence(11), TARGET), frame_time_s=frame_time_s, speed=speed)
+    _, infos, ends = play(env)
+    assert [info["frame_index"] for info in infos[1:]] == tracked and env.dropped == 10 - len(tracked)
+    assert ends[-1][1] and infos[-1]["episode_metrics"]["coverage"] == pytest.approx((1 + len(tracked)) / 11)
+
+
+def test_dropped_frames_cost_the_error_of_not_moving() -> None:
+    whole, *_ = play(SlamEnv(ToySequence(11), TARGET, settings=QUIET))
+    dropping, *_ = play(DropFrames(SlamEnv(ToySequence(11), TARGET, settings=QUIET), frame_time_s=1.9 / 30))
+    motion = np.hypot(0.01, 0.002)
+    assert sum(whole) == pytest.approx(0, abs=1e-9)
+    assert sum(dropping) == pytest.approx(-8 * motion, abs=1e-6)  # 4 dropped, 4 ways back
+
+
+def test_random_drops_are_seeded_and_near_their_share() -> None:
+    def seen(seed: int) -> list[int]:
+        env = DropFrames(SlamEnv(ToySequence(200), TARGET), share=0.3, seed=seed)
+        return [info["frame_index"] for info in play(env)[1][1:]]
+
+    assert seen(1) == seen(1) != seen(2)
+    assert 120 < len(seen(1)) < 160 and seen(1)[-1] == 199
+
+
+def test_dropping_more_than_is_left() -> None:
+    env = SlamEnv(ToySequence(5), TARGET)
+    env.reset(seed=0)
+    with pytest.raises(DynslamError, match="cannot drop 4 frames, 3 are left"):
+        env.drop_frames(4)
+
+
+@pytest.mark.parametrize("kind", ["lighting", "glare", "shadow", "blur", "noise"])
+def test_degradation_grows_with_its_strength_and_repeats(kind: str) -> None:
+    frame = Frame(7, 1.0, *images(7))
+    changes = []
+    for strength in (0.0, 0.3, 1.0):
+        degraded = Degradation(**{kind: strength}, seed=3)(frame)
+        assert degraded.rgb.dtype == np.uint8 and degraded.rgb.shape == frame.rgb.shape
+        assert (Degradation(**{kind: strength}, seed=3)(frame).rgb == degraded.rgb).all()
+        assert (degraded.depth == frame.depth).all()
+        changes.append(float(np.abs(degraded.rgb.astype(float) - frame.rgb).mean()))
+    assert changes[0] == 0 and 0 < changes[1] < changes[2]
+    assert (Degradation(**{kind: 1.0}, seed=4)(frame).rgb != Degradation(**{kind: 1.0}, seed=3)(frame).rgb).any()
+
+
+def test_what_each_degradation_does() -> None:
+    gray = Frame(20, 1.0, np.full((120, 160, 3), 120, np.uint8), np.full((120, 160), 2.0, np.float32))
+    dark = Degradation(lighting=1.0)(gray).rgb
+    assert dark.mean() < 120
+    shadow = Degradation(shadow=1.0)(gray).rgb[..., 0]
+    assert shadow.min() == pytest.approx(0.15 * 120, abs=2) and shadow.max() == pytest.approx(120, abs=2)
+    glare = Degradation(glare=1.0)(gray).rgb[..., 0]
+    assert (glare == 255).any() and glare.min() >= 120
+    noise = Degradation(noise=0.5)(gray).rgb.astype(float)
+    assert noise.std() == pytest.approx(20, rel=0.05) and noise.mean() == pytest.approx(120, abs=0.5)
+    depth = Degradation(depth_noise=1.0)(gray).depth
+    assert (depth == 0).mean() == pytest.approx(0.3, abs=0.02)
+    assert depth[depth > 0].std() == pytest.approx(0.08, rel=0.05)
+    edge = Frame(20, 1.0, np.repeat(np.uint8([[[0]] * 80 + [[200]] * 80] * 120), 3, axis=2), gray.depth)
+    blurred = Degradation(blur=1.0)(edge).rgb[60, :, 0].astype(int)
+    assert ((blurred > 5) & (blurred < 195)).sum() > 3 and blurred[0] == 0 and blurred[-1] == 200
+
+
+def test_degraded_frames_reach_the_tracker_and_the_observation() -> None:
+    env = DegradeFrames(SlamEnv(ToySequence(5), TARGET, observation="rgbd"), noise=0.5, seed=1)
+    seen, _ = env.reset(seed=0)
+    assert (seen["rgb"] != images(0)[0]).mean() > 0.9
+    assert (seen["rgb"] == env.unwrapped.frame.rgb).all()
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "arguments"),
+    [(DegradeFrames, {"blur": 1.5}), (DegradeFrames, {"noise": -0.1}), (SequenceSampler, {"sequences": []})]
+    + [(DropFrames, arguments) for arguments in ({"speed": 0}, {"frame_time_s": -1}, {"share": 1.0})],
+)
+def test_arguments_outside_their_range(wrapper: type, arguments: dict) -> None:
+    with pytest.raises(SettingsError):
+        wrapper(SlamEnv(ToySequence(5), TARGET), **arguments)
+
+
+def test_sequence_sampler(toy_folder: str, tmp_path) -> None:
+    other = str(write_folder(tmp_path / "other", 8))
+
+    def drawn(mode: str, seed: int) -> list[str]:
+        env = SequenceSampler(SlamEnv(toy_folder, TARGET), [toy_folder, other], mode=mode)
+        return [env.reset(seed=seed if first else None)[1]["sequence"] for first in (True, *[False] * 7)]
+
+    assert drawn("round_robin", 0) == [toy_folder, other] * 4
+    assert drawn("random", 5) == drawn("random", 5) != drawn("random", 6) and set(drawn("random", 5)) == {
+        toy_folder,
+        other,
+    }
+
+
+class Compiles(FixedTracker):
+    """Takes long over the first frames that it ever sees, as what compiles its kernels does."""
+
+    slow_frames = 0
+    resets = 0
+
+    def reset(self, camera, *, rng):
+        super().reset(camera, rng=rng)
+        type(self).resets += 1
+        self.drawn = rng.random()
+
+    def track(self, frame):
+        if type(self).slow_frames < 3:
+            type(self).slow_frames += 1
+            time.sleep(0.4)
+        return super().track(frame)
+
+
+def test_compiling_is_no_work_of_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Compiles, "slow_frames", 0)
+    monkeypatch.setattr(Compiles, "resets", 0)
+    spec = replace(FIXED, entry_point=f"{__name__}:Compiles")
+    env = DropFrames(SlamEnv(ToySequence(20), spec), speed=0.5)
+    play(env)
+    assert Compiles.slow_frames == 3 and env.dropped == 0 and Compiles.resets == 2
+    play(env)
+    assert Compiles.resets == 3  # it is warm
+
+
+def test_warming_up_leaves_the_random_numbers_where_they_are() -> None:
+    def drawn(env) -> list[float]:
+        found = []
+        for seed in (3, None, None):
+            env.reset(seed=seed)
+            found.append(env.unwrapped._tracker.drawn)  # the tracker's first random number has no public name
+        return found
+
+    def make() -> SlamEnv:
+        return SlamEnv(ToySequence(4), replace(FIXED, entry_point=f"{__name__}:Compiles"))
+
+    assert drawn(DropFrames(make())) == drawn(make())
+
+
+# Small images for agents: what they show, and that stable-baselines3 has nothing to say about them.
+
+
+def test_they_show_the_same_smaller() -> None:
+    env = SmallImages(SlamEnv(ToySequence(4), TARGET, observation="rgbd"), width=40, height=36)
+    seen, _ = env.reset(seed=0)
+    assert seen in env.observation_space and seen["rgb"].shape == (36, 40, 3) and seen["depth"].shape == (36, 40, 1)
+    whole = env.unwrapped.frame
+    assert abs(float(seen["rgb"].mean()) - float(whole.rgb.mean())) < 3
+
+
+def test_depth_keeps_missing_apart_and_is_right_to_half_a_step() -> None:
+    env = SmallImages(SlamEnv(ToySequence(4), TARGET, observation="rgbd"))
+    shown = {"rgb": np.zeros((60, 80, 3), np.uint8), "depth": np.linspace(0, MAX_DEPTH_M, 4800, dtype=np.float32)}
+    shown["depth"] = shown["depth"].reshape(60, 80)
+    steps = env.observation(shown)["depth"][..., 0].astype(float)
+    assert (steps == 0).sum() == 1 and steps[0, 0] == 0 and steps[-1, -1] == 255
+    metres = (steps - 1) * MAX_DEPTH_M / 254
+    assert np.abs(metres - shown["depth"]).ravel()[1:].max() <= 0.5 * MAX_DEPTH_M / 254 + 1e-6
+
+
+@pytest.mark.parametrize(("observation", "width"), [("stats", 80), ("rgbd", 0)])
+def test_what_it_cannot_wrap_is_refused(observation: str, width: int) -> None:
+    with pytest.raises(SettingsError):
+        SmallImages(SlamEnv(ToySequence(4), TARGET, observation=observation), width=width)
+
+
+def test_stable_baselines3_takes_it_without_a_word() -> None:
+    checks = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra [rl] is not installed")
+    env = SmallImages(
+        SlamEnv(ToySequence(6), TARGET, observation="rgbd", control=["noise.level_m"]), width=40, height=36
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checks.check_env(env)
+    with pytest.warns(UserWarning, match="unconventional shape"):
+        checks.check_env(SlamEnv(ToySequence(6), TARGET, observation="rgbd", control=["noise.level_m"]))
