@@ -9,12 +9,12 @@ with the standard deviation, or their median with the range. Errors are those of
 shown; the least coverage follows in brackets where it is below 95 %. Runs are kept in ``--results`` and made once.
 """
 
-import argparse
 import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pandas as pd
+from command_line import parser_of
 
 import dynslam_bench as db
 from dynslam_bench.api import RunResult, make_specs, run_specs
@@ -75,18 +75,14 @@ def cell(runs: pd.DataFrame, show: str, style: str) -> str:
 
 def main() -> None:
     """Make the runs and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(
+        __doc__, offsets=[0], seeds=[0], stride=1, protocol="tum-rgbd/v1", jobs=1, results="results/tables"
+    )
     parser.add_argument("--trackers", nargs="+", required=True, metavar="'TRACKER [NAME=VALUE ...]'")
     parser.add_argument("--sequences", nargs="+", required=True)
     parser.add_argument("--show", nargs="+", default=["ate"], choices=COLUMNS)
     parser.add_argument("--cell", default="values", choices=CELLS)
-    parser.add_argument("--offsets", type=int, nargs="+", default=[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--frames", help="part of each sequence, A:B")
-    parser.add_argument("--stride", type=int, default=1)
-    parser.add_argument("--protocol", default="tum-rgbd/v1")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--results", default="results/tables")
     chosen = parser.parse_args()
     specs, keys = [], []
     for text, sequence in itertools.product(chosen.trackers, chosen.sequences):

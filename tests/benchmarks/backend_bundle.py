@@ -8,13 +8,13 @@ Needs the extra: ``pip install '.[gtsam]'``.
 import one_thread  # noqa: F401  # before all others
 
 # isort: split
-import argparse
 import sys
 import time
 from dataclasses import replace
 
 import gtsam
 import numpy as np
+from command_line import parser_of
 
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera
@@ -76,10 +76,7 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
 
 def main() -> int:
     """Print one row a solver."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--observations", type=int, default=6000)
-    parser.add_argument("--iterations", type=int, default=3)
+    parser = parser_of(__doc__, repeats=5, observations=6000, iterations=3)
     options = parser.parse_args()
     solvers = {"schur": adjust_bundle, "gtsam": adjust_bundle_gtsam}
     spent: dict[str, list[float]] = {name: [] for name in solvers}

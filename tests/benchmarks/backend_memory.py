@@ -15,7 +15,6 @@ Bars: less than 1 MB of growth a 1,000 frames after the first fifth, and in the 
 import one_thread  # noqa: F401  # before all others
 
 # isort: split
-import argparse
 import multiprocessing
 import os
 import sys
@@ -27,6 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from command_line import parser_of
 
 from dynslam_bench.contracts.sequence import FrameMasks, Sequence
 from dynslam_bench.core.settings import field_names
@@ -96,11 +96,7 @@ def ranked() -> list[str]:
 
 def main() -> None:
     """Print a row a tracker."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tracker", nargs="+", default=["orb-slam2"])
-    parser.add_argument("--sequence", default="synthetic/sitting_xyz")
-    parser.add_argument("--frames", type=int, default=10000)
-    parser.add_argument("--loop", type=int, default=300)
+    parser = parser_of(__doc__, tracker=["orb-slam2"], sequence="synthetic/sitting_xyz", frames=10000, loop=300)
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
     options = parser.parse_args()
     smaller = PreprocessingSettings(width=options.size[0], height=options.size[1])

@@ -26,16 +26,15 @@ and clear if exactly one of the two holds. Sim(3)-aligned numbers and ablations 
 import argparse
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.load import load_runs, open_stores
 from dynslam_bench.reports.model.published import published, static_camera_errors
-from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.runs.record import FAILED
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -44,37 +43,7 @@ from dynslam_bench.trackers.registry import TRACKERS
 FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"
 REFERENCES = (("DynaSLAM N",), ("DynaSLAM N+G", "DynaSLAM"))
 FAITHFUL = ("faithful-code", "faithful-paper")
-
-
-@dataclass
-class Cell:
-    """One system on one replica, over its repeats."""
-
-    ates: list[float] = field(default_factory=list)
-    coverages: list[float] = field(default_factory=list)
-    broken: int = 0
-    standstills: list[float] = field(default_factory=list)
-
-    @property
-    def static_camera(self) -> float | None:
-        """Median ATE in metres of a camera that never moves; None where no run says it."""
-        return float(np.median(self.standstills)) if self.standstills else None
-
-    @property
-    def spread(self) -> str:
-        """Range of the ATE over repeats that differ, `` (0.0102-0.0140)``; empty for a single value."""
-        low, high = (min(self.ates), max(self.ates)) if self.ates else (0.0, 0.0)
-        return f" ({low:.4f}-{high:.4f})" if high - low >= 5e-5 else ""
-
-    @property
-    def ate(self) -> float:
-        """Median ATE in metres; NaN without any."""
-        return float(np.median(self.ates)) if self.ates else float("nan")
-
-    @property
-    def coverage(self) -> float:
-        """Median coverage."""
-        return float(np.median(self.coverages)) if self.coverages else 0.0
+EXACT = "mask-rcnn with exact masks"
 
 
 def classify(
@@ -142,44 +111,33 @@ def published_class(tracker: str, sequence: str) -> str | None:
     return FAILS if fails else SURVIVES
 
 
-def read_cells(
-    folder: Path, instances: range | None = None
-) -> tuple[dict[tuple[str, str], Cell], dict[str, Cell], dict[str, str]]:
-    """Everything that the table needs.
+def read_cells(folder: Path, instances: range | None = None) -> pd.DataFrame:
+    """Everything that the table needs: a row by (tracker, sequence), over its repeats.
 
     Args:
         folder: Results of the suite.
         instances: Which instances of the replicas count; None for all.
 
     Returns:
-        Cells by (tracker with its default settings, sequence), the reference system's by sequence, and provenance by
-        tracker.
+        Medians of the ATE in metres (with its `low` and `high`), of the coverage, and of the ATE of a camera that never
+        moves; whether any run is `broken`; provenance. The reference system is `EXACT`, others have default settings.
     """
-    cells: dict[tuple[str, str], Cell] = {}
-    reference: dict[str, Cell] = {}
-    provenance: dict[str, str] = {}
+    rows = []
     for run in load_runs(open_stores(folder), get_protocol(DEFAULT_PROTOCOL)).rows:
         if run.kind != "run" or run.degrade or run.drop_share or run.realtime:
             continue
         if instances is not None and instance_of(run.sequence.id) not in instances:
             continue
-        if run.tracker.id == "mask-rcnn" and run.overrides == {"segmentation.source": "oracle"}:
-            add(reference.setdefault(run.sequence.id, Cell()), run)
-        elif not run.overrides:
-            add(cells.setdefault((run.tracker.id, run.sequence.id), Cell()), run)
-            provenance[run.tracker.id] = run.tracker.provenance
-    return cells, reference, provenance
-
-
-def add(cell: Cell, run: RunRow) -> None:
-    """Take one repeat's run into its cell."""
-    ate = run.metrics.get("ate_rmse_m")
-    if ate is not None:
-        cell.ates.append(ate)
-    cell.coverages.append(run.coverage)
-    cell.broken += run.status in FAILED
-    if run.static_camera_ate_rmse_m is not None:
-        cell.standstills.append(run.static_camera_ate_rmse_m)
+        exact = run.tracker.id == "mask-rcnn" and run.overrides == {"segmentation.source": "oracle"}
+        if exact or not run.overrides:
+            numbers = run.metrics.get("ate_rmse_m"), run.coverage, run.static_camera_ate_rmse_m, run.status in FAILED
+            rows.append((EXACT if exact else run.tracker.id, run.sequence.id, run.tracker.provenance, *numbers))
+    names = ["tracker", "sequence", "provenance", "ate", "coverage", "static_camera", "broken"]
+    frame = pd.DataFrame(rows, columns=names).astype({"ate": float, "static_camera": float})
+    return frame.groupby(["tracker", "sequence"], sort=False).agg(
+        provenance=("provenance", "first"), ate=("ate", "median"), low=("ate", "min"), high=("ate", "max"),
+        coverage=("coverage", "median"), static_camera=("static_camera", "median"), broken=("broken", "any"),
+    )  # fmt: skip
 
 
 def report(folder: Path, instances: range | None = None) -> str:
@@ -192,72 +150,60 @@ def report(folder: Path, instances: range | None = None) -> str:
     Raises:
         DynslamError: The folder holds no runs, or not the reference system's, or none on these instances.
     """
-    cells, reference, provenance = read_cells(folder, instances)
-    replicas = [
-        replica for replica in dict.fromkeys(replica for _, replica in cells) if replica.startswith("synthetic/")
-    ]
-    missing = [replica for replica in replicas if replica not in reference or not np.isfinite(reference[replica].ate)]
+    cells = read_cells(folder, instances)
+    ates = cells["ate"].unstack()
+    replicas = [name for name in ates if name.startswith("synthetic/")] if len(cells) else []
     if not replicas and instances is not None:
         raise DynslamError(
             f"{folder} holds no runs on instances {instances.start} to {instances.stop - 1} of the rendered replicas",
             "run the suite 'dynamic', or ask for other --instances",
         )
+    reference = ates.reindex(index=[EXACT], columns=replicas).loc[EXACT]
+    missing = [replica for replica in replicas if np.isnan(reference[replica])]
     if missing or not replicas:
         raise DynslamError(
             f"{folder} holds no run of mask-rcnn with exact masks on {missing[0] if missing else 'any replica'}",
             "run the suite 'dynamic', or mask-rcnn with --set segmentation.source=oracle",
         )
-    trackers = sorted({tracker for tracker, _ in cells}, key=lambda name: (provenance[name] not in FAITHFUL, name))
+    standstill = cells["static_camera"].unstack().loc[EXACT]
+    if "never-move" in ates.index:
+        standstill = standstill.fillna(ates.loc["never-move"])
     lines = [
         "| replica | never-move m | exact masks m | fails from m | survives up to m |",
         "| --- | --- | --- | --- | --- |",
     ]
-    standstill = {replica: standstill_of(replica, cells, reference) for replica in replicas}
     for replica in replicas:
-        known = standstill[replica]
-        lines.append(
-            f"| {short(replica)} | {known:.3f} | {reference[replica].ate:.4f} | {0.5 * known:.4f} "
-            f"| {3 * reference[replica].ate:.4f} |"
-        )
+        still, exact = standstill[replica], reference[replica]
+        lines.append(f"| {short(replica)} | {still:.3f} | {exact:.4f} | {0.5 * still:.4f} | {3 * exact:.4f} |")
     lines += [
         "",
         "| system | provenance | replica | ATE m | coverage | measured | published | verdict |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     matched, clear, misses = 0, 0, []
-    for tracker in trackers:
-        for replica in replicas:
-            cell = cells.get((tracker, replica))
-            expected = published_class(tracker, recorded(replica))
-            if cell is None or expected is None:
-                continue
-            measured = classify(cell.ate, cell.coverage, standstill[replica], reference[replica].ate, cell.broken > 0)
-            verdict = "not clear" if expected == BETWEEN else "match" if measured == expected else "**miss**"
-            if provenance[tracker] in FAITHFUL and expected != BETWEEN:
-                clear += 1
-                matched += measured == expected
-                if measured != expected:
-                    misses.append(f"{tracker} on {short(replica)}: {measured} ({cell.ate:.4f} m), published {expected}")
-            elif verdict != "not clear":
-                verdict += " (not counted)"
-            lines.append(
-                f"| `{tracker}` | {provenance[tracker]} | {short(replica)} | {cell.ate:.4f}{cell.spread} "
-                f"| {100 * cell.coverage:.0f} % | {measured} | {expected} | {verdict} |"
-            )
+    by_name = {(key, place): cell for (key, place), cell in cells.iterrows() if key != EXACT and place in replicas}
+    order = sorted(by_name, key=lambda key: (by_name[key].provenance not in FAITHFUL, key[0], replicas.index(key[1])))
+    for tracker, replica in order:
+        cell, expected = by_name[tracker, replica], published_class(tracker, recorded(replica))
+        if expected is None:
+            continue
+        measured = classify(cell.ate, cell.coverage, standstill[replica], reference[replica], cell.broken)
+        verdict = "not clear" if expected == BETWEEN else "match" if measured == expected else "**miss**"
+        if cell.provenance in FAITHFUL and expected != BETWEEN:
+            clear += 1
+            matched += measured == expected
+            if measured != expected:
+                misses.append(f"- {tracker} on {short(replica)}: {measured} ({cell.ate:.4f} m), published {expected}")
+        elif verdict != "not clear":
+            verdict += " (not counted)"
+        spread = f" ({cell.low:.4f}-{cell.high:.4f})" if cell.high - cell.low >= 5e-5 else ""
+        lines.append(
+            f"| `{tracker}` | {cell.provenance} | {short(replica)} | {cell.ate:.4f}{spread} "
+            f"| {100 * cell.coverage:.0f} % | {measured} | {expected} | {verdict} |"
+        )
     share = f"{100 * matched / clear:.0f} %" if clear else "-"
     lines += ["", f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %)."]
-    lines += ["", "Misses:", "", *(f"- {miss}" for miss in misses)] if misses else []
-    return "\n".join(lines)
-
-
-def standstill_of(replica: str, cells: dict[tuple[str, str], Cell], reference: dict[str, Cell]) -> float:
-    """ATE of a camera that never moves on a replica, metres; NaN where no run says it."""
-    known = reference[replica].static_camera
-    return (
-        cells["never-move", replica].ate
-        if known is None and ("never-move", replica) in cells
-        else known or float("nan")
-    )
+    return "\n".join([*lines, "", "Misses:", "", *misses] if misses else lines)
 
 
 def short(replica: str) -> str:

@@ -17,6 +17,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from command_line import parser_of
+
 from dynslam_bench.contracts.sequence import Sequence
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.core.folders import find_data_root
@@ -64,12 +66,8 @@ def text(quantity: Quantity, scale: float) -> str:
 
 def main() -> None:
     """One line a recording, then the counts."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", type=int, default=[0, 1])
-    parser.add_argument("--frames", type=int, default=100)
-    parser.add_argument("--readouts", nargs="+", type=float, default=[0.0, 26.0])
+    parser = parser_of(__doc__, scenes=[0, 1], frames=100, readouts=[0.0, 26.0], data_root=Path)
     parser.add_argument("--part", nargs="+", default=["fast", "global", "real"], choices=["fast", "global", "real"])
-    parser.add_argument("--data-root", type=Path)
     options = parser.parse_args()
     rolling, still, observable = [], [], 0
     head = ("recording", "true ms", "readout ms", "truth within", "delay of depth ms", "depth factor", "processor s")

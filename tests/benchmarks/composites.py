@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from command_line import parser_of
 
 import dynslam_bench as db
 from dynslam_bench.api import make_specs, run_specs
@@ -31,13 +32,10 @@ TRACKERS = (
 
 def main() -> None:
     """Make the instances and the runs, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, instances=10, folder=Path("results/composites"), jobs=1)
     parser.add_argument("hosts", nargs="+")
     parser.add_argument("--with", dest="people", required=True)
-    parser.add_argument("--instances", type=int, default=10)
     parser.add_argument("--trackers", nargs="+", default=TRACKERS, metavar="'TRACKER [NAME=VALUE ...]'")
-    parser.add_argument("--folder", type=Path, default=Path("results/composites"))
-    parser.add_argument("--jobs", type=int, default=1)
     chosen = parser.parse_args()
     people = open_sequence(chosen.people)
     hosts: dict[str, str] = {}

@@ -20,7 +20,6 @@ sequences.
 import one_thread  # noqa: F401  # before all others
 
 # isort: split
-import argparse
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -28,6 +27,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from command_line import parser_of
 
 from dynslam_bench.contracts.sequence import FrameMasks
 from dynslam_bench.core.settings import parse_assignments
@@ -111,13 +111,11 @@ def row(label: str, names: list[str], part: tuple[int, int | None], masks: str |
 
 def main() -> None:
     """Print one table row a system."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sequences", nargs="+", default=SEQUENCES)
+    parser = parser_of(__doc__, sequences=SEQUENCES, jobs=1)
     parser.add_argument("--frames", default="0:", help="part of each sequence, A:B")
     parser.add_argument("--trackers", nargs="+", default=TRACKERS_AND_SETTINGS, metavar="'TRACKER [NAME=VALUE ...]'")
     parser.add_argument("--masks", metavar="SOURCE", help="where systems with masks have them from, e.g. oracle")
     parser.add_argument("--cache", type=Path, help="folder of the stage cache; default: a temporary one")
-    parser.add_argument("--jobs", type=int, default=1)
     chosen = parser.parse_args()
     first, last = chosen.frames.split(":")
     part = (int(first or 0), int(last) if last else None)

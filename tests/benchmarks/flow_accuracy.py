@@ -6,11 +6,11 @@ Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by 
 the KITTI pair. Every row uses the default settings but for what it names.
 """
 
-import argparse
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from command_line import parser_of
 from flow_data import Pair, kitti, real, synthetic
 
 from dynslam_bench.flow.dense_flow import DenseDaisyFlow
@@ -122,11 +122,7 @@ def dense_table(budgets: Sequence[int]) -> None:
 
 def main() -> None:
     """Print all tables."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--budgets", type=int, nargs="+", default=[48, 64, 96, 192, 384])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--images", type=int, default=6)
-    parser.add_argument("--quick", action="store_true")
+    parser = parser_of(None, budgets=[48, 64, 96, 192, 384], seeds=[0], images=6, quick=False)
     options = parser.parse_args()
     warps = synthetic(KINDS, 2 if options.quick else options.images)
     if options.quick:

@@ -8,11 +8,11 @@ to `emfoa+propagation` with Student's 95 % interval over the units. A unit is a 
 offsets averaged.
 """
 
-import argparse
 from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
+from command_line import parser_of
 from flow_data import Pair, corners
 from scipy import stats
 
@@ -127,13 +127,9 @@ def rendered(scene: int, start: int, strides: Sequence[int], count: int) -> list
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--starts", type=int, nargs="+", default=[40, 100])
-    parser.add_argument("--points", type=int, default=400)
-    parser.add_argument("--budget", type=int, default=FlowSettings().budget)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--within", type=float, default=3.0)
+    parser = parser_of(
+        None, scenes=12, starts=[40, 100], points=400, budget=FlowSettings().budget, seeds=[0], within=3.0
+    )
     options = parser.parse_args()
     names = sorted(STRATEGIES, key=lambda name: (name != BASE, not STRATEGIES[name].propagates))
     rows = {name: FlowSettings(search=name, budget=options.budget) for name in names}

@@ -6,12 +6,12 @@
 for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 
 import cv2
 import numpy as np
+from command_line import parser_of
 from flow_data import corners, synthetic
 
 from dynslam_bench.contracts.flow import FlowEstimator
@@ -46,8 +46,7 @@ def a_thousand(reference: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     """Print all tables."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--repeats", type=int, default=40)
+    parser = parser_of(None, repeats=40)
     options = parser.parse_args()
     repeats = options.repeats
     cv2.setNumThreads(1)

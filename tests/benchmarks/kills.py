@@ -15,7 +15,6 @@ Bars: every disturbed folder, gone on from, holds the same runs with the same tr
 gone within 2 s; nothing left in shared memory.
 """
 
-import argparse
 import json
 import os
 import random
@@ -28,6 +27,8 @@ import time
 import traceback
 from collections import Counter
 from pathlib import Path
+
+from command_line import parser_of
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), *(str(ROOT / "tests" / room) for room in ("core", "envs", "runs", "tuning"))]
@@ -248,11 +249,8 @@ def note(counted: Counter[str], what: str, wrong: str) -> None:
 
 def main() -> int:
     """Disturb, and print the counts."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, every=1, times=20, fault=["kill", "full", "read-only", "gone"])
     parser.add_argument("what", choices=("operations", "moments", "signals"))
-    parser.add_argument("--every", type=int, default=1)
-    parser.add_argument("--times", type=int, default=20)
-    parser.add_argument("--fault", nargs="+", default=["kill", "full", "read-only", "gone"])
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="kills-") as folder:
         work = Path(folder)

@@ -17,12 +17,12 @@ from the true one in the world of the first frame, beyond what it was before the
 import one_thread  # noqa: F401  # before all others
 
 # isort: split
-import argparse
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pandas as pd
+from command_line import parser_of
 
 from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FrameBundle
@@ -151,11 +151,7 @@ def row(name: str, cases: pd.DataFrame) -> str:
 
 def main() -> None:
     """Print a row for each kind of loss."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sequences", nargs="+", default=SCENES)
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--black", type=int, default=20)
-    parser.add_argument("--cases", type=int, default=6)
+    parser = parser_of(__doc__, sequences=SCENES, frames=300, black=20, cases=6)
     parser.add_argument("--set", nargs="*", default=[], help="settings of the back end, e.g. loop_closing.enabled=true")
     options = parser.parse_args()
     cv2.setNumThreads(1)

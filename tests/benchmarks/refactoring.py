@@ -14,7 +14,6 @@ recorded too: on another machine, record at the revision to compare with first.
 from one_thread import ROOT  # before all others
 
 # isort: split
-import argparse
 import hashlib
 import json
 import platform
@@ -25,6 +24,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from command_line import parser_of
 
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.trackers import TrackerContext, build_tracker
@@ -75,9 +75,7 @@ def run(tracker_id: str, name: str, frames: int) -> tuple[str, list[float]]:
 
 def main() -> int:
     """Record, compare, or time."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", action="store_true")
-    parser.add_argument("--frames", type=int, default=16)
+    parser = parser_of(__doc__, record=False, frames=16)
     parser.add_argument("--only", nargs="+", choices=TRACKERS, default=TRACKERS, help="compare these trackers alone")
     parser.add_argument("--times", type=int, default=0, help="rounds over orb-slam2 and emfoa-oft; prints medians")
     arguments = parser.parse_args()

@@ -20,7 +20,6 @@ What follows that line, up to the next heading, is replaced by what the commands
 written again, `data` stays as it is. A new table is a section without the line: ``--data`` says what it is made of.
 """
 
-import argparse
 import datetime
 import os
 import platform
@@ -28,6 +27,8 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+
+from command_line import parser_of
 
 ROOT = Path(__file__).resolve().parents[2]
 MADE = re.compile(
@@ -77,11 +78,9 @@ def _run(command: str) -> str:
 
 def main() -> None:
     """Run the commands of the chosen sections and rewrite the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, all=False, data="")
     parser.add_argument("page", type=Path)
     parser.add_argument("sections", nargs="*")
-    parser.add_argument("--all", action="store_true")
-    parser.add_argument("--data", default="")
     options = parser.parse_args()
     page = options.page.read_text(encoding="utf-8")
     parts = sections(page)

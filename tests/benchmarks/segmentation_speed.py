@@ -4,7 +4,6 @@ Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--thread
 medians; user CPU time stands beside them, because wall times of a busy machine mean little.
 """
 
-import argparse
 import statistics
 import sys
 import time
@@ -16,6 +15,8 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
+
+from command_line import parser_of
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
@@ -54,10 +55,7 @@ def untrained(config: NetworkConfig, side: int, threads: int, objects: int) -> M
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--objects", type=int, default=3)
+    parser = parser_of(None, threads=2, repeats=7, objects=3)
     arguments = parser.parse_args()
     cv2.setNumThreads(arguments.threads)
     sequence = open_sequence("synthetic/walking_xyz?scene=120&frames=60")

@@ -13,6 +13,8 @@ anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes hundreds
 import argparse
 from pathlib import Path
 
+from command_line import parser_of
+
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs import RunStore
 from dynslam_bench.trackers import TRACKERS
@@ -59,10 +61,9 @@ def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> 
 
 def main() -> None:
     """Judge the presets of the trackers that are named, or of all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, results=Path("results/presets"))
     parser.add_argument("trackers", nargs="*", metavar="TRACKER")
     parser.add_argument("--part", nargs="+", default=list(PARTS), choices=list(PARTS))
-    parser.add_argument("--results", type=Path, default=Path("results/presets"))
     options = parser.parse_args()
     for tracker in options.trackers or [found.spec.id for found in TRACKERS.all() if found.spec.presets]:
         for preset in TRACKERS.get(tracker).presets:

@@ -14,7 +14,6 @@ same bound at the end. `extended`: null studies that are extended twice. A run i
 instance, counted once as the run store makes it.
 """
 
-import argparse
 import math
 import sys
 import tempfile
@@ -31,6 +30,14 @@ from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tuning"))
 
+import simulated
+from command_line import parser_of
+
+from dynslam_bench.tuning import Verdict, finish
+from dynslam_bench.tuning.judgement import compared
+from dynslam_bench.tuning.plan import distributions
+from dynslam_bench.tuning.study_file import scenes
+
 SCENES, SPREADS = (6, 11, 12, 24), (0.15, 0.5)
 PLANTED = 0.3
 MOST_RUNS = 40
@@ -38,8 +45,6 @@ MOST_RUNS = 40
 
 def study_on(scenes: int, offsets: str = "0-1", **changes: object) -> Any:
     """A simulated study on so many scenes."""
-    import simulated
-
     tune = f"synthetic/walking_xyz?scene=0-{scenes - 1}&frames=20&offsets={offsets}"
     return simulated.make_spec(tune=[tune], **changes)
 
@@ -50,32 +55,26 @@ def line(*cells: object) -> str:
 
 def null(studies: int, folder: Path) -> Iterable[str]:
     """Of so many studies in which nothing is better, the shares that say what."""
-    import simulated
-
-    from dynslam_bench.tuning import Verdict, finish
 
     verdicts = [verdict.value for verdict in Verdict if verdict != Verdict.NOT_JUDGED]
     yield line("scenes", "sd", "the best trial promises 5 %", "chosen", *(f"*{verdict}*" for verdict in verdicts))
-    for scenes in SCENES:
+    for count in SCENES:
         for simulated.STARTS_SD in SPREADS:
             lucky = chosen = 0
             said = Counter[str]()
-            for seed in range(scenes * 1000 + int(100 * simulated.STARTS_SD) * 100000, 10**9)[:studies]:
-                spec = study_on(scenes, sampler_seed=seed, sampler="tpe")
-                tuner = simulated.SimulatedTuner(spec, folder / f"{scenes}-{simulated.STARTS_SD}-{seed}", seed=seed)
+            for seed in range(count * 1000 + int(100 * simulated.STARTS_SD) * 100000, 10**9)[:studies]:
+                spec = study_on(count, sampler_seed=seed, sampler="tpe")
+                tuner = simulated.SimulatedTuner(spec, folder / f"{count}-{simulated.STARTS_SD}-{seed}", seed=seed)
                 lucky += tuner.run().study.best_value < math.log(0.95)
                 summary = finish(tuner)
                 chosen += summary.best is not None and summary.best.chosen
                 said[summary.verdict.value] += 1
             shares = [count / studies for count in (lucky, chosen, *(said[name] for name in verdicts))]
-            yield line(scenes, str(simulated.STARTS_SD), *shares)
+            yield line(count, str(simulated.STARTS_SD), *shares)
 
 
 def choice(studies: int, folder: Path) -> Iterable[str]:
     """Of so many choices among two settings that are no better, the share where one is chosen."""
-    import simulated
-
-    from dynslam_bench.tuning.judgement import compared
 
     tuner = simulated.SimulatedTuner(study_on(6), folder / "choice")
     confirm = tuner.design.confirm
@@ -96,10 +95,6 @@ def planted(settings: Mapping[str, Any]) -> float:
 
 def recovered(studies: int, folder: Path) -> Iterable[str]:
     """Of so many studies in which a setting has 30 % less error than the baseline, how many find and prove it."""
-    import simulated
-
-    from dynslam_bench.tuning import Verdict, finish
-    from dynslam_bench.tuning.judgement import compared
 
     loss = planted({})
     optimum = {"gain": 1.5 * (0.2 / 3) ** (1 / 3)}
@@ -138,9 +133,6 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
 
 def best_power(design: Any, gain: float) -> float:
     """How often a z-test of known variances tells a gain from nothing, with a false claim in 1600 (2.5 % x 2.5 %)."""
-    import simulated
-
-    from dynslam_bench.tuning.study_file import scenes
 
     information = 0.0
     for split in (design.confirm, design.held_out):
@@ -153,9 +145,6 @@ def best_power(design: Any, gain: float) -> float:
 
 def regret(studies: int, folder: Path) -> Iterable[str]:
     """Regret of a study with each pruner, beside plain Optuna's on as many runs, and how many trials each made."""
-    import simulated
-
-    from dynslam_bench.tuning import finish
 
     simulated.STARTS_SD = 0.28
     plain_ones = ("plain Optuna, `WilcoxonPruner`", "trials", "plain Optuna, no pruner", "trials")
@@ -185,10 +174,6 @@ def summed(found: Sequence[tuple[float, int]]) -> tuple[str, int]:
 
 def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -> tuple[float, int]:
     """Regret of the best of two trials by the same bound, and how many there were: Optuna as its manual has it."""
-    import simulated
-
-    from dynslam_bench.tuning.judgement import compared
-    from dynslam_bench.tuning.plan import distributions
 
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), pruner=pruner)
     study.enqueue_trial({parameter.name: tuner.base[parameter.name] for parameter in tuner.space})
@@ -216,9 +201,6 @@ def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -
 
 def extended(studies: int, folder: Path) -> Iterable[str]:
     """Null studies that are extended by six scenes, twice, as long as they do not end in `does not matter here`."""
-    import simulated
-
-    from dynslam_bench.tuning import Verdict, finish
 
     simulated.STARTS_SD = 0.28
     yield line("extensions", "chosen", "proven")
@@ -240,8 +222,7 @@ TABLES = {"null": null, "choice": choice, "planted": recovered, "regret": regret
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--studies", type=int, default=100)
+    parser = parser_of(__doc__, studies=100)
     parser.add_argument("--table", nargs="+", choices=TABLES, default=list(TABLES))
     options = parser.parse_args()
     warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)

@@ -7,13 +7,13 @@ moving sequence, removes the depth of people (and of everything while it moves) 
 outside, so that no feature is left on them.
 """
 
-import argparse
 import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
+from command_line import parser_of
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
@@ -149,10 +149,9 @@ def cell(runs: pd.DataFrame) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, runs=3)
     parser.add_argument("ids", nargs="*", default=[f"synthetic/{name}?scene=100&frames=120" for name in FAMILIES])
     parser.add_argument("--controls", nargs="+", default=list(CONTROLS), choices=CONTROLS)
-    parser.add_argument("--runs", type=int, default=3)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as cache:
         rows = [

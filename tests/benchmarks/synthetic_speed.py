@@ -5,11 +5,12 @@ Usage: python tests/benchmarks/synthetic_speed.py [ID] [--frames 120] [--threads
 A Markdown table of wall and CPU time a frame: on a machine shared with others only the CPU time says something.
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+from command_line import parser_of
 
 from dynslam_bench.sequences.synthetic import open_synthetic
 
@@ -23,10 +24,8 @@ def timed(what: str, frames: int, work: Callable[[], object]) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, frames=120, threads=2)
     parser.add_argument("id", nargs="?", default="synthetic/walking_xyz")
-    parser.add_argument("--frames", type=int, default=120)
-    parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         chosen = f"{arguments.id}{'&' if '?' in arguments.id else '?'}frames={arguments.frames}"

@@ -44,7 +44,7 @@ FOREIGN = {
     "run_grpc_proxy_server",
 }
 """First parts of names that belong to other libraries and that our code never spells."""
-FOREIGN_OPTIONS = {"--help", "--extra-index-url", "--fixed_delta"}
+FOREIGN_OPTIONS = {"--help", "--extra-index-url", "--no-deps", "--fixed_delta"}
 """Options of the help, of pip, and of the TUM benchmark's scripts."""
 POSE = re.compile(r"[TR]_[a-z]+_[a-z]+")
 """Poses by their frames of reference; the notation, not a variable."""

@@ -53,13 +53,13 @@ BEFORE = {"docs/how-to/export.md": A_RUN, "docs/how-to/pandas.md": A_RUN}
 WITH_OUTPUT = {"docs/how-to/trajectory.md": "", "docs/tutorials/study.md": "mine.toml", "docs/tutorials/tracker.md": ""}
 """Pages that show what commands print, and the file that their block of TOML is."""
 ELSEWHERE = {
-    "docs/how-to/dataset.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
-    "docs/how-to/filter.md": (2, "tests/trackers/adapters/test_adapter_docs.py"),
-    "docs/how-to/program.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
-    "docs/how-to/segmenter.md": (2, "tests/trackers/adapters/test_adapter_docs.py"),
-    "docs/reference/plugins.md": (1, "tests/trackers/adapters/test_adapter_docs.py"),
+    "docs/how-to/dataset.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
+    "docs/how-to/filter.md": (2, "tests/trackers/adapters/test_adapter_controls.py"),
+    "docs/how-to/program.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
+    "docs/how-to/segmenter.md": (2, "tests/trackers/adapters/test_adapter_controls.py"),
+    "docs/reference/plugins.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
     "docs/how-to/report.md": (1, "tests/reports/test_reports_tables.py"),
-    "docs/how-to/study.md": (2, "tests/tuning/test_python_study.py"),
+    "docs/how-to/study.md": (2, "tests/tuning/test_studies.py"),
 }
 """Pages with blocks of Python that another test runs, how many, and which."""
 

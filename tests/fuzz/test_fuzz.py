@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from . import binaries, exchange, layouts, records, texts
 from .campaign import Target, attack
+from .targets import TARGETS
 
-TARGETS = [*records.TARGETS, *texts.TARGETS, *binaries.TARGETS, *layouts.TARGETS, *exchange.TARGETS]
 INPUTS, SEED = int(os.environ.get("FUZZ_INPUTS", "60")), int(os.environ.get("FUZZ_SEED", "0"))
 
 
