@@ -3,7 +3,9 @@
 import contextlib
 import http.server
 import os
+import shlex
 import signal
+import stat
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -14,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults import in_a_small_process, survey, tree
+from pydantic import Field
 
 from dynslam_bench.core.download import check_address, download
-from dynslam_bench.core.errors import DownloadError, DynslamError
+from dynslam_bench.core.errors import DownloadError, DynslamError, RunError
 from dynslam_bench.core.files import (
     TemporaryFolder,
     atomic_folder,
@@ -27,7 +30,12 @@ from dynslam_bench.core.files import (
     sweep_temporary,
     write_atomic,
 )
+from dynslam_bench.core.reading import parse_json, read_bytes, read_json, read_lines, read_text
+from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.sanitise import inside, printable, storable, without_passwords, words_without_passwords
+from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.stage_cache import StageCache
+from dynslam_bench.core.toml import parse_toml
 
 BODY = bytes(range(256)) * 40
 
@@ -279,3 +287,221 @@ def test_a_download_has_a_largest_size(here: str, kind: str, tmp_path: Path) -> 
     with pytest.raises(DownloadError, match=r"is longer than the 0\.00 GB that are expected"):
         download(f"{here}/{kind}", tmp_path / "x", most_bytes=1 << 20, timeout_s=5)
     assert not (tmp_path / "x.part").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\xff\xfe", "is not a text file: .utf-8. codec can.t decode byte 0xff"),
+        (b"[" * 100_000, "is no valid JSON: maximum recursion depth"),
+        (b"9" * 5000, "is no valid JSON: Exceeds the limit"),
+        (b"{", "is no valid JSON: Expecting property name"),
+        (b" " * 2000, "has more than the 0.00095.* MB that are read"),
+    ],
+)
+def test_a_damaged_file_is_one_line(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "file.json"
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=words) as caught:
+        read_json(path, limit=1000 if content.isspace() else 1 << 20, kind=RunError)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_what_is_no_file_is_one_line(tmp_path: Path) -> None:
+    for path in (tmp_path / "none", tmp_path, tmp_path / ("x" * 300), tmp_path / "a\0b"):
+        with pytest.raises(DynslamError, match="cannot read"):
+            read_bytes(path)
+        with pytest.raises(DynslamError, match="cannot read"):
+            list(read_lines(path))
+
+
+def test_the_byte_order_mark_is_left_out_and_long_lines_are_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "text"
+    path.write_bytes(b"\xef\xbb\xbfa\nb")
+    assert read_text(path) == "a\nb" and list(read_lines(path)) == ["a\n", "b"]
+    path.write_bytes(b"x" * 5000)
+    with pytest.raises(DynslamError, match="has more than"):
+        list(read_lines(path, limit=1000))
+
+
+@pytest.mark.parametrize("text", ["a = " + "[" * 5000, "a = " + "9" * 5000, "a = \ud800", "a"])
+def test_damaged_toml_is_one_line(text: str) -> None:
+    with pytest.raises(RunError, match=r"^suite.toml is not valid TOML: "):
+        parse_toml(text, "suite.toml", kind=RunError)
+
+
+def test_messages_are_one_line_of_bounded_length() -> None:
+    error = DynslamError("first\nsecond" + "x" * 100_000, "hint\r\nmore")
+    assert "\n" not in str(error) and len(str(error)) < 2100 and str(error).startswith("first second")
+    with pytest.raises(DynslamError, match="where is no valid JSON"):
+        parse_json("\n{\n", "where")
+
+
+class Sample(Record):
+    text: str
+    more: dict[str, list[str]] = Field(default_factory=dict)
+
+
+def test_half_characters_do_not_keep_a_record_from_being_stored(tmp_path: Path) -> None:
+    record = Sample(text="caf\udce9", more={"\ud800": ["\udfff"]})
+    write_atomic(tmp_path / "record.json", record.to_json())
+    assert Sample.read(tmp_path / "record.json") == Sample(text="caf\\udce9", more={"\\ud800": ["\\udfff"]})
+    write_atomic(tmp_path / "text", "comment \ud800")
+    assert (tmp_path / "text").read_bytes() == b"comment \\ud800"
+    assert storable(("a\udc80", 1, None)) == ("a\\udc80", 1, None)
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["postgresql://me:s3cret@db/x", "mysql+pymysql://me:s3cret@db:3306/x", "https://h/x?password=s3cret&a=b",
+     "grpc://:s3cret@host:1", "https://h/x;token=s3cret", "postgresql://me:s3cret@/x@y@db/x"],
+)  # fmt: skip
+def test_passwords_are_in_no_message(address: str) -> None:
+    assert "s3cret" in address and "s3cret" not in str(DynslamError(f"cannot reach {address!r} now", f"try {address}"))
+
+
+class Command(Record):
+    text: str
+    words: list[str]
+    shell: list[str]
+    settings: dict[str, str]
+
+
+SECRETS = [
+    "--token=s3cret", "--token s3cret", "--api-key s3cret", "--api_key=s3cret", "--apikey s3cret", "-token s3cret",
+    "--hf-token='s3cret s3cret'", '--password "s3cret s3cret"', "--db.password=s3cret", "PASSWORD=s3cret slam",
+    "HF_TOKEN=s3cret slam", "--client-secret s3cr\\\\s3cret", "--access-key=s3cr\xe9s3cret", "--Passphrase s3cret",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("secret", SECRETS)
+def test_a_programs_secrets_are_in_no_record(secret: str) -> None:
+    command = f"slam {secret} --threads 2"
+    words = ["dynslam-bench", "run", f"subprocess:{command}", "--set", f"command={command}"]
+    shell = shlex.split(command)
+    stored = Command(text=command, words=words, shell=shell, settings={"api_key": "s3cret", "command": command})
+    for text in (stored.to_json(), stored.to_line()):
+        assert "s3cret" not in text
+        again = Command.model_validate_json(text)
+        assert again.shell[0] == "slam" and again.shell[-2:] == ["--threads", "2"] and len(again.shell) == len(shell)
+        assert again.text.startswith("slam ") and again.text.endswith(" --threads 2")
+    assert "s3cret" not in str(DynslamError(f"cannot start {command}"))
+    assert "s3cret" not in " ".join(words_without_passwords(words + shlex.split(command)))
+
+
+@pytest.mark.parametrize(
+    "words", [["slam", "--token", "--threads", "2"], ["slam", "--tokenizer", "bert"], ["--keyframes", "3"],
+              ["a token b"], ["segmentation.source=plugin:token", "x"], ["--max-tokens", "5"], ["slam --token", "x"]],
+)  # fmt: skip
+def test_words_that_are_no_secrets_stay(words: list[str]) -> None:
+    kept = words_without_passwords(words)
+    assert len(kept) == len(words) and (kept == words or words[-1] == "x")
+
+
+def test_what_holds_no_password_stays_as_it_is() -> None:
+    for text in ("sqlite:///studies.db", "https://host:8080/a", "grpc://host:13000", "a:b@c", "mail me@host"):
+        assert without_passwords(text) == text
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../x", "a/../../x", "/etc/passwd", "", "a\0b", "a\\..\\b", "x" * 256, "a\nb", "\x1b[2J", "..", "caf\udce9"],
+)
+def test_no_name_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
+    with pytest.raises(RunError, match="does not lie in"):
+        inside(tmp_path, name, where="a list", kind=RunError)
+    assert inside(tmp_path, "rgb/1.000.png", where="a list", kind=RunError) == tmp_path / "rgb" / "1.000.png"
+
+
+def test_terminals_get_nothing_that_they_act_upon() -> None:
+    text = "\x1b[31mred\x07\x9b2J\u202egnp.exe\ud800\x7f"
+    assert printable(text) == "\\x1b[31mred\\x07\\x9b2J\\u202egnp.exe\\ud800\\x7f"
+    assert printable("Zoë\tβ\n") == "Zoë\tβ\n"
+
+
+def test_files_and_folders_have_the_permissions_that_the_umask_gives(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_atomic(tmp_path / "file", "x")
+        with atomic_folder(tmp_path / "folder") as work:
+            (work / "inside").touch()
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
+    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
+
+
+@pytest.mark.parametrize("size", [0, 1, 1 << 16, (1 << 16) + 1, 1 << 17])
+def test_files_of_any_size_are_read_whole_up_to_the_limit(tmp_path, size):
+    path = tmp_path / "file"
+    path.write_bytes(bytes(range(256)) * (size // 256) + b"x" * (size % 256))
+    assert read_bytes(path, limit=size) == path.read_bytes()
+    (tmp_path / "larger").write_bytes(path.read_bytes() + b"x")
+    with pytest.raises(DynslamError, match="more than the"):
+        read_bytes(tmp_path / "larger", limit=size)
+
+
+EXPECTED_FLOW = [7831125740418745553, 14977623595910913313]
+EXPECTED_WIDE = [12832584331059455313]
+
+
+class Point(Record):
+    x: float
+    name: str = "p"
+
+
+def test_round_trip_even_of_infinity(tmp_path):
+    for value in (0.1 + 0.2, 1e-300, float("inf"), -float("inf")):
+        write_atomic(tmp_path / "p.json", Point(x=value).to_json())
+        assert Point.read(tmp_path / "p.json") == Point(x=value)
+    write_atomic(tmp_path / "p.json", Point(x=float("nan")).to_json())
+    assert np.isnan(Point.read(tmp_path / "p.json").x)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('{"x": "wide"}', r"p\.json is not a valid Point: x: Input should be a valid number"),
+        ('{"x": 1, "y": 2}', "y: Extra inputs are not permitted"),
+        ("{", "file: Invalid JSON"),
+        ("{}", "x: Field required"),
+    ],
+)
+def test_bad_records_name_file_and_field(tmp_path, text, expected):
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(DynslamError, match=expected) as caught:
+        Point.read(tmp_path / "p.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_digest_is_stable_and_blind_to_order():
+    assert digest({"a": 1, "b": [1, 2]}) == digest({"b": [1, 2], "a": 1}) == "8baa73198470"
+    assert digest(Point(x=1.0)) == digest({"x": 1.0, "name": "p"})
+    assert digest({"a": 1}) != digest({"a": 2})
+    assert len(digest({}, length=40)) == 40
+
+
+# -- seeding
+
+
+def test_streams_are_fixed_for_good():
+    # raw words: guaranteed by NumPy across versions and platforms
+    assert stream(0, "flow", 3).bit_generator.random_raw(2).tolist() == EXPECTED_FLOW
+    assert stream(2**40 + 7).bit_generator.random_raw(1).tolist() == EXPECTED_WIDE
+
+
+def test_streams_do_not_disturb_each_other():
+    first = stream(1, "a").random(5)
+    stream(1, "b").random(1000)
+    assert np.array_equal(first, stream(1, "a").random(5))
+    names = [("a",), ("b",), ("a", "b"), ("ab",), ("a", 1), ("a", 11), ("a", 1, 1)]
+    assert len({tuple(stream(1, *name).random(2)) for name in names}) == len(names)
+    assert stream(1, "a").random() != stream(2, "a").random()
+    assert stream(1, "a", 1).random() == stream(1, "a", "1").random()
+
+
+def test_derived_seeds():
+    seeds = {derive_seed(stream(i)) for i in range(50)}
+    assert len(seeds) == 50
+    assert all(0 <= seed < 2**63 for seed in seeds)
+    assert derive_seed(stream(3)) == derive_seed(stream(3))

@@ -1,17 +1,37 @@
 """Settings: one annotation gives validation, overrides, search space and table; errors name what is wrong."""
 
+import sys
+from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Literal
 
+import numba
+import numpy as np
 import pytest
 
-from dynslam_bench.core.errors import DynslamError, SettingsError, did_you_mean
+import dynslam_bench
+from dynslam_bench.core import compiled, fingerprint, folders
+from dynslam_bench.core import plugins as plugin_probe
+from dynslam_bench.core import version as versions
+from dynslam_bench.core.errors import DynslamError, PluginError, SettingsError, did_you_mean
+from dynslam_bench.core.fingerprint import (
+    code_digest,
+    content_digest,
+    machine_digest,
+    named_digests,
+    opencv_version,
+    plugin_digest,
+)
+from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, Registry, load_object
 from dynslam_bench.core.settings import (
     Settings,
     apply_overrides,
     build,
     field_names,
     flatten,
+    names,
     parameters,
     parse_assignments,
     settings_table,
@@ -167,3 +187,385 @@ def test_errors_survive_a_process_border():
     assert type(again) is SettingsError
     assert str(again) == str(error) == "what (how)"
     assert str(DynslamError("only")) == "only"
+
+
+@pytest.mark.parametrize("compile_", [compiled.kernel, compiled.dividing_kernel, compiled.spliced])
+def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**options: object):
+        if options.pop("cache", False):
+            raise RuntimeError("cannot cache function: no locator available")
+        return numba.njit(**options)
+
+    monkeypatch.setattr(compiled, "numba", SimpleNamespace(njit=refuse))
+    assert compile_(lambda x: x + 1)(2) == 3
+
+
+def test_kernels_are_cached_and_release_the_lock() -> None:
+    from dynslam_bench.slam.pose_optimisation import apply_twist
+
+    options = apply_twist.targetoptions
+    assert options["nogil"] and apply_twist.stats.cache_path
+
+
+def test_kernels_on_disk_are_loaded_before_they_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    def twice(x: float) -> float:
+        return 2 * x
+
+    monkeypatch.setattr(compiled, "_CACHED", [])
+    compiled.kernel(twice)(1.0)
+    again = compiled.kernel(twice)
+    compiled.load_kernels()
+    assert again.signatures == [(numba.float64,)] and not again.stats.cache_misses
+
+
+def test_a_division_by_zero_is_an_error_unless_asked_for() -> None:
+    @compiled.dividing_kernel
+    def like_numpy(x: float) -> float:
+        return 1.0 / x
+
+    @compiled.kernel
+    def like_python(x: float) -> float:
+        return 1.0 / x
+
+    assert like_numpy(0.0) == np.inf
+    with pytest.raises(ZeroDivisionError):
+        like_python(0.0)
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_content_digest_sees_type_shape_and_value() -> None:
+    base = np.zeros((2, 3), np.uint8)
+    others = [base.reshape(3, 2), base.astype(np.int8), base + 1]
+    assert len({content_digest(each) for each in (base, *others)}) == 4
+    assert content_digest(base) == content_digest(np.zeros((2, 6), np.uint8)[:, ::2])
+
+
+def test_a_plug_in_counts_with_the_code_of_its_folder_and_nothing_else(tmp_path: Path) -> None:
+    plugin = write(tmp_path / "mine.py", "a = 1\n")
+    helper = write(tmp_path / "helper.py", "b = 1\n")
+    before = plugin_digest(f"{plugin}:SPEC")
+    write(tmp_path / "notes.txt", "not code")
+    assert plugin_digest(f"{plugin}:SPEC") == before
+    helper.write_text("b = 2\n")
+    assert plugin_digest(f"{plugin}:SPEC") != before
+    assert plugin_digest("dynslam_bench.features.orb:OrbExtractor") == ""
+    with pytest.raises(PluginError, match=r"cannot read the code.*No such file"):
+        plugin_digest(f"{tmp_path}/none/none.py:SPEC")
+
+
+def test_packages_with_and_without_init_count_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    write(tmp_path / "fp_regular" / "__init__.py", "")
+    for package in ("fp_regular", "fp_namespace"):
+        inner = write(tmp_path / package / "deep" / "inner.py", "a = 1\n")
+        before = plugin_digest(f"{package}.deep.inner:SPEC")
+        inner.write_text("a = 2\n")
+        changed = plugin_digest(f"{package}.deep.inner:SPEC")
+        inner.rename(inner.with_name("other.py"))
+        assert len({before, changed, plugin_digest(f"{package}.deep.inner:SPEC")}) == 3
+    with pytest.raises(PluginError, match="code of 'fp_nowhere' cannot be found"):
+        plugin_digest("fp_nowhere.module:SPEC")
+
+
+def test_own_rooms_count_each_by_itself() -> None:
+    orb = "dynslam_bench.features.orb:OrbExtractor"
+    assert code_digest(orb, ("core", "features")) == code_digest(orb, ("core", "features"))
+    assert code_digest(orb, ("core", "features")) != code_digest(orb, ("core", "segmentation"))
+
+
+class Inner(Settings):
+    source: str = "auto"
+    options: dict[str, object] = {}  # noqa: RUF012
+
+
+class Whole(Settings):
+    extractor: str = names("orb", "features", meaning="an id")
+    vocabulary: str = names("", "file", meaning="a file", otherwise="FP_TEST_VOCABULARY")
+    word: str = "orb"
+    weights: Path | None = None
+    gain: float = tunable(1.0, low=0, high=2, meaning="a number")
+    inner: Inner = Inner()
+
+
+def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "orb").mkdir()
+    write(tmp_path / "auto", "a file called like a setting")
+    assert named_digests(Whole()) == {}, "a folder called like a word changes nothing"
+    net = write(tmp_path / "net.onnx", "one")
+    write(tmp_path / "voc.txt", "words")
+    settings = Whole(
+        vocabulary="voc.txt",
+        word=str(net),
+        weights=Path("net.onnx"),
+        inner=Inner(source="onnx:net.onnx", options={"network": {"file": str(net)}, "side": 3}),
+    )
+    found = named_digests(settings)
+    assert set(found) == {"vocabulary", "word", "weights", "inner.source", "inner.options.network.file"}
+    assert len(set(found.values())) == 2
+    net.write_text("three")
+    assert named_digests(settings)["inner.source"] != found["inner.source"]
+    monkeypatch.setenv("FP_TEST_VOCABULARY", str(tmp_path / "voc.txt"))
+    assert named_digests(Whole())["vocabulary"] == found["vocabulary"], "named by the environment"
+
+
+@pytest.mark.parametrize("name", fingerprint.OPENCV)
+def test_every_distribution_of_opencv_is_versioned(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def only(version: str):
+        monkeypatch.setattr(fingerprint, "distribution_version", lambda asked: version if asked == name else "")
+        for cached in (opencv_version, machine_digest):
+            cached.cache_clear()
+        return opencv_version(), machine_digest()
+
+    try:
+        (first, machine), (second, other) = only("4.10.0"), only("4.11.0")
+        assert first == f"{name} 4.10.0" and second == f"{name} 4.11.0" and machine != other
+        monkeypatch.setattr(fingerprint, "distribution_version", lambda asked: "")
+        opencv_version.cache_clear()
+        assert opencv_version().startswith("cv2 "), "a build of one's own tells its version itself"
+    finally:
+        for cached in (opencv_version, machine_digest):
+            cached.cache_clear()
+
+
+def test_a_link_to_a_folder_above_it_is_not_followed(tmp_path):
+    from dynslam_bench.core.code_files import files_below
+
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    (inner / "code.py").touch()
+    (inner / "up").symlink_to(tmp_path)
+    assert list(files_below(tmp_path)) == [inner / "code.py"]
+
+
+# Where data, stages, weights and vocabularies lie, and the version of the package.
+
+
+FOLDERS = {
+    "data": folders.find_data_root,
+    "stages": folders.stage_cache_folder,
+    "weights": folders.weights_folder,
+    "vocabularies": folders.vocabularies_folder,
+}
+VARIABLES = {"data": folders.DATA_VARIABLE, "stages": folders.STAGES_VARIABLE, "weights": folders.WEIGHTS_VARIABLE}
+
+
+@pytest.fixture
+def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    for variable in (*VARIABLES.values(), "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("platform", "cache"), [("linux", ".cache"), ("darwin", "Library/Caches")])
+@pytest.mark.parametrize("name", FOLDERS)
+def test_everything_lies_in_one_cache_folder(name: str, platform: str, cache: str, home: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "platform", platform)
+    assert FOLDERS[name]() == home / cache / "dynslam-bench" / name
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / "elsewhere"))
+    assert FOLDERS[name]() == home / "elsewhere" / "dynslam-bench" / name
+
+
+@pytest.mark.parametrize("name", VARIABLES)
+def test_a_variable_moves_one_of_them(name: str, home: Path, monkeypatch) -> None:
+    monkeypatch.setenv(VARIABLES[name], str(home / "mine"))
+    assert FOLDERS[name]() == (home / "mine" / "stages" if name == "stages" else home / "mine")
+    for other in FOLDERS.keys() - {name}:
+        assert FOLDERS[other]() == folders.user_cache() / other
+
+
+@pytest.fixture
+def fresh_version(monkeypatch: pytest.MonkeyPatch):
+    versions.version.cache_clear()
+    yield
+    monkeypatch.undo()
+    versions.version.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("installed", "release"),
+    [
+        ("0.1.0", "0.1.0"),
+        ("0.1.1.dev5+g1a2b3c4.d20261122", "0.1.1"),
+        ("0.1.dev1520+gabc", "0.1.0"),
+        ("2.0", "2.0.0"),
+        ("1.2rc1", "1.2.0"),
+    ],
+)
+@pytest.mark.usefixtures("fresh_version")
+def test_the_release_of_a_version(installed: str, release: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", lambda name: installed)
+    assert (dynslam_bench.__version__, versions.release()) == (installed, release)
+
+
+@pytest.mark.usefixtures("fresh_version")
+def test_a_checkout_that_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", missing)
+    assert (dynslam_bench.__version__, versions.release()) == ("0+unknown", "0.0.0")
+
+
+@dataclass(frozen=True)
+class Spec:
+    id: str
+    entry_point: str = "json:loads"
+
+
+SPEC_SOURCE = "from tests_plugin_contract import Spec\nSPEC = Spec('{id}')\nOTHER = 5\n"
+
+
+@pytest.fixture(autouse=True)
+def contract(monkeypatch):
+    """Makes `Spec` importable by the plug-in files, and the environment clean."""
+    module = type(sys)("tests_plugin_contract")
+    module.Spec = Spec
+    monkeypatch.setitem(sys.modules, "tests_plugin_contract", module)
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+
+
+def registry(kind="trackers"):
+    return Registry(kind, Spec, lambda: [Spec("built-in"), Spec("never-move")])
+
+
+def fake_distribution(folder, group, targets, name="fake-dist"):
+    info = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    lines = "".join(f"{key} = {target}\n" for key, target in targets.items())
+    (info / "entry_points.txt").write_text(f"[{group}]\n{lines}")
+
+
+def test_file_and_module_targets(tmp_path, monkeypatch):
+    file = tmp_path / "my_tracker.py"
+    file.write_text(SPEC_SOURCE.format(id="mine"))
+    assert registry().get(f"{file}:SPEC").id == "mine"
+    monkeypatch.syspath_prepend(tmp_path)
+    assert registry().get("my_tracker:SPEC").id == "mine"
+    with pytest.raises(PluginError, match=r"is a int, not a Spec .name the spec, not the class"):
+        registry().get(f"{file}:OTHER")
+    with pytest.raises(PluginError, match=r"has no 'SPECC'.*did you mean 'SPEC' or 'Spec'"):
+        registry().get(f"{file}:SPECC")
+
+
+@pytest.mark.parametrize(
+    ("target", "expected"),
+    [
+        ("nowhere.at.all:SPEC", "cannot import nowhere.at.all: ModuleNotFoundError"),
+        ("/nowhere/file.py:SPEC", "cannot import /nowhere/file.py: FileNotFoundError: no file /nowhere/file.py"),
+        ("nocolon", "is not module:Attr"),
+        (":SPEC", "is not module:Attr"),
+        ("module:", "is not module:Attr"),
+    ],
+)
+def test_targets_that_cannot_be_loaded(target, expected):
+    with pytest.raises(PluginError, match=expected) as caught:
+        load_object(target)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_raises_gives_its_reason_and_can_be_mended(tmp_path):
+    file = tmp_path / "broken.py"
+    file.write_text("raise RuntimeError('no GPU here')\n")
+    with pytest.raises(PluginError, match="RuntimeError: no GPU here"):
+        load_object(f"{file}:SPEC")
+    file.write_text("SPEC = 7\n")
+    assert load_object(f"{file}:SPEC") == 7
+
+
+ENDINGS = {
+    "import sys; sys.exit(0)": "exit code 0",
+    "import os; os._exit(0)": "exit code 0",
+    "raise SystemExit('no GPU')": "exit code 1",
+    "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)": "SIGSEGV",
+}
+
+
+@pytest.mark.parametrize("statement", ENDINGS)
+def test_an_import_that_ends_the_process_is_an_error_like_any_other(tmp_path, monkeypatch, statement):
+    """As a file, as a module that the environment names, and as an entry point: the rest goes on."""
+    (tmp_path / "ends_env.py").write_text(statement)
+    (tmp_path / "ends_dist.py").write_text(statement)
+    fake_distribution(tmp_path, "dynslam_bench.trackers", {"ends": "ends_dist:SPEC"}, "ends-dist")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "ends_env:SPEC")
+    with pytest.raises(PluginError, match=rf"that ends the process \({ENDINGS[statement]}\) .*sys.exit") as caught:
+        load_object(f"{tmp_path / 'ends_env.py'}:SPEC")
+    assert "\n" not in str(caught.value)
+    trackers = registry()
+    assert len(trackers.all()) == 2
+    reasons = [failure.reason for failure in trackers.failures()]
+    assert len(reasons) == 2 and all(f"ends the process ({ENDINGS[statement]})" in reason for reason in reasons)
+
+
+def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(plugin_probe, "LIMIT_S", 3)
+    (tmp_path / "endless.py").write_text("while True: pass\n")
+    with pytest.raises(PluginError, match="is not done after 3 s"):
+        load_object(f"{tmp_path / 'endless.py'}:SPEC")
+
+
+def test_environment_variable(tmp_path, monkeypatch):
+    good, broken = tmp_path / "good.py", tmp_path / "broken.py"
+    good.write_text(SPEC_SOURCE.format(id="from-env"))
+    broken.write_text("import nothing_of_that_name\n")
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, f"{good}:SPEC, flow={good}:SPEC,trackers={broken}:SPEC")
+    trackers = registry()
+    assert [found.spec.id for found in trackers.all()] == ["built-in", "from-env", "never-move"]
+    (failure,) = trackers.failures()
+    assert str(broken) in failure.source
+    assert "ModuleNotFoundError: No module named 'nothing_of_that_name'" in failure.reason
+    assert "from-env" in {found.spec.id for found in registry("flow").all()}
+    assert "from-env" not in {found.spec.id for found in registry("filters").all()}
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE)
+    assert len(trackers.all()) == 3  # found once
+    trackers.refresh()
+    assert len(trackers.all()) == 2
+    assert trackers.failures() == []
+
+
+def test_entry_points_of_installed_distributions(tmp_path, monkeypatch):
+    (tmp_path / "dist_plugin.py").write_text(SPEC_SOURCE.format(id="from-dist"))
+    (tmp_path / "dist_broken.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')\n")
+    targets = {"good": "dist_plugin:SPEC", "bad": "dist_broken:SPEC", "number": "dist_plugin:OTHER"}
+    fake_distribution(tmp_path, "dynslam_bench.trackers", targets)
+    monkeypatch.syspath_prepend(tmp_path)
+    trackers = registry()
+    sources = {found.spec.id: found.source for found in trackers.all()}
+    assert sources["from-dist"] == "entry point 'good' of fake-dist"
+    assert {"built-in", "never-move"} <= set(sources)
+    reasons = {failure.source: failure.reason for failure in trackers.failures()}
+    assert "libGL.so.1" in reasons["entry point 'bad' of fake-dist"]
+    assert "is a int" in reasons["entry point 'number' of fake-dist"]
+    with pytest.raises(PluginError, match="failed to load: cannot import dist_broken: OSError: libGL"):
+        trackers.get("bad")
+    assert trackers.get("from-dist").id == "from-dist"
+
+
+def test_order_built_in_before_environment_before_entry_points(tmp_path, monkeypatch):
+    (tmp_path / "order_env.py").write_text(SPEC_SOURCE.format(id="same"))
+    (tmp_path / "order_dist.py").write_text(
+        "from tests_plugin_contract import Spec\nSPEC = Spec('same')\nBUILT_IN = Spec('never-move', 'a:b')\n"
+    )
+    fake_distribution(
+        tmp_path, "dynslam_bench.trackers", {"same": "order_dist:SPEC", "never": "order_dist:BUILT_IN"}, "order-dist"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "order_env:SPEC")
+    trackers = registry()
+    sources = {found.spec.id: found.source for found in trackers.all()}
+    assert sources["same"].startswith(ENVIRONMENT_VARIABLE)
+    assert sources["never-move"] == "built in"
+    taken = {failure.source: failure.reason for failure in trackers.failures()}
+    assert (
+        "id 'same' is already taken by DYNSLAM_BENCH_PLUGINS: order_env:SPEC"
+        in taken["entry point 'same' of order-dist"]
+    )
+    assert "id 'never-move' is already taken by built in" in taken["entry point 'never' of order-dist"]

@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 from evaluation_walks import moved, noisy, turned, walk
 
-from dynslam_bench.core.errors import EvaluationError
+from dynslam_bench.core.errors import EvaluationError, TrajectoryError
 from dynslam_bench.evaluation import (
     PROTOCOLS,
     OnlineError,
     Protocol,
     RPESpec,
     compare_masks,
+    compare_protocols,
     evaluate,
     evaluate_files,
     get_protocol,
+    hints,
     hold,
     pose_errors,
     static_camera,
@@ -27,9 +29,17 @@ from dynslam_bench.evaluation.comparison import nearest_match
 from dynslam_bench.evaluation.evaluate import Evaluation
 from dynslam_bench.evaluation.rpe import segment_errors
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.rigs import bonn_as_droid_w, bonn_camera
+from dynslam_bench.geometry.rigs import (
+    BONN_R_BODY_CAM,
+    BONN_T_M,
+    BONN_T_ROS,
+    bonn_as_droid_w,
+    bonn_camera,
+    in_camera_axes,
+    nearest_rotation,
+)
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
+from dynslam_bench.geometry.trajectory_files import load_tum, read_tum, write_kitti, write_tum
 
 TRUTH = walk()
 ESTIMATE = noisy(TRUTH)
@@ -515,3 +525,378 @@ def test_the_tolerance_is_strict():
     truth = Trajectory(np.array([0.0, 1.0]), np.tile(np.eye(4), (2, 1, 1)))
     assert OnlineError(truth, max_dt=0.5).update(0.5, np.eye(4)) is None
     assert OnlineError(truth, max_dt=0.5).update(0.499, np.eye(4)) is not None
+
+
+TRAJECTORIES = Path(__file__).resolve().parents[3] / "shared" / "data" / "trajectories"
+FR3 = "rgbd-vo/rgbd_dataset_freiburg3_"
+
+
+def hand_held(frames=240, rate=30.0, seed=0, noise_m=0.0):
+    """A camera that moves along and turns about all axes, as a hand does."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(frames) / rate
+    size = np.repeat([0.15, 0.12], 3)
+    twists = sum(
+        size / (k + 1) * np.sin(np.outer(t, rng.uniform(1, 2, 6) * (k + 1)) + rng.uniform(0, 6, 6)) for k in range(3)
+    )
+    poses = se3.exp(rng.normal(size=6)) @ se3.exp(twists)
+    poses[:, :3, 3] += rng.normal(0, 1, (frames, 3)) * noise_m
+    return Trajectory(np.round(1e9 + t, 6), poses)
+
+
+def tracked(truth, seed=1, drift=0.01, jitter=5e-4, every=1):
+    rng = np.random.default_rng(seed)
+    steps = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
+    size = np.linalg.norm(se3.log(steps), axis=1, keepdims=True)
+    poses = [np.eye(4)]
+    for step in steps @ se3.exp(rng.normal(size=(len(steps), 6)) * drift * size):
+        poses.append(poses[-1] @ step)
+    estimate = Trajectory(truth.timestamps, np.array(poses) @ se3.exp(rng.normal(0, jitter, (len(truth), 6))))
+    return estimate.select(slice(None, None, every))
+
+
+def ids(estimate, truth, *arguments, **options):
+    return [hint.id for hint in hints(estimate, truth, *arguments, **options)]
+
+
+def posed(trajectory, poses):
+    return Trajectory(trajectory.timestamps, poses)
+
+
+def scaled(trajectory, factor):
+    poses = trajectory.T_world_cam.copy()
+    poses[:, :3, 3] *= factor
+    return posed(trajectory, poses)
+
+
+def w_first(trajectory):
+    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
+    return posed(trajectory, se3.from_quaternion(position, np.roll(quaternion, 1, axis=1)))
+
+
+HAND_HELD = hand_held()
+TRACKED = tracked(HAND_HELD)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("drift", "jitter"), [(0.0, 3e-4), (0.01, 5e-4), (0.05, 2e-3)])
+def test_healthy_estimates_get_none(seed, drift, jitter):
+    truth = hand_held(seed=seed)
+    assert ids(tracked(truth, seed, drift, jitter), truth) == []
+
+
+def test_estimates_of_every_length_are_taken():
+    for frames in (1, 2, 7, 8, 9, 12, 20):
+        truth = hand_held(max(frames, 2)).select(slice(0, frames))
+        assert ids(tracked(truth), truth) == []
+
+
+@pytest.mark.parametrize("seconds", [-1, -0.2, -0.05, 0.05, 0.2, 1])
+@pytest.mark.parametrize("every", [1, 3])
+def test_time_shifts_are_measured(seconds, every):
+    estimate = tracked(HAND_HELD, every=every)
+    (hint,) = hints(Trajectory(estimate.timestamps + seconds, estimate.T_world_cam), HAND_HELD)
+    assert hint.id == "time-shift"
+    assert hint.numbers["shift_s"] == pytest.approx(-seconds, abs=0.01)
+    assert hint.numbers["error_undone_m"] < 0.5 * hint.numbers["error_m"]
+
+
+@pytest.mark.parametrize("factor", [1000, 100, 5, 1.5, 0.8, 0.2, 0.001])
+def test_scales_are_measured(factor):
+    (hint,) = hints(scaled(TRACKED, factor), HAND_HELD)
+    assert hint.id == "scale" and hint.numbers["scale"] == pytest.approx(1 / factor, rel=0.05)
+    assert ("millimetres" in hint.text) == (factor == 1000)
+
+
+def test_a_scale_that_the_protocol_finds_is_no_fault():
+    assert ids(scaled(TRACKED, 5), HAND_HELD, "tum-rgbd/v1-sim3") == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_conventions_are_named(seed):
+    truth = hand_held(seed=seed)
+    estimate = tracked(truth, seed)
+    assert ids(posed(estimate, se3.inverse(estimate.T_world_cam)), truth) == ["inverted-poses"]
+    assert ids(w_first(estimate), truth) == ["quaternion-order"]
+    (hint,) = hints(posed(estimate, estimate.T_world_cam @ np.diag([1.0, -1.0, -1.0, 1.0])), truth)
+    assert hint.id == "camera-axes" and "OpenGL" in hint.text
+    turned = estimate.T_world_cam.copy()
+    turned[:, :3, :3] = turned[:, :3, :3].transpose(0, 2, 1)
+    assert ids(posed(estimate, turned), truth) == ["inverted-rotations"]
+
+
+def test_two_faults_are_both_named():
+    inverted = se3.inverse(scaled(TRACKED, 1000).T_world_cam)
+    assert ids(posed(TRACKED, inverted), HAND_HELD) == ["inverted-poses", "scale"]
+    late = Trajectory(TRACKED.timestamps + 0.2, scaled(TRACKED, 1000).T_world_cam)
+    assert ids(late, HAND_HELD) == ["time-shift", "scale"]
+
+
+def test_a_truth_with_axes_of_its_own_is_no_fault_of_the_estimate():
+    truth = posed(HAND_HELD, HAND_HELD.T_world_cam @ se3.exp(np.array([0.02, 0.01, 0.0, 2.0, -0.7, 0.4])))
+    assert ids(TRACKED, truth) == []
+    assert ids(posed(TRACKED, se3.inverse(TRACKED.T_world_cam)), truth) == ["inverted-poses"]
+
+
+def test_several_recordings_in_a_file(tmp_path):
+    other = Trajectory(HAND_HELD.timestamps + 3600, TRACKED.T_world_cam)
+    both = Trajectory(
+        np.concatenate([TRACKED.timestamps, other.timestamps]),
+        np.concatenate([TRACKED.T_world_cam, other.T_world_cam]),
+    )
+    (hint,) = hints(both, HAND_HELD)
+    assert hint.id == "several-recordings" and hint.numbers["poses_outside"] == len(other)
+    long = hand_held(600)
+    write_tum(tmp_path / "run.txt", tracked(long))
+    text = (tmp_path / "run.txt").read_text()
+    (tmp_path / "twice.txt").write_text(text + text)
+    file = load_tum(tmp_path / "twice.txt")
+    assert file.notes.back_s == pytest.approx(599 / 30)
+    (hint,) = hints(file.trajectory, long, notes=file.notes)
+    assert hint.id == "several-recordings" and hint.numbers["repeated_stamps"] == 600
+
+
+def test_frames_lost_for_long_are_not_several_recordings():
+    truth = hand_held(1200)
+    estimate = tracked(truth)
+    kept = (truth.timestamps < truth.timestamps[0] + 5) | (truth.timestamps > truth.timestamps[0] + 30)
+    assert ids(estimate.select(kept), truth) == []
+
+
+def test_poses_read_from_the_truth_are_named():
+    assert ids(HAND_HELD, HAND_HELD) == ["below-truth-noise"]
+    measured = hand_held(1200, rate=100.0, noise_m=1e-4)
+    stamps = measured.timestamps[:-4:3] + 0.004
+    at = np.searchsorted(measured.timestamps, stamps)
+    between = measured.T_world_cam[at].copy()
+    for axis in range(3):
+        between[:, axis, 3] = np.interp(stamps, measured.timestamps, measured.positions[:, axis])
+    assert ids(Trajectory(stamps, between), measured) == ["below-truth-noise"]
+    drift = np.cumsum(np.random.default_rng(0).normal(0, 1e-5, (len(at), 3)), axis=0)
+    between[:, :3, 3] += drift + [[0.003, 0, 0]] * np.sin(stamps - stamps[0])[:, None]
+    assert ids(Trajectory(stamps, between), measured) == ["below-truth-noise"]
+    few = tracked(measured, drift=0.0, jitter=3e-4, every=3)
+    assert ids(few, measured) == [] and ids(few.select(np.arange(len(few)) < 20), measured) == []
+
+
+def test_a_camera_that_stands_still_may_be_followed_exactly():
+    still = Trajectory(100 + np.arange(60) / 30, np.tile(np.eye(4), (60, 1, 1)))
+    assert ids(still, still) == []
+    noisy = hand_held(600, rate=100.0)
+    noisy = posed(noisy, np.tile(np.eye(4), (600, 1, 1)))
+    noisy.T_world_cam[:, :3, 3] += np.random.default_rng(0).normal(0, 3e-4, (600, 3))
+    assert ids(Trajectory(noisy.timestamps, np.tile(np.eye(4), (600, 1, 1))), noisy) == []
+
+
+def bad(kind, truth, rng):
+    stamps, number, good = truth.timestamps, np.arange(len(truth)), tracked(truth).T_world_cam
+    speed = se3.log(se3.inverse(good[:1]) @ good[5:6]) / 5
+    walk = np.cumsum(rng.normal(0, 0.01, (len(truth), 6)), axis=0)
+    poses = {
+        "still": np.tile(np.eye(4), (len(truth), 1, 1)),
+        "steady": se3.exp(speed * number[:, None]),
+        "walk": se3.exp(walk),
+        "stops": good[np.minimum(number, len(truth) // 2)],
+        "jumps": se3.exp(rng.normal(0, 0.5, (4, 6)))[number * 4 // len(truth)] @ good,
+        "drifts": tracked(truth, 3, 0.3, 2e-3).T_world_cam,
+        "diverges": se3.exp(np.exp(0.1 * number)[:, None] * rng.normal(0, 1e-4, 6)),
+    }[kind]
+    return Trajectory(stamps, poses)
+
+
+@pytest.mark.parametrize("kind", ["still", "steady", "walk", "stops", "jumps", "drifts", "diverges"])
+@pytest.mark.parametrize("seed", range(5))
+def test_bad_trackers_get_none(kind, seed):
+    truth = hand_held(seed=seed)
+    assert ids(bad(kind, truth, np.random.default_rng(seed)), truth) == []
+
+
+def test_no_number_changes():
+    estimate = posed(TRACKED, se3.inverse(TRACKED.T_world_cam))
+    kept = estimate.timestamps.copy(), estimate.T_world_cam.copy()
+    hints(estimate, HAND_HELD)
+    assert np.array_equal(kept[0], estimate.timestamps) and np.array_equal(kept[1], estimate.T_world_cam)
+
+
+@pytest.mark.skipif(not TRAJECTORIES.is_dir(), reason="needs the trajectories in ../shared/data")
+@pytest.mark.parametrize(
+    ("estimate", "truth", "expected"),
+    [
+        ("authors/dyslam/walking_xyz.txt", f"{FR3}walking_xyz/groundtruth.txt", []),
+        ("authors/cds_slam/walking_rpy.txt", f"{FR3}walking_rpy/groundtruth.txt", []),
+        ("authors/amos_slam/CameraTrajectory.txt", "authors/amos_slam/groundtruth.txt", []),
+        (f"{FR3}walking_xyz/ours.txt", f"{FR3}walking_xyz/groundtruth.txt", ["several-recordings"]),
+        (f"{FR3}walking_static/ours.txt", f"{FR3}walking_static/groundtruth.txt", ["several-recordings"]),
+    ],
+)
+def test_published_trajectories(estimate, truth, expected):
+    file = load_tum(TRAJECTORIES / estimate)
+    assert ids(file.trajectory, load_tum(TRAJECTORIES / truth).trajectory, notes=file.notes) == expected
+
+
+R_M = nearest_rotation(BONN_T_M[:3, :3])
+SCALE = float(np.cbrt(np.linalg.det(BONN_T_M[:3, :3])))
+
+
+def camera_of(markers):
+    """The publisher's formula, with the rigid part of the calibration."""
+    rigid = BONN_T_M.copy()
+    rigid[:3, :3] = R_M
+    return Trajectory(markers.timestamps, np.linalg.inv(BONN_T_ROS) @ markers.T_world_cam @ BONN_T_ROS @ rigid)
+
+
+def sequence_truth(markers):
+    """What a Bonn sequence gives: positions of the markers, orientations of the camera."""
+    return Trajectory(markers.timestamps, in_camera_axes(markers.T_world_cam, BONN_R_BODY_CAM))
+
+
+def test_digests_of_protocols_that_were_there_before_are_what_they_were():
+    kept = {"tum-rgbd/v1": "1190f97bbd77", "tum-rgbd/v1-random-pairs": "9d4145d276f0", "evo-default": "e1e985248944",
+            "vslam-lab": "c3d577abd792", "kitti": "6baedd087d0f"}  # fmt: skip
+    assert {name: PROTOCOLS[name].digest() for name in kept} == kept
+    assert len({protocol.digest() for protocol in PROTOCOLS.values()}) == len(PROTOCOLS)
+
+
+def test_bonns_lever_arm_is_undone():
+    """A perfect camera scores 0 at the camera and the lever arm's effect, but not more than 18.6 mm, at the markers."""
+    markers = walk(3, n=300)
+    estimate = turned(camera_of(markers), 5)
+    truth = sequence_truth(markers)
+    at_camera, at_markers = evaluate(estimate, truth, "bonn-camera/v1"), evaluate(estimate, truth, "tum-rgbd/v1")
+    assert at_camera.metrics["ate_rmse_m"] < 1e-4 and at_camera.metrics["rpe_1s_trans_rmse_m"] < 1e-4
+    assert 1e-3 < at_markers.metrics["ate_rmse_m"] < 0.0187
+    lever = bonn_camera(truth.T_world_cam)[:, :3, 3] - truth.positions
+    assert np.allclose(np.linalg.norm(lever, axis=1), np.linalg.norm(BONN_T_M[:3, 3]), atol=1e-12)
+    assert np.linalg.norm(BONN_T_M[:3, 3]) == pytest.approx(0.0186, abs=5e-5)
+
+
+def test_droid_ws_truth_is_theirs_to_the_last_digit_and_smaller():
+    markers = walk(4, n=120)
+    theirs = BONN_T_ROS.T @ markers.T_world_cam @ BONN_T_ROS @ BONN_T_M
+    theirs = np.linalg.inv(theirs[0]) @ theirs
+    assert np.abs(bonn_as_droid_w(sequence_truth(markers).T_world_cam)[:, :3, 3] - theirs[:, :3, 3]).max() < 1e-12
+    assert SCALE == pytest.approx(1.059, abs=1e-3)
+    estimate = noisy(camera_of(markers))
+    error = evaluate(estimate, sequence_truth(markers), "droid-w/v1-bonn").metrics["ate_rmse_m"]
+    unscaled = Trajectory(markers.timestamps, bonn_camera(sequence_truth(markers).T_world_cam))
+    assert error * SCALE == pytest.approx(evaluate(estimate, unscaled, "droid-w/v1").metrics["ate_rmse_m"], rel=2e-3)
+
+
+def test_a_file_of_bonn_scores_as_its_sequence_does(tmp_path):
+    markers = walk(6, n=200)
+    estimate = noisy(camera_of(markers))
+    write_tum(tmp_path / "truth.txt", markers)
+    write_tum(tmp_path / "estimate.txt", estimate)
+    for name in ("bonn-camera/v1", "droid-w/v1-bonn", "tum-rgbd/v1"):
+        of_files = evaluate_files(tmp_path / "estimate.txt", tmp_path / "truth.txt", name).metrics["ate_rmse_m"]
+        of_sequence = evaluate(estimate, sequence_truth(markers), name).metrics["ate_rmse_m"]
+        assert of_files == pytest.approx(of_sequence, abs=1e-6)
+
+
+def test_bonns_protocols_refuse_other_sequences():
+    get_protocol("bonn-camera/v1").check_sequence("bonn/crowd")
+    get_protocol("tum-rgbd/v1").check_sequence("anything")
+    with pytest.raises(EvaluationError, match=r"holds for bonn/\* only, not for 'tum/fr1/xyz'"):
+        get_protocol("droid-w/v1-bonn").check_sequence("tum/fr1/xyz")
+
+
+def test_every_image_takes_the_nearest_true_pose_within_80_ms():
+    truth = walk(1, n=100, rate=10.0)
+    estimate = Trajectory(truth.timestamps[:60] + 0.03, truth.T_world_cam[:60])
+    assert evaluate(estimate, truth, "droid-w/v1").n_pairs == 60
+    with pytest.raises(EvaluationError, match="none of 60 poses"):
+        evaluate(estimate, truth, "tum-rgbd/v1")
+
+
+def test_90_frames_are_every_third_that_has_a_true_pose():
+    """As the preparation of MonST3R picks them: pair images with truth, take every third, stop at 90."""
+    truth = walk(2, n=600)
+    frames = truth.timestamps.copy()
+    holey = truth.select(np.r_[0:100, 130:600])
+    estimate = noisy(truth)
+    found = evaluate(estimate, holey, "tum-dynamics-90/v1", input_timestamps=frames)
+    matched = [stamp for stamp in frames if np.abs(holey.timestamps - stamp).min() < 0.02][::3][:90]
+    chosen = estimate.select(np.isin(estimate.timestamps, matched))
+    assert found.n_pairs == 90 == len(chosen) and found.n_pairs_rpe == {"1f": 89}
+    sim3 = get_protocol("tum-dynamics-90/v1").model_copy(update={"every": 1, "most_frames": 0})
+    assert found.metrics["ate_rmse_m"] == evaluate(chosen, holey, sim3).metrics["ate_rmse_m"]
+    assert "90 poses on 90 frames are compared: every 3 of 570 matched" in found.diagnostics
+    lost = evaluate(estimate.select(slice(100, None)), holey, "tum-dynamics-90/v1", input_timestamps=frames)
+    assert lost.n_pairs == 90 - 34
+    with pytest.raises(EvaluationError, match="none of 100 poses is of the 90 frames"):
+        evaluate(estimate.select(slice(500, None)), holey, "tum-dynamics-90/v1", input_timestamps=frames)
+
+
+def test_a_rate_is_the_error_over_the_time_between_its_poses():
+    truth = walk(7, n=300, rate=7.0)  # 1 s is no multiple of a frame: pairs lie 0.857 or 1 or 1.143 s apart
+    estimate = noisy(truth)
+    rate, error = evaluate(estimate, truth, "tum-rgbd/v1-rate").metrics, evaluate(estimate, truth).metrics
+    assert rate["rpe_1s_rate_trans_rmse_m_per_s"] == pytest.approx(error["rpe_1s_trans_rmse_m"], rel=0.01)
+    slow = Trajectory(truth.timestamps[0] + (truth.timestamps - truth.timestamps[0]) * 10, truth.T_world_cam)
+    slow_estimate = Trajectory(slow.timestamps, estimate.T_world_cam)
+    tenth = evaluate(slow_estimate, slow, "tum-rgbd/v1-rate").metrics  # now 1.43 s between frames
+    per_frame = evaluate(slow_estimate, slow, "tum-rgbd/v1").metrics["rpe_1f_trans_rmse_m"]
+    assert tenth["rpe_1s_rate_trans_rmse_m_per_s"] == pytest.approx(per_frame * 0.7, rel=1e-3)
+    assert "rpe_1s_rate_trans_sse_m_per_s2" not in rate and "rpe_1s_rate_rot_rmse_deg_per_s" in rate
+    with pytest.raises(ValueError, match="a rate is taken over seconds"):
+        RPESpec(delta=1, unit="f", rate=True)
+
+
+def test_kitti_files_are_taken_with_their_stamps(tmp_path):
+    truth = walk(8, n=60)
+    estimate = noisy(truth)
+    write_tum(tmp_path / "truth.txt", truth)
+    write_kitti(tmp_path / "estimate.txt", estimate)
+    (tmp_path / "rgb.txt").write_text("# list\n" + "".join(f"{s:.6f} rgb/{s}.png\n" for s in truth.timestamps))
+    found = evaluate_files(tmp_path / "estimate.txt", tmp_path / "truth.txt", timestamps=tmp_path / "rgb.txt")
+    assert found.metrics["ate_rmse_m"] == pytest.approx(evaluate(estimate, truth).metrics["ate_rmse_m"], abs=1e-6)
+    with pytest.raises(TrajectoryError, match=r"12 values.*--timestamps FILE"):
+        evaluate_files(tmp_path / "estimate.txt", tmp_path / "truth.txt")
+    (tmp_path / "short.txt").write_text("x\n")
+    with pytest.raises(TrajectoryError, match=r"short\.txt line 1: 'x' is not a stamp"):
+        evaluate_files(tmp_path / "estimate.txt", tmp_path / "truth.txt", timestamps=tmp_path / "short.txt")
+
+
+# Protocols: frozen, told apart, described, and how far their numbers lie apart.
+
+
+def test_protocols_are_frozen_told_apart_and_described():
+    tum = get_protocol("tum-rgbd/v1")
+    assert get_protocol(tum) is tum
+    assert tum.digest() == "1190f97bbd77"  # stored with every number: a change of v1 is a new version
+    for change in ({"max_dt": 0.03}, {"strict": False}, {"alignment": "sim3"}, {"lost_frames": "hold"}, {"rpe": ()}):
+        assert tum.model_copy(update=change).digest() != tum.digest()
+    with pytest.raises(Exception, match="frozen"):
+        tum.max_dt = 1.0
+    assert "1190f97bbd77" in tum.describe()
+    assert Protocol.model_validate_json(tum.model_dump_json()) == tum
+
+
+def test_unknown_protocol_has_a_did_you_mean():
+    with pytest.raises(EvaluationError, match=r"unknown protocol 'tum-rgbd'.*did you mean 'tum-rgbd/v1'"):
+        get_protocol("tum-rgbd")
+
+
+def test_a_delta_in_frames_is_whole():
+    with pytest.raises(ValueError, match="whole number"):
+        RPESpec(delta=1.5, unit="f")
+    with pytest.raises(ValueError, match="all pairs are taken over frames"):
+        RPESpec(delta=1.0, unit="m", pairs="all")
+
+
+def test_compare_protocols_shows_how_far_they_are_apart():
+    truth = walk(n=400)
+    rows = compare_protocols(turned(noisy(truth), 2), truth)
+    by_label = {row.label: row for row in rows}
+    assert (
+        by_label["not aligned"].rmse_m
+        > by_label["origin-aligned"].rmse_m
+        > by_label["SE(3)-aligned (TUM's ATE)"].rmse_m
+    )
+    assert by_label["Sim(3)-aligned"].rmse_m <= by_label["SE(3)-aligned (TUM's ATE)"].rmse_m
+    assert {row.metric for row in rows} == {"ATE", "RPE"}
+    assert all(row.rmse_m is not None and row.pairs > 0 for row in rows)
+    short = compare_protocols(noisy(walk(n=20)), walk(n=20))
+    missing = next(row for row in short if row.label == "TUM, 1 s, fixed delta")
+    assert missing.rmse_m is None
+    assert "1 s" in missing.note

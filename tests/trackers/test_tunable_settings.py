@@ -4,11 +4,16 @@ An episode that is configured before its first frame equals, bit for bit, that o
 After `reset` the settings that the tracker was built with are in force again.
 """
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
+import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from quick_dense import quick
 from steering_scene import FRAMES, SmallScene, construct, difference, play, settings_for
@@ -16,10 +21,20 @@ from steering_scene import FRAMES, SmallScene, construct, difference, play, sett
 from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
-from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
-from dynslam_bench.core.settings import OnlineSettings, Parameter, Settings, apply_overrides, online_parameters, tunable
-from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.trackers.registry import all_specs
+from dynslam_bench.core.errors import DynslamError, SegmentationError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.core.settings import (
+    OnlineSettings,
+    Parameter,
+    Settings,
+    apply_overrides,
+    flatten,
+    online_parameters,
+    tunable,
+)
+from dynslam_bench.runs import RunSpec, RunStore, run_many
+from dynslam_bench.sequences.synthetic import open_synthetic
+from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
+from dynslam_bench.trackers.registry import all_specs, resolve_settings
 from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
 
@@ -278,3 +293,236 @@ def test_sequences_without_depth_are_for_monocular_trackers_alone(plain_scene):
     finally:
         del plain_scene.has_depth
     check_sensors(TRACKERS.get("emfoa-oft"), plain_scene)
+
+
+CACHED = 4
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory):
+    return open_synthetic(f"synthetic/walking_xyz?scene=5&frames={CACHED}", tmp_path_factory.mktemp("rendered"))
+
+
+def run(rendered, cache: Path | None, **settings: object):
+    """Poses ``[N, 4, 4]`` and the results of a run with the embedded network."""
+    context = TrackerContext(sequence_id=rendered.id, cache=None if cache is None else str(cache))
+    tracker = build_tracker("emfoa-oft", {"segmentation.source": "embedded", **settings}, context)
+    tracker.reset(rendered.camera, rng=np.random.default_rng(0))
+    results = [tracker.track(rendered[index]) for index in range(len(rendered))]
+    return np.array([result.T_world_cam for result in results]), results
+
+
+def test_cached_runs_have_the_same_bits_and_load_no_network(
+    rendered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, _ = run(rendered, None)
+    cold, filled = run(rendered, tmp_path)
+    assert [result.stats["cached_stages"] for result in filled] == [0.0] * CACHED
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a network was loaded although all masks are stored")
+
+    monkeypatch.setattr("dynslam_bench.segmentation.networks.mask_rcnn_segmenter.build_embedded", refuse)
+    warm, found = run(rendered, tmp_path, **{"epipolar.threshold_px": 2.0, "segmentation.confidence": 0.35})
+    again, _ = run(rendered, tmp_path)
+    assert [result.stats["cached_stages"] for result in found] == [2.0] * CACHED
+    assert np.array_equal(plain, cold) and np.array_equal(plain, again)
+    assert warm.shape == plain.shape
+    for before, after in zip(filled, found, strict=True):
+        cost = before.timings["segmentation"]
+        assert after.timings["segmentation"] == pytest.approx(cost, rel=0.5), "told as what it costs, not the look-up"
+
+
+EXTRACTOR = """
+import numpy as np
+from dynslam_bench.contracts import FeatureSpec, Keypoints
+
+class Mine:
+    def extract(self, gray):
+        n = COUNT
+        return Keypoints(np.full((n, 2), 30, np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32),
+                         np.ones(n, np.float32), np.zeros((n, 32), np.uint8))
+
+def build(settings):
+    return Mine()
+
+SPEC = FeatureSpec("mine", f"{__file__}:build")
+"""
+ASK = """
+import sys
+from pathlib import Path
+import numpy as np
+from dynslam_bench.core.stage_cache import StageCache
+from dynslam_bench.features.registry import build_extractor
+from dynslam_bench.features.registry import CachedExtractor
+from dynslam_bench.features.settings import FeatureSettings
+
+settings = FeatureSettings(extractor=sys.argv[1], options={"weights": sys.argv[3]})
+cached = CachedExtractor(build_extractor(settings), settings, StageCache(Path(sys.argv[2])), 1)
+print(len(cached.extract(np.zeros((60, 60), np.uint8)).xy), cached.hit)
+"""
+
+
+def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Path) -> None:
+    plugin, weights = tmp_path / "mine.py", tmp_path / "net.bin"
+
+    def ask() -> str:
+        command = [sys.executable, "-c", ASK, f"{plugin}:SPEC", str(tmp_path / "cache"), str(weights)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    plugin.write_text(EXTRACTOR.replace("COUNT", "3"))
+    weights.write_text("one")
+    assert [ask(), ask()] == ["3 False", "3 True"]
+    plugin.write_text(EXTRACTOR.replace("COUNT", "5"))
+    assert ask() == "5 False"
+    weights.write_text("three")
+    assert ask() == "5 False"
+
+
+def test_a_missing_file_is_an_error_at_once_with_the_cache_too(rendered, tmp_path: Path) -> None:
+    with pytest.raises(SegmentationError, match=r"nowhere\.onnx"):
+        run(rendered, tmp_path, **{"segmentation.source": f"onnx:{tmp_path / 'nowhere.onnx'}"})
+
+
+# The presets that ship: they fit, change something and act in a run.
+
+
+SHIPPED = [(found.spec.id, name) for found in TRACKERS.all() for name in found.spec.presets]
+
+
+@pytest.mark.parametrize(("tracker", "name"), SHIPPED)
+def test_each_sets_something_else_than_the_default(tracker, name):
+    spec = TRACKERS.get(tracker)
+    default, chosen = flatten(spec.settings()), flatten(resolve_settings(spec, spec.presets[name]))
+    changed = {key for key in chosen if chosen[key] != default[key]}
+    assert changed and changed <= set(spec.presets[name])
+
+
+@pytest.mark.parametrize(("more", "asked"), [({}, [1, 0, 1, 0, 1, 0, 1]), ({"crowded_share": 0.1}, [1] * 7)])
+def test_fast_asks_the_network_on_every_second_frame_but_where_people_cover_the_view(tmp_path, more, asked):
+    settings = {"segmentation.source": "oracle", **TRACKERS.get("mask-rcnn").presets["fast"]}
+    settings |= {f"segmentation.{name}": value for name, value in more.items()}
+    spec = RunSpec(tracker="mask-rcnn", sequence="synthetic/walking_xyz?frames=7", settings=settings)
+    (record,) = run_many([spec], results=tmp_path)
+    frames = pd.read_csv(RunStore(tmp_path).folder(record.run_id) / "frames.csv")
+    assert frames["stat_segmented"].tolist() == asked
+
+
+HARD = 44
+BAD = range(6, 16)
+"""The frames that a fault spoils."""
+END = 20
+"""Where the episodes with a fault end."""
+
+
+@pytest.fixture(scope="module")
+def sitting(tmp_path_factory: pytest.TempPathFactory):
+    return open_synthetic(f"synthetic/sitting_xyz?scene=2&frames={HARD}", tmp_path_factory.mktemp("rendered"))
+
+
+def started(sitting, name: str = "orb-slam2"):
+    tracker = build_tracker(name, {}, TrackerContext(sequence_id=sitting.id))
+    tracker.reset(sitting.camera, rng=np.random.default_rng(0))
+    return tracker
+
+
+def track(sitting, change: Callable[[Frame], Frame], bad: range = BAD):
+    """States, and for the tracked frames the distance in metres from the true camera centre, first pose aligned."""
+    tracker = started(sitting)
+    states, error = [], {}
+    truth = sitting.ground_truth.T_world_cam
+    for index in range(END):
+        frame = sitting[index]
+        result = tracker.track(change(frame) if index in bad else frame)
+        states.append(result.state)
+        assert result.T_world_cam is None or np.isfinite(result.T_world_cam).all()
+        if result.state == "ok":
+            error[index] = float(np.linalg.norm((truth[0] @ result.T_world_cam - truth[index])[:3, 3]))
+    assert max(error.values()) < 0.05
+    return states
+
+
+@pytest.mark.parametrize("value", [0, 127, 255], ids=["covered lens", "fog", "saturated"])
+def test_frames_without_any_texture_are_lost_and_only_those(sitting, value: int) -> None:
+    states = track(sitting, lambda frame: replace(frame, rgb=np.full_like(frame.rgb, value)))
+    lost = [index for index, state in enumerate(states) if state == "lost"]
+    assert lost[: len(BAD)] == list(BAD), "each covered frame counts as lost"
+    assert len(lost) <= len(BAD) + 2, f"recovery within two frames, but lost: {lost}"
+
+
+@pytest.mark.parametrize("gain", [0.35, 2.2], ids=["under-exposed", "over-exposed"])
+def test_a_wrong_exposure_is_survived(sitting, gain: float) -> None:
+    def exposed(frame: Frame) -> Frame:
+        """As if exposed `gain` times as long, clipped by the sensor."""
+        return replace(frame, rgb=np.clip(frame.rgb * gain, 0, 255).astype(np.uint8))
+
+    assert track(sitting, exposed).count("ok") >= END - 3
+
+
+def test_without_depth_for_a_while_it_tracks_on_or_says_lost(sitting) -> None:
+    states = track(sitting, lambda frame: replace(frame, depth=np.zeros_like(frame.depth)))
+    assert states[BAD.stop + 2 :].count("ok") == END - BAD.stop - 2
+
+
+@pytest.mark.parametrize("degrees", [3, 5, 7])
+def test_a_sudden_turn_is_no_translation(sitting, degrees: int) -> None:
+    """From rest, one frame later turned: a chance agreement within the search window must not pass for the pose."""
+    tracker = started(sitting)
+    frame, matrix = sitting[5], sitting.camera.matrix
+    for index in range(3):
+        tracker.track(replace(frame, index=index, timestamp=index / 30))
+    rotation = cv2.Rodrigues(np.array([0, np.deg2rad(degrees), 0]))[0]
+    warp, size = matrix @ rotation @ np.linalg.inv(matrix), (sitting.camera.width, sitting.camera.height)
+    turned = Frame(
+        3,
+        0.1,
+        np.asarray(cv2.warpPerspective(frame.rgb, warp, size), np.uint8),
+        np.asarray(cv2.warpPerspective(frame.depth, warp, size, flags=cv2.INTER_NEAREST), np.float32),
+    )
+    result = tracker.track(turned)
+    assert result.state == "lost" or np.linalg.norm(result.T_world_cam[:3, 3]) < 0.02
+
+
+def test_a_gap_of_a_second_is_bridged_or_said(sitting) -> None:
+    tracker = started(sitting)
+    truth = sitting.ground_truth.T_world_cam
+    tracked = []
+    for index in (*range(5), *range(36, 44)):
+        result = tracker.track(sitting[index])
+        if result.state == "ok":
+            assert np.linalg.norm((truth[0] @ result.T_world_cam - truth[index])[:3, 3]) < 0.03
+            tracked.append(index)
+    assert tracked[:5] == [0, 1, 2, 3, 4]
+
+
+def test_frames_of_another_kind_are_refused_in_one_line(sitting) -> None:
+    tracker = build_tracker("emfoa-oft?masks=none", {}, TrackerContext(sequence_id=sitting.id))
+    for method in (tracker.finalize, tracker.map_outputs):
+        with pytest.raises(TrackerError, match=r"before reset\(\)"):
+            method()
+    tracker.reset(sitting.camera, rng=np.random.default_rng(0))
+    frame = sitting[0]
+    for wrong, text in (
+        (replace(frame, rgb=frame.rgb / 255.0), r"colour of type float64 .*uint8"),
+        (replace(frame, depth=(1000 * frame.depth).astype(np.uint16)), r"depth of type uint16 .*float32, in metres"),
+        (replace(frame, depth=None), r"depth of type object"),
+        (replace(frame, timestamp=float("inf")), r"timestamp inf"),
+    ):
+        with pytest.raises(SequenceError, match=text):
+            tracker.track(wrong)
+
+
+def test_missing_depth_is_missing_however_it_is_written_and_buffers_may_be_reused(sitting) -> None:
+    def poses(missing: float, *, reuse: bool) -> bytes:
+        tracker = started(sitting, "emfoa-oft?masks=none")
+        found, buffer = [], np.empty_like(sitting[0].depth)
+        for index in range(5):
+            frame = sitting[index]
+            depth = np.where(frame.depth > 0, frame.depth, missing).astype(np.float32)
+            buffer[:] = depth
+            found.append(tracker.track(replace(frame, depth=buffer if reuse else depth)).T_world_cam)
+        return np.array(found).tobytes()
+
+    zero = poses(0.0, reuse=False)
+    assert poses(np.inf, reuse=False) == zero and poses(np.nan, reuse=False) == zero
+    assert poses(0.0, reuse=True) == zero

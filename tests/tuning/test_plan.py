@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import optuna
 import pytest
 import simulated
@@ -15,19 +19,24 @@ from simulated import SimulatedTuner, make_spec, valley
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core.errors import DynslamError, StudyError
+from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.core.toml import read_settings
+from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences.view import part_of
+from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import Plan, StudySpec, Verdict, finish, read_preset_text, run_study, write_page
 from dynslam_bench.tuning.objectives import InstanceFailedError, Outcome
+from dynslam_bench.tuning.splits import check_splits, design_of, seen_note, splits_seen, with_more_starts
 from dynslam_bench.tuning.storage import EARLIER, best_trials, importances
-from dynslam_bench.tuning.study_file import ProblemInstance, SpaceSpec
+from dynslam_bench.tuning.study_file import (
+    ProblemInstance,
+    SpaceSpec,
+    further_scenes,
+    parse_instances,
+    scenes,
+)
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
-
-
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    root = tmp_path_factory.mktemp("toys")
-    return [str(toy_tracker.make_sequence(root / f"s{i}", 0.8 * i)) for i in range(7)]
 
 
 def make(folders: list[str], **changes: object) -> StudySpec:
@@ -248,3 +257,265 @@ def test_a_baseline_that_crashes_where_it_judges_is_one_clear_line(tmp_path: Pat
     tuner.run()
     with pytest.raises(StudyError, match=r"^the baseline fails: \S+: crashed: it broke"):
         finish(tuner)
+
+
+WALK = "synthetic/walking_xyz"
+
+
+def spec(tune: list[str], held_out: list[str], **changes: object) -> StudySpec:
+    values: dict[str, object] = {
+        "name": "toy", "tracker": TRACKER, "tune": tune, "held_out": held_out, "trials": 2, "top": 1,
+        "space": {"include": ["gain"]}, "pruner": "none", "min_coverage": None, "offsets": [0], "recorded": [],
+    }  # fmt: skip
+    return StudySpec.model_validate({**values, **changes})
+
+
+def check(tune: list[str], held_out: list[str]) -> None:
+    study = spec(tune, held_out)
+    check_splits(study.name, {"tune": study.instances(*study.tune), "held_out": study.instances(*study.held_out)})
+
+
+@pytest.mark.parametrize("other", ["?scene=0", "?scene=000", "@0", "?scene=0&frames=50", "?frames=10&noise=3", ""])
+def test_rendered_sequences_overlap_in_every_spelling(other: str) -> None:
+    with pytest.raises(StudyError, match=r"^[^\n]*are the same sequence") as caught:
+        check([WALK], [f"{WALK}{other}"])
+    assert f"'{WALK}'" in str(caught.value), "both spellings"
+
+
+def test_a_path_is_a_spelling_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy_tracker.make_sequence(tmp_path / "toys" / "a", 0.3)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StudyError, match="are the same sequence"):
+        check(["./toys/a"], [str(tmp_path / "toys" / ".." / "toys" / "a")])
+
+
+def test_a_copy_is_the_same_recording(tmp_path: Path) -> None:
+    whole = str(toy_tracker.make_sequence(tmp_path / "whole", 0.3))
+    copy = str(shutil.copytree(whole, tmp_path / "copy"))
+    for tune, held_out, named in (
+        ([whole], [copy], "are the same sequence"),
+        ([whole, copy], [], "are the same frames"),
+    ):
+        with pytest.raises(StudyError, match=named) as caught:
+            check(tune, held_out)
+        assert whole in str(caught.value) and copy in str(caught.value)
+
+
+def disguised(whole: Path, copy: Path, how: str) -> Path:
+    """A copy of a toy recording: renamed, shifted, re-encoded, beginning later, seen from elsewhere."""
+    shutil.copytree(whole, copy)
+    shift, dropped = 1000.013 * (how == "shifted"), 5 * (how == "later")
+    names = {f"{i}.png": f"{100 + i}-b.png" if how == "renamed" else f"{i}.png" for i in range(24)}
+    for kind in ("rgb", "depth"):
+        for old, new in names.items():
+            image = cv2.imread(str(copy / kind / old), cv2.IMREAD_UNCHANGED)
+            (copy / kind / old).unlink()
+            cv2.imwrite(str(copy / kind / new), image, [cv2.IMWRITE_PNG_COMPRESSION, 0 if how == "re-encoded" else 3])
+    for kind in ("rgb", "depth", "groundtruth"):
+        lines = [line.split() for line in (copy / f"{kind}.txt").read_text().splitlines()[dropped:]]
+        for words in lines:
+            words[0] = f"{float(words[0]) + shift:.6f}"
+            if kind != "groundtruth":
+                words[1] = f"{kind}/{names[Path(words[1]).name]}"
+            elif how == "elsewhere":  # turned by 90 degrees and moved
+                words[1:4] = ["5", f"{float(words[1]) - 2:.6f}", "1"]
+        (copy / f"{kind}.txt").write_text("\n".join(" ".join(words) for words in lines) + "\n")
+    return copy
+
+
+@pytest.mark.parametrize("how", ["renamed", "shifted", "re-encoded", "later", "elsewhere"])
+def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> None:
+    whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24)
+    copy, disguised_copy = (disguised(whole, tmp_path / name, how) for name in ("copy", "twin"))
+    assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, "digests alone pass it"
+    with pytest.raises(StudyError, match="are the same sequence"):
+        check([str(whole)], [str(copy)])
+    with pytest.raises(StudyError, match="are the same sequence"):
+        check([str(disguised_copy)], [str(whole)])
+    for phase in (0.9, 1.7, 2.5):
+        other = toy_tracker.make_sequence(tmp_path / f"other{phase}", phase, 24)
+        check([str(copy)], [str(other)])
+
+
+@pytest.mark.parametrize(
+    ("tune", "held_out", "named"),
+    [
+        (["?scene=1"], ["?scene=5"], r"scene=5' is used as held-out.*0-99.*the tune split"),
+        (["?scene=105"], ["?scene=101"], r"scene=105' is used as tune.*100-199.*held-out split"),
+    ],
+)
+def test_scenes_stay_in_their_split(tune: list[str], held_out: list[str], named: str) -> None:
+    splits = [[f"{WALK}{query}" for query in queries] for queries in (tune, held_out)]
+    with pytest.raises(StudyError, match=named):
+        check(*splits)
+    check([f"{WALK}?scene=1", f"{WALK}?scene=1&noise=4"], [f"{WALK}?scene=101"])
+
+
+def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
+    held, tune, plain = (
+        str(toy_tracker.make_sequence(tmp_path / name, phase))
+        for name, phase in (
+            ("rgbd_dataset_freiburg3_walking_rpy", 3.4), ("rgbd_dataset_freiburg3_walking_xyz", 3.9), ("plain", 0.7)
+        )
+    )  # fmt: skip
+    with pytest.raises(StudyError, match="the catalogue puts it into the held-out"):
+        check([held], [])
+    with pytest.raises(StudyError, match="the catalogue puts it into the tune"):
+        check([plain], [tune])
+    check([tune], [held])
+
+
+@pytest.mark.parametrize(
+    ("source", "seen"), [("auto", ["tune", "confirm"]), ("embedded", ["tune", "confirm"]), ("oracle", [])]
+)
+def test_the_embedded_network_alone_was_trained_on_the_scenes(source: str, seen: list[str]) -> None:
+    study = simulated.make_spec()
+    design = simulated.simulated_design(study)
+    settings = apply_overrides(TRACKERS.get("mask-rcnn").settings(), {"segmentation.source": source})
+    assert splits_seen(settings, design) == seen
+    assert splits_seen(TRACKERS.get(TRACKER).settings(), design) == [], "a system without masks"
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_page_summary_and_preset_mark_scenes_of_the_training(masks: bool, tmp_path: Path) -> None:
+    changes = {"tracker": "mask-rcnn", "space": {"include": ["features.n_features"]}} if masks else {}
+    tuner = simulated.SimulatedTuner(simulated.make_spec(trials=3, **changes), tmp_path)
+    tuner.run()
+    summary = finish(tuner)
+    assert summary.seen == (["tune", "confirm"] if masks else []) and bool(seen_note(summary.seen)) == masks
+    page, preset = write_page(tuner, summary).read_text(), (tuner.folder / "best.toml").read_text()
+    assert ("in the trial §" in page, "unseen instances §" in page, "held-out §" in page) == (masks, masks, False)
+    assert page.count("trained on those very scenes") >= 3 * masks and ("trained on" in preset) == masks
+
+
+def test_a_text_names_scenes_lengths_and_starts() -> None:
+    instances = parse_instances(f"{WALK}?scene=0-1,7&frames=80&offsets=0-4")
+    assert len(instances) == 15
+    assert instances[0] == ProblemInstance(f"{WALK}?scene=0&frames=80")
+    assert instances[-1] == ProblemInstance(f"{WALK}?scene=7&frames=80", offset=4)
+    assert list(scenes(instances)) == [f"{WALK}?scene=0", f"{WALK}?scene=1", f"{WALK}?scene=7"]
+
+
+@pytest.mark.parametrize("text", [
+    "bonn/crowd[0:120]", "bonn/crowd[40:]?offsets=2,5&stride=2", "bonn/crowd?frames=120&degrade=blur:0.5,glare:0.2",
+    f"{WALK}[10:40]?scene=3&frames=60&noise=7&seeds=0-1", "tum/fr1/xyz", "some/folder[0:9]?offsets=1",
+])  # fmt: skip
+def test_the_text_of_an_instance_names_it(text: str) -> None:
+    instances = parse_instances(text)
+    assert [parse_instances(str(instance)) for instance in instances] == [(instance,) for instance in instances] != []
+
+
+def test_parts_strides_and_degradation_reach_the_run() -> None:
+    (instance,) = parse_instances("bonn/crowd[20:120]?offsets=3&stride=2&degrade=blur:0.5&seeds=4")
+    run = instance.run_spec("orb-slam2", threads=2)
+    assert (run.frames, run.offset, run.stride, run.seed, run.threads) == ((20, 120), 3, 2, 4, 2)
+    assert run.degrade == {"blur": 0.5}
+    assert parse_instances("bonn/crowd?frames=120")[0].frames == (0, 120)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("bonn/crowd[0:10", "names no instances"),
+        ("bonn/crowd[9:3]", "9:3"),
+        (f"{WALK}?scene=5-2", "'5-2'"),
+        (f"{WALK}?scene=1,0-2", "'0-2'"),
+        (f"{WALK}?scene=first", "'scene=first'"),
+        ("bonn/crowd?offset=3", "'offset=3'.*offsets"),
+        ("bonn/crowd?stride=2&stride=3", "stride twice"),
+        ("bonn/crowd?noise=3", "noise"),
+        ("bonn/crowd?scene=3", "scene"),
+        ("bonn/crowd[0:9]?frames=3", "frames"),
+        ("bonn/crowd?degrade=blurr:0.3", "'blurr'.*'blur'"),
+        ("bonn/crowd?degrade=blur:3", "'blur' is 3.0"),
+        ("bonn/crowd?degrade=blur:much", "blur:much"),
+    ],
+)
+def test_what_cannot_be_read_is_one_clear_line(text: str, named: str) -> None:
+    with pytest.raises(DynslamError, match=named) as caught:
+        parse_instances(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> str:
+    return str(toy_tracker.make_sequence(tmp_path / "a", 0.3))
+
+
+def test_instances_are_measured_against_their_sequence(folder: str) -> None:
+    assert len(ProblemInstance(folder, (2, 10), offset=1, stride=3).open()) == 3
+    for instance, named in (
+        (ProblemInstance(folder, (0, 20)), r"0 to 19.* 12 frames"),
+        (ProblemInstance(folder, offset=11), "1 frames, it needs 2"),
+    ):
+        with pytest.raises(StudyError, match=named):
+            instance.open()
+    (Path(folder) / "groundtruth.txt").unlink()
+    with pytest.raises(StudyError, match="no ground truth"):
+        ProblemInstance(folder).open()
+
+
+def test_instances_of_one_recording_are_apart_or_repeats(folder: str) -> None:
+    one, later = ProblemInstance(folder, (0, 6)), ProblemInstance(folder, (6, 12))
+    check_splits("s", {"tune": [one, replace(one, offset=1), later]})
+    for instances, named in (
+        ([one, ProblemInstance(folder, (4, 12))], "share 2 frames"),
+        ([one, one], "is named twice"),
+        ([ProblemInstance(folder), ProblemInstance(folder, (0, 12))], "are the same frames"),
+    ):
+        with pytest.raises(StudyError, match=named):
+            check_splits("s", {"tune": instances})
+    with pytest.raises(StudyError, match=f"{re.escape(folder)}' held out are the same sequence"):
+        check_splits("s", {"tune": [one], "held_out": [later]})
+
+
+def test_the_baseline_runs_from_three_starts() -> None:
+    few = parse_instances(f"{WALK}?scene=0-3&frames=20&offsets=0,3")
+    first = [instance.offset for instance in with_more_starts(few) if instance.scene.endswith("?scene=0")]
+    assert sorted(first) == [0, 1, 3]
+
+
+@pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 18), (11, 18), (40, 20)])
+def test_the_choice_is_made_on_further_scenes(scenes_to_tune_on: int, reserved: int) -> None:
+    spec = StudySpec(name="s", tune=(f"{WALK}?scene=0-{scenes_to_tune_on - 1}&frames=20",), recorded=())
+    design = design_of(spec)
+    confirm, tune = ({instance.scene for instance in split} for split in (design.confirm, design.tune))
+    assert (len(tune), len(confirm)) == (scenes_to_tune_on, reserved) and not confirm & tune
+    assert len({instance.scene for instance in design.tune[:scenes_to_tune_on]}) == scenes_to_tune_on, "in turn"
+    assert {instance.offset for instance in design.confirm} == {0, 3}
+
+
+def test_further_scenes_are_of_all_sequences_in_turn_and_of_their_split() -> None:
+    tune = (f"{WALK}?scene=0-1&frames=20&offsets=0", "synthetic/sitting_xyz?scene=5&frames=20&offsets=2&seeds=3")
+    spec = StudySpec(name="s", tune=tune, confirm=(tune[0].replace("0-1", "7"),), recorded=(),
+                     held_out=(f"{WALK}?scene=100-101&frames=20&offsets=0",))  # fmt: skip
+    design = design_of(spec, further=2)
+    assert [instance.scene.rpartition("=")[2] for instance in design.confirm] == ["7", "2", "3"]
+    assert [instance.scene.rpartition("=")[2] for instance in design.held_out] == ["100", "101", "102", "103"]
+    added = further_scenes(spec.instances(*tune), 2, set(), range(3, 9))
+    assert [str(instance) for instance in added] == [
+        f"{WALK}?scene=3&frames=20&offsets=0", "synthetic/sitting_xyz?scene=3&frames=20&offsets=2&seeds=3"
+    ]  # fmt: skip
+    with pytest.raises(StudyError, match=r"2 further scenes.*only 1"):
+        further_scenes(spec.instances(tune[0]), 2, {f"{WALK}?scene=3"}, range(3, 5))
+
+
+def test_recordings_are_confirmed_on_other_stretches_or_not_at_all(folder: str) -> None:
+    def confirm(*tune: str, **changes: object) -> list[str]:
+        spec = StudySpec.model_validate({"name": "s", "tune": tune, "recorded": (), "offsets": (0,), **changes})
+        return [str(instance).removeprefix(folder) for instance in design_of(spec).confirm]
+
+    assert confirm(f"{folder}[0:3]", f"{folder}[3:5]") == ["[5:8]?offsets=0", "[8:10]?offsets=0"]
+    assert confirm(f"{folder}[0:8]") == [] == confirm(folder), "no frames are left"
+    for other in (f"{folder}[2:6]", f"{folder}[0:4]?offsets=1"):
+        with pytest.raises(StudyError, match=r"share [24] frames"):
+            confirm(f"{folder}[0:4]", confirm=(other,))
+
+
+def test_a_recording_that_is_here_is_in_the_check(folder: str, tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    toy_tracker.make_sequence(root / "bonn" / "rgbd_bonn_crowd", 0.2)
+    recorded = design_of(StudySpec(name="s", tune=(folder,), data_root=str(root))).recorded
+    assert recorded == tuple(ProblemInstance("bonn/crowd", recorded[0].frames, offset) for offset in range(4))
+    assert design_of(StudySpec(name="s", tune=(folder,), recorded=(), data_root=str(root))).recorded == ()
+    assert design_of(StudySpec(name="s", tune=(folder,), data_root=str(tmp_path / "empty"))).recorded == ()

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import math
+import multiprocessing
 import os
+import re
+import runpy
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import optuna
 import pytest
 import toy_tracker
+from faults import in_a_small_process, survey
 from optuna.trial import TrialState
+from simulated import HELD_OUT, TUNE, SimulatedTuner, make_spec, simulated_design, valley
 
 from dynslam_bench.core.errors import DynslamError, StudyError
 from dynslam_bench.core.settings import apply_overrides
@@ -21,6 +29,8 @@ from dynslam_bench.core.toml import read_settings
 from dynslam_bench.runs import RunEvent, RunStore
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import (
+    Outcome,
+    ProblemInstance,
     Study,
     StudySpec,
     Verdict,
@@ -32,30 +42,25 @@ from dynslam_bench.tuning import (
     search_space,
     write_page,
 )
+from dynslam_bench.tuning.storage import JournalFile, open_database, open_storage
 from dynslam_bench.tuning.study import CRASHED_WORKER
 from dynslam_bench.tuning.study_file import SpaceSpec
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 
 
-@pytest.fixture(scope="module")
-def sequences(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    root = tmp_path_factory.mktemp("toys")
-    return [str(toy_tracker.make_sequence(root / f"s{i}", 0.8 * i)) for i in range(4)]
-
-
-def make(sequences: list[str], **changes: object) -> StudySpec:
+def make(folders: list[str], **changes: object) -> StudySpec:
     values: dict[str, object] = {
-        "name": "toy", "tracker": TRACKER, "tune": sequences[:2], "held_out": sequences[3:], "trials": 10,
-        "confirm": sequences[2:3],
+        "name": "toy", "tracker": TRACKER, "tune": folders[:2], "held_out": folders[3:4], "trials": 10,
+        "confirm": folders[2:3],
         "space": {"include": ["gain", "wobble"]}, "seeds": [0], "offsets": [0], "top": 2,
         "pruner": "none", "min_coverage": None, "recorded": [],
     }  # fmt: skip
     return StudySpec.model_validate({**values, **changes})
 
 
-def test_a_study_finds_the_known_optimum(sequences: list[str], tmp_path: Path) -> None:
-    tuner = run_study(make(sequences, trials=14), results=tmp_path)
+def test_a_study_finds_the_known_optimum(folders: list[str], tmp_path: Path) -> None:
+    tuner = run_study(make(folders, trials=14), results=tmp_path)
     trials = tuner.study.get_trials()
     assert len(trials) == 14 and all(trial.state == TrialState.COMPLETE for trial in trials)
     assert trials[0].params == {"gain": 1.5, "wobble": 2}, "trial 0 is the default"
@@ -74,9 +79,9 @@ def test_a_study_finds_the_known_optimum(sequences: list[str], tmp_path: Path) -
     assert set(preset) == {"gain", "wobble"} and abs(math.log(preset["gain"])) < math.log(1.3)
 
 
-def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> None:
+def test_trials_are_runs_of_the_store(folders: list[str], tmp_path: Path) -> None:
     told: list[RunEvent] = []
-    tuner = run_study(make(sequences, trials=3), results=tmp_path, on_run=told.append)
+    tuner = run_study(make(folders, trials=3), results=tmp_path, on_run=told.append)
     stored = set(RunStore(tmp_path).ids())
     trials = tuner.study.get_trials()
     assert trials
@@ -92,8 +97,8 @@ def test_trials_are_runs_of_the_store(sequences: list[str], tmp_path: Path) -> N
     assert {record.tracker.given for record in records} == {TRACKER}, "its id, toy, names it to nobody"
 
 
-def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_path: Path) -> None:
-    spec = make(sequences, space={"include": ["mode", "anger"]}, trials=8, sampler="random")
+def test_a_crash_is_a_failed_trial_with_its_reason(folders: list[str], tmp_path: Path) -> None:
+    spec = make(folders, space={"include": ["mode", "anger"]}, trials=8, sampler="random")
     tuner = run_study(spec, results=tmp_path)
     failed = tuner.study.get_trials(states=(TrialState.FAIL,))
     assert failed, "a random sampler draws 'crash' within eight trials"
@@ -102,8 +107,8 @@ def test_a_crash_is_a_failed_trial_with_its_reason(sequences: list[str], tmp_pat
         assert "the toy broke" in trial.user_attrs["reason"]
 
 
-def test_constraints_decide_who_is_a_candidate(sequences: list[str], tmp_path: Path) -> None:
-    tuner = run_study(make(sequences, trials=4, min_fps=1e9), results=tmp_path)
+def test_constraints_decide_who_is_a_candidate(folders: list[str], tmp_path: Path) -> None:
+    tuner = run_study(make(folders, trials=4, min_fps=1e9), results=tmp_path)
     assert all(trial.constraints["fps"] > 0 for trial in tuner.study.get_trials())
     summary = finish(tuner)
     assert summary.verdict in (Verdict.WORSE, Verdict.NOT_JUDGED)
@@ -118,8 +123,8 @@ if __name__ == "__main__":
 """
 
 
-def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_path: Path) -> None:
-    spec = make(sequences, trials=6)
+def test_kill_and_resume_loses_only_the_running_trial(folders: list[str], tmp_path: Path) -> None:
+    spec = make(folders, trials=6)
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
     command = [sys.executable, str(script), spec.model_dump_json(), str(tmp_path)]
@@ -157,10 +162,10 @@ def test_kill_and_resume_loses_only_the_running_trial(sequences: list[str], tmp_
     ],
 )
 def test_bad_studies_are_refused_before_any_trial(
-    sequences: list[str], tmp_path: Path, changes: dict[str, object], message: str
+    folders: list[str], tmp_path: Path, changes: dict[str, object], message: str
 ) -> None:
     with pytest.raises(DynslamError, match=message):
-        run_study(make(sequences, **changes), results=tmp_path)
+        run_study(make(folders, **changes), results=tmp_path)
     journal = tmp_path / "studies" / "toy" / "journal.log"
     assert not journal.exists() or '"op_code":6' not in journal.read_text()
 
@@ -184,14 +189,14 @@ def test_bad_study_files_are_one_clear_line(tmp_path: Path, text: str, message: 
 
 
 def test_resuming_something_else_is_refused_with_the_difference(
-    sequences: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folders: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_study(make(sequences, trials=2), results=tmp_path)
+    run_study(make(folders, trials=2), results=tmp_path)
     with pytest.raises(StudyError, match=r"stored with other seeds: \[0\] there, \[0, 1\] here"):
-        run_study(make(sequences, trials=2, seeds=[0, 1]), results=tmp_path)
+        run_study(make(folders, trials=2, seeds=[0, 1]), results=tmp_path)
     ask = Study.ask
     monkeypatch.setattr(Study, "ask", lambda *given: time.sleep(0.2) or ask(*given))  # other threads count meanwhile
-    more = run_study(make(sequences, trials=4), results=tmp_path, jobs=3)
+    more = run_study(make(folders, trials=4), results=tmp_path, jobs=3)
     assert len(more.study.get_trials()) == 4, "more trials of the same study are welcome"
 
 
@@ -208,9 +213,9 @@ def test_a_study_does_not_go_on_after_its_data_changed(tmp_path: Path) -> None:
 
 
 def test_a_study_of_older_code_can_be_read_but_not_continued(
-    sequences: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folders: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec = make(sequences, trials=2)
+    spec = make(folders, trials=2)
     run_study(spec, results=tmp_path)
     monkeypatch.setattr("dynslam_bench.runs.identity.source_fingerprint", lambda *_: "newer")
     with pytest.raises(StudyError, match="stored with other code"):
@@ -229,3 +234,207 @@ def test_space_of_a_real_tracker_can_be_drawn() -> None:
     for _ in range(20):
         values = study.ask(distributions(space)).params
         apply_overrides(settings(), values)  # every drawn configuration is valid
+
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "tune_in_python.py"
+DOCS = EXAMPLE.parents[1] / "docs"
+FIELDS: dict[str, Any] = {
+    "name": "py", "tracker": TRACKER, "tune": [TUNE], "held_out": [HELD_OUT], "recorded": (), "trials": 8,
+    "space": {"include": ["gain", "wobble"]}, "min_coverage": None,
+}  # fmt: skip
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs are drawn."""
+    design = simulated_design(make_spec())
+    monkeypatch.setattr("dynslam_bench.tuning.plan.design_of", lambda spec: design)
+    for name in ("outcomes", "_identify", "_error"):
+        monkeypatch.setattr(Study, name, getattr(SimulatedTuner, name), raising=False)
+    for name, value in {"effect": staticmethod(valley), "noise_seed": 0, "_made": set()}.items():
+        monkeypatch.setattr(Study, name, value, raising=False)
+
+
+def steady(run: Outcome) -> float:
+    return run.ate_m
+
+
+@pytest.mark.usefixtures("drawn")
+def test_own_objective_sampler_callbacks_and_start(tmp_path: Path) -> None:
+    (tmp_path / "preset.toml").write_text("gain = 0.9\n")
+    seen: list[int] = []
+    study = Study(
+        **FIELDS, results=tmp_path, objective=steady, sampler=optuna.samplers.RandomSampler(seed=3),
+        callbacks=[lambda study, trial: seen.append(trial.number)], start=[tmp_path / "preset.toml", {"wobble": 0}],
+    ).run()  # fmt: skip
+    trials = study.study.get_trials()
+    assert [trial.params for trial in trials[:3]] == [
+        {"gain": 1.5, "wobble": 2},
+        {"gain": 0.9, "wobble": 2},
+        {"gain": 1.5, "wobble": 0},
+    ]
+    assert sorted(seen) == list(range(8)) and len(study.frame()) == 8
+    assert study.spec.objectives == ("steady",) and isinstance(study.study.sampler, optuna.samplers.RandomSampler)
+    summary = study.finish()
+    assert summary.candidates[0].confirm is not None and summary.candidates[0].confirm.what == "steady"
+    again = Study(**FIELDS, results=tmp_path, objective=steady, start=[{"wobble": 0}])
+    assert len(again.run().study.get_trials()) == 8, "resumed, and nothing enqueued twice"
+    looked = Study.open(tmp_path / "studies" / "py")
+    assert len(looked.frame()) == 8 and optuna.load_study(study_name="py", storage=open_storage(tmp_path, study.spec))
+
+
+@pytest.mark.usefixtures("drawn")
+def test_instances_may_be_objects(tmp_path: Path) -> None:
+    instance = ProblemInstance("synthetic/walking_xyz?scene=3&frames=20", offset=2)
+    study = Study(**{**FIELDS, "tune": [instance, TUNE]}, results=tmp_path)
+    assert study.spec.tune == ("synthetic/walking_xyz?scene=3&frames=20&offsets=2", TUNE)
+    assert study.spec.instances(study.spec.tune[0]) == [instance]
+
+
+@pytest.mark.usefixtures("drawn")
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"start": [{"gian": 1.0}]}, "'gian'.*'gain'"),
+        ({"start": [{"mode": "crash"}]}, "'crash'.*'fine'"),
+        ({"start": [{"gain": 99.0}]}, "gain = 99.0"),
+        ({"objective": "sped"}, "unknown objective 'sped'.*'speed'"),
+        ({"trails": 3}, "the study: unknown key 'trails'.*'trials'"),
+        ({"start": ["nowhere.toml"]}, "nowhere.toml"),
+    ],
+)
+def test_mistakes_are_one_clear_line(fields: dict[str, Any], named: str, tmp_path: Path) -> None:
+    with pytest.raises(DynslamError, match=named) as caught:
+        Study(**{**FIELDS, **fields}, results=tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_example_goes_as_it_stands_but_for_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(EXAMPLE))["main"](str(tmp_path), 8)
+    told = capsys.readouterr().out
+    assert "trial 0: {'frames': 5}" in told and "trial 1: {'frames': 2}" in told
+    assert told.splitlines()[-1].startswith("Does not matter here"), "nothing can be gained there"
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_notebook_goes_as_it_stands_but_for_its_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    cells = json.loads((EXAMPLE.parent / "notebooks" / "study.ipynb").read_text())["cells"]
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), "study.ipynb", "exec"), names)
+    assert len(names["trials"]) == 12 and names["summary"].conclusion in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_page_s_python_goes_as_it_stands_but_for_its_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib", reason="pandas draws with it")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fast.toml").write_text('"backend.keyframes.tracked_share" = 0.8\n')
+    first, second = re.findall(r"^```python\n(.*?)^```", (DOCS / "how-to" / "study.md").read_text(), flags=re.S | re.M)
+    exec(compile(first.replace("trials=30", "trials=6"), "docs/how-to/study.md", "exec"), {})
+    assert "scenes that no trial saw" in capsys.readouterr().out.splitlines()[-1]
+    tuned = "params.backend.keyframes.tracked_share"
+    second = second.replace("studies/thresholds", "studies/mine").replace("params.epipolar.threshold_px", tuned)
+    names: dict[str, Any] = {}
+    exec(compile(second, "docs/how-to/study.md", "exec"), names)
+    assert len(names["frame"]) == 6
+
+
+LOSS = {"x": optuna.distributions.FloatDistribution(0, 1)}
+SPEC = StudySpec(name="trust", tune=("synthetic/walking_xyz?frames=10",))
+
+
+def add(path: Path, upto: int) -> None:
+    """Open the study and add finished trials until it has so many."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    path.parent.mkdir(exist_ok=True)
+    storage = optuna.storages.JournalStorage(JournalFile(path))
+    study = optuna.create_study(storage=storage, study_name="s", load_if_exists=True)
+    for number in range(len(study.trials), upto):
+        study.add_trial(optuna.trial.create_trial(value=number / 8, params={"x": number / 8}, distributions=LOSS))
+
+
+def values(path: Path) -> list[float]:
+    storage = optuna.storages.JournalStorage(JournalFile(path))
+    return [trial.value for trial in optuna.load_study(storage=storage, study_name="s").trials]
+
+
+@in_a_small_process
+def test_no_fault_spoils_a_journal(tmp_path: Path) -> None:
+    path = tmp_path / "study" / "journal.log"
+    ends = survey(lambda: add(path, 3), path.parent, result=lambda: values(path), faults=("kill", "full", "read-only"))
+    assert values(path) == [0, 1 / 8, 2 / 8] and path.read_bytes().endswith(b"\n")
+    assert ends.operations > 8 and ends.ends["kill", -9] == ends.operations and ends.ends["full", 3] > 3
+
+
+def test_an_unfinished_line_is_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "journal.log"
+    add(path, 2)
+    with path.open("ab") as file:
+        file.write(b'{"op_code": 4, "half')
+    assert values(path) == [0, 1 / 8]
+    add(path, 3)
+    assert values(path) == [0, 1 / 8, 2 / 8]
+
+
+def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "journal.log"
+    add(path, 2)
+    before = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StudyError, match="No space left on device"):
+        add(path, 3)
+    assert path.read_bytes() == before
+
+
+def begin(url: str, barrier: Any, outcomes: Any) -> None:
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    barrier.wait()
+    try:
+        optuna.create_study(storage=open_database(url), study_name="s", load_if_exists=True)
+        outcomes.put("")
+    except Exception as error:
+        outcomes.put(f"{type(error).__name__}: {error}")
+
+
+def test_workers_may_begin_on_an_empty_database_at_the_same_time(tmp_path: Path) -> None:
+    """SQLite, with as many errors as PostgreSQL gives: without repeats three of four workers fail."""
+    context = multiprocessing.get_context("fork")
+    barrier, outcomes = context.Barrier(4), context.Queue()
+    url = f"sqlite:///{tmp_path}/study.db"
+    workers = [context.Process(target=begin, args=(url, barrier, outcomes)) for _ in range(4)]
+    for worker in workers:
+        worker.start()
+    assert [outcomes.get(timeout=120) for _ in workers] == [""] * 4
+    for worker in workers:
+        worker.join()
+
+
+@pytest.mark.parametrize("storage", ["redis://host/0", "postgres", "file:///x", "s3://bucket"])
+def test_storages_that_may_hold_code_are_refused(tmp_path: Path, storage: str) -> None:
+    with pytest.raises(StudyError, match="is of no kind that is known"):
+        open_storage(tmp_path, SPEC.model_copy(update={"storage": storage}))
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["postgresql://me:s3cret@127.0.0.1:9/x", "mysql+nothing://me:s3cret@host/x", "postgresql://me:s3%63ret@127.0.0.1:9/x",
+     "grpc://me:s3cret@host"],
+)  # fmt: skip
+def test_the_password_is_in_no_error_and_no_record(tmp_path: Path, address: str) -> None:
+    spec = SPEC.model_copy(update={"storage": address})
+    with pytest.raises(StudyError, match="cannot open the storage") as caught:
+        open_storage(tmp_path, spec)
+    assert "s3" not in str(caught.value) and caught.value.__cause__ is None
+    assert "s3" not in str(spec.for_others())

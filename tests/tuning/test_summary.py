@@ -4,31 +4,57 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import optuna
 import pytest
+import simulated
 import toy_tracker
 from optuna.trial import TrialState
+from reports_browser import Browser, needs_browser
 from scipy import stats
 from scipy.stats import mstats
+from simulated import SimulatedTuner, make_spec
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning import Study, StudySpec, Verdict, finish, run_study, write_page
+from dynslam_bench.core.settings import Parameter
+from dynslam_bench.core.toml import read_settings
+from dynslam_bench.tuning import (
+    Outcome,
+    ProblemInstance,
+    Study,
+    StudySpec,
+    Verdict,
+    finish,
+    read_preset_text,
+    run_study,
+    write_page,
+)
 from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, beside_default, compared, judge
 from dynslam_bench.tuning.objectives import (
-    Outcome,
+    OBJECTIVES,
+    Configuration,
+    InstanceFailedError,
     bounds,
     by_scene,
     centre,
     detectable,
+    find_objective,
+    own_objective,
     scenes_needed,
     spread_test,
+    together,
 )
+from dynslam_bench.tuning.page import fewer_starts, settings_table, warnings_of
+from dynslam_bench.tuning.splits import Design, with_more_starts
 from dynslam_bench.tuning.storage import FEWEST_TRIALS, importances, open_storage
-from dynslam_bench.tuning.study_file import ProblemInstance
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 CONFIRM = Ratio(ratio=0.7, low=0.6, high=0.82, n=8, sequences=4, bound=0.85)
@@ -195,15 +221,9 @@ def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
         assert all(0 <= importance.low <= importance.high <= 1 for importance in shares.values())
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    root = tmp_path_factory.mktemp("toys")
-    return [str(toy_tracker.make_sequence(root / f"s{i}", 0.8 * i)) for i in range(5)]
-
-
 def test_a_study_is_a_frame(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = StudySpec.model_validate({
-        "name": "toy", "tracker": TRACKER, "tune": folders[:1], "held_out": folders[1:], "trials": 5, "top": 1,
+        "name": "toy", "tracker": TRACKER, "tune": folders[:1], "held_out": folders[1:5], "trials": 5, "top": 1,
         "sampler": "random", "sampler_seed": 3, "pruner": "none", "min_coverage": 0.5, "recorded": [],
         "space": {"include": ["gain", "mode", "anger"], "fixed": {"wobble": 0}},
     })  # fmt: skip
@@ -254,3 +274,200 @@ def test_a_storage_that_holds_no_trials_is_one_clear_line(tmp_path: Path, value:
     study.ask().set_user_attr("coverage", value)
     with pytest.raises(StudyError, match="no trial"):
         Study.open(spec, tmp_path).frame()
+
+
+PLAIN = [ProblemInstance(f"synthetic/walking_xyz?scene={scene}") for scene in range(4)]
+BLURRED = replace(PLAIN[0], degradation=(("blur", 0.5),))
+
+
+def outcome(instance: ProblemInstance, ate: float, time: float = 0.03, coverage: float = 1.0) -> Outcome:
+    return Outcome(instance, "", ate, coverage, time, time, 1.0)
+
+
+def test_objectives_are_logarithms_of_ratios_by_hand() -> None:
+    default = {instance: outcome(instance, 0.02) for instance in [*PLAIN, BLURRED]}
+    tuned = {instance: outcome(instance, 0.01 * (1 + scene), 0.015, 0.98) for scene, instance in enumerate(PLAIN)}
+    values = {name: each.value(tuned, default) for name, each in OBJECTIVES.items() if name != "robustness"}
+    assert values["accuracy"] == pytest.approx(sum(math.log(n / 2) for n in (1, 2, 3, 4)) / 4)
+    assert values["speed"] == pytest.approx(math.log(0.5))
+    assert values["worst"] == pytest.approx(math.log(2)), "the worst of four scenes"
+    assert values["coverage"] == pytest.approx(math.log(3)), "2 % more lost, beside a floor of 1 %"
+    blurred = {**tuned, BLURRED: outcome(BLURRED, 0.06)}
+    assert OBJECTIVES["robustness"].value(blurred, default) == pytest.approx(math.log(3))
+    balance = together([OBJECTIVES["accuracy"], OBJECTIVES["speed"]])
+    assert balance.value(tuned, default) == pytest.approx((values["accuracy"] + values["speed"]) / 2)
+
+
+def test_what_cannot_be_an_objective_is_refused() -> None:
+    default = {instance: outcome(instance, 0.02) for instance in PLAIN}
+    with pytest.raises(StudyError, match="'robustness' counts degraded instances alone"):
+        OBJECTIVES["robustness"].value(default, default)
+    with pytest.raises(StudyError, match=r"'sped'.*'speed'"):
+        find_objective("sped")
+    with pytest.raises(StudyError, match="gives 0 on instance"):
+        own_objective(lambda run: 0.0).value(default, default)
+
+
+class TimedTuner(SimulatedTuner):
+    """`wobble` takes time and leaves the poses alone; a smaller `gain` saves time and may cost accuracy."""
+
+    price = 0.0
+
+    def outcomes(
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        tracker: str = "",
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
+        gain, wobble = float(settings.get("gain", 1.5)), int(settings.get("wobble", 2))
+        found = super().outcomes({"gain": gain}, instances, cache=cache)
+        time = 0.02 * (0.5 + 0.25 * wobble) * gain
+        cost = math.exp(self.price * max(0.0, 1.5 - gain))
+        return {instance: replace(each, ate_m=each.ate_m * cost, processor_s=time) for instance, each in found.items()}
+
+
+def spec(objectives: list[str], include: list[str], **changes: object):
+    values = {"objectives": objectives, "space": {"include": include}, "trials": 14, "top": 3}
+    return make_spec(**values | changes)
+
+
+def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
+    tuner = TimedTuner(spec(["speed"], ["wobble"], pruner="halving"), tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # a constraint is told once, when it is final
+        tuner.run()
+    summary = finish(tuner)
+    chosen = summary.candidates[0]
+    assert summary.verdict == Verdict.PROVEN and chosen.params == {"wobble": 0}
+    assert chosen.held_out is not None and chosen.held_out.ratio == pytest.approx(0.5)
+    assert chosen.on_held_out["accuracy"].ratio == pytest.approx(1.0)
+
+
+def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None:
+    tuner = TimedTuner(spec(["speed"], ["gain"], pruner="halving"), tmp_path)
+    tuner.price = 0.6
+    tuner.run()
+    summary = finish(tuner)
+    assert not summary.candidates[0].chosen and summary.verdict in (Verdict.WORSE, Verdict.PROMISING)
+    assert read_settings(tuner.folder / "best.toml") == summary.candidates[0].params, "written with its status"
+    assert f'status = "{summary.verdict.value}"' in (tuner.folder / "best.toml").read_text()
+
+
+@pytest.mark.parametrize("objectives", [["accuracy", "speed"], ["speed", "accuracy"]])
+def test_the_best_of_a_front_is_the_best_in_all_objectives_together(objectives: list[str], tmp_path: Path) -> None:
+    study = spec(objectives, ["wobble"], space={"include": ["wobble"], "fixed": {"mode": "fine"}})
+    tuner = TimedTuner(study, tmp_path, in_memory=False)
+    tuner.run()
+    summary = finish(tuner)
+    assert summary.best is not None and summary.best.params == {"wobble": 0}
+    assert read_settings(tuner.folder / "best.toml") == {"wobble": 0}
+    assert 'mode = "fine"' in read_preset_text(study, tmp_path), "what the study fixed is a comment"
+    assert "<h3>Pareto front</h3>" in write_page(tuner, summary).read_text()
+
+
+class DriftingTuner(SimulatedTuner):
+    """A machine that slows down with every run, and settings that change nothing; a gain of 13 breaks."""
+
+    calls = 0
+
+    def outcomes(
+        self,
+        settings: Mapping[str, Any],
+        instances: Sequence[ProblemInstance],
+        *,
+        tracker: str = "",
+        cache: bool | None = None,
+    ) -> dict[ProblemInstance, Outcome]:
+        if settings.get("gain") == 13.0:
+            raise InstanceFailedError(f"{instances[0]}: crashed")
+        drawn: dict[ProblemInstance, Outcome] = {}
+        for instance, run in super().outcomes(settings, instances).items():
+            self.calls += 1
+            drawn[instance] = replace(run, ate_m=0.02, processor_s=0.03 * 1.02 ** (self.calls / 2))
+        return drawn
+
+
+def test_a_machine_that_slows_down_decides_nothing(tmp_path: Path) -> None:
+    tuner = DriftingTuner(make_spec(objectives=["speed"]), tmp_path)
+    instances = tuner.design.held_out
+    default, (same, broken) = tuner.evaluate_beside(
+        [Configuration("", settings) for settings in ({"gain": 1.1}, {"gain": 13.0})], instances
+    )
+    assert isinstance(broken, InstanceFailedError) and isinstance(same, dict)
+    assert list(default) == list(instances) == list(same)
+    assert OBJECTIVES["speed"].value(same, default) == pytest.approx(math.log(1.01), abs=0.002), "one run apart"
+    apart = [tuner.outcomes(settings, instances) for settings in ({}, {"gain": 1.1})]
+    assert OBJECTIVES["speed"].value(apart[1], apart[0]) > 0.2, "all of one after all of the other"
+
+
+SPACE = [
+    Parameter("a.threshold", "float", 1.0, 0.1, 10.0, "log", unit="px"),
+    Parameter("a.mode", "categorical", "fast", choices=("fast", "slow")),
+]
+
+
+def tuner_of(study: optuna.Study, objective: str = "accuracy") -> Study:
+    return cast("Study", SimpleNamespace(study=study, spec=SimpleNamespace(objectives=(objective,))))
+
+
+@pytest.mark.parametrize("offsets", [(0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)])
+def test_a_default_of_more_starts_than_the_trials_is_explained(offsets: tuple[int, ...]) -> None:
+    tune = tuple(ProblemInstance("synthetic/walking_xyz?scene=0", offset=offset) for offset in offsets)
+    text = fewer_starts(Design(tune, tuple(with_more_starts(tune)), (), (), ()))
+    assert bool(text) == (len(offsets) < 3)
+
+
+@pytest.mark.parametrize(("values", "count"), [((0.01, 0.02, 0.03), 3), ((-0.01, 0.02, 0.03), 2), ((-1, -1, -1), 0)])
+def test_infeasible_trials_are_counted(values: tuple[float, ...], count: int) -> None:
+    study = optuna.create_study()
+    for value in values:
+        trial = study.ask()
+        trial.set_constraint("ate", value)
+        study.tell(trial, 1.0)
+    (text, *_) = [note for note in warnings_of(tuner_of(study)) if "constraint" in note] or [""]
+    assert (str(count) in text) == bool(text) == (count > 0)
+
+
+def test_times_of_trials_are_called_unpaired() -> None:
+    speed, accuracy = (warnings_of(tuner_of(optuna.create_study(), name)) for name in ("speed", "accuracy"))
+    assert set(accuracy) < set(speed)
+
+
+def test_the_table_holds_default_chosen_and_range() -> None:
+    default: dict[str, Any] = {"a.threshold": 1.0, "a.mode": "fast"}
+    table = settings_table(SPACE, default, {"a.threshold": 3.0, "a.mode": "slow"}, True)
+    assert [[cell.text for cell in row] for row in table.rows] == [
+        ["a.threshold", "1", "3", "0.1 to 10, log", "px"],
+        ["a.mode", "fast", "slow", "fast, slow", ""],
+    ]
+    assert [column.name for column in table.columns] == ["setting", "baseline", "best trial", "range", "unit"]
+    unproven = settings_table(SPACE, default, {}, False)
+    assert unproven.rows[0][2].text == "–" and "keep the baseline" in unproven.caption
+
+
+@needs_browser
+def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None:
+    tuner = simulated.SimulatedTuner(simulated.make_spec(trials=12), tmp_path)
+    tuner.run()
+    summary = finish(tuner)
+    browser = Browser(tmp_path / "profile")
+    try:
+        for width in (1440, 390):
+            browser.open(write_page(tuner, summary), width)
+            browser.run("all('.figure').forEach((figure) => figure.scrollIntoView())")
+            browser.until("all('.figure').every((figure) => figure.querySelector('.main-svg'))", tries=200)
+            assert browser.faults == [] and browser.run("document.documentElement.scrollWidth") == width
+        assert browser.violations() == []
+        assert browser.run("one('.verdict').textContent") == summary.conclusion
+        stages = browser.run("byId('result-1').layout.xaxis.ticktext")
+        confirmed, held_out = (
+            sum(getattr(candidate, split) is not None for candidate in summary.candidates)
+            for split in ("confirm", "held_out")
+        )
+        complete = len(tuner.study.get_trials(states=(TrialState.COMPLETE,)))
+        assert stages == [f"tried: {complete} whole trials", f"confirmed: {confirmed}", f"held out: {held_out}"]
+        assert len(browser.run("all('.figure').map((figure) => figure.id)")) >= 6
+    finally:
+        browser.close()
