@@ -8,8 +8,6 @@ The public interface is `run`, `bench`, `tune`, `report`, `load`, `sequence` and
 Importing this package loads none of its subpackages.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 

@@ -4,8 +4,6 @@ Importing this package registers ``dynslam/<sequence>-v0`` for every listed sequ
 worker processes write ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequence=...)``.
 """
 
-from __future__ import annotations
-
 import gymnasium as gym
 
 from dynslam_bench.contracts import TrackerContractError

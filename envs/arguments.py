@@ -1,7 +1,5 @@
 """The arguments of an environment: the sequence and its part, and the device."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence as PySequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The picture of one frame: features and masks on the image, the trajectory from above, and a line of numbers."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import cv2

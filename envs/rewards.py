@@ -1,7 +1,5 @@
 """Rewards: what the newest frame of an episode earns, by name or as a callable of the user's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

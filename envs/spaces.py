@@ -1,7 +1,5 @@
 """Action space and observation space of the environment. Ground truth enters the part ``privileged`` alone."""
 
-from __future__ import annotations
-
 import math
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence

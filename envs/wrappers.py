@@ -1,7 +1,5 @@
 """Wrappers: timings, trajectories, sequences, small images, degraded and dropped frames."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

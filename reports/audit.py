@@ -4,8 +4,6 @@ Nothing is run. The printed numbers are compared with identities that every such
 compared systems' authors published, and with a static camera.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

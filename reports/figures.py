@@ -1,7 +1,5 @@
 """The report's figures, as plotly figures; pages set fonts and colours of the theme (`THEMES`)."""
 
-from __future__ import annotations
-
 import base64
 import html
 import textwrap

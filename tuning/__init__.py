@@ -5,8 +5,6 @@ Its steps: `read_study` reads a study's TOML, `run_study` makes its trials, `fin
 held-out instances, `write_page` shows it all. `search_space` and `distributions` serve studies of your own.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

@@ -1,7 +1,5 @@
 """After the trials: the best are judged on unseen instances, the best of them on held-out ones and kept as a preset."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

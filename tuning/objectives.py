@@ -5,8 +5,6 @@ logarithms of ratios to the baseline: less is better, 0 is the baseline's own. B
 interval, power, and the test of whether settings matter at all.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence

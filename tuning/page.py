@@ -1,7 +1,5 @@
 """The page of a study: verdict, what was tried, confirmed and held out, settings, Optuna's plots, all trials."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A study before it runs: its space, baseline and instances, what they could show, and how long that takes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase

@@ -1,7 +1,5 @@
 """Where a study is stored, a journal file by default, any SQL database, or Optuna's gRPC proxy; and its trials."""
 
-from __future__ import annotations
-
 import fcntl
 import inspect
 import json

@@ -1,7 +1,5 @@
 """A study as one TOML file, and the problem instances that its texts name: parts of sequences, each from one start."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterable

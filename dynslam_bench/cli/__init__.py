@@ -1,7 +1,5 @@
 """The command line: every verb is a thin call of a public function; heavy modules load when a verb needs them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

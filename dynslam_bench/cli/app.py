@@ -1,7 +1,5 @@
 """The program: its verbs, and how it ends."""
 
-from __future__ import annotations
-
 import os
 import sys
 from typing import Annotated, Optional

@@ -1,7 +1,5 @@
 """``bank add|verify|pull|push``: trajectories as an archive of text files with checksums."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

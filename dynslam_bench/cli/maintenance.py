@@ -1,7 +1,5 @@
 """``doctor``, ``envs`` and ``cache info|clear``: what is installed, registered and stored on this machine."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """``report make|publish|compare|audit-paper``, and ``published``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Optional
 

@@ -1,7 +1,5 @@
 """``eval``, ``protocols list|compare``, ``import`` and ``export``: trajectory files, scored and exchanged."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal, Optional

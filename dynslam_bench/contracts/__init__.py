@@ -20,8 +20,6 @@ Example:
     []
 """
 
-from __future__ import annotations
-
 from dynslam_bench.contracts.checks import TrackerContractError
 from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
 from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need

@@ -4,8 +4,6 @@ A *fault* makes a run ``invalid``: the environment refuses the result. A *blemis
 only: no number is wrong because of it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The contract of all sparse flows: where do these points of one image lie in another?"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable

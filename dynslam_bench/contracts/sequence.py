@@ -1,7 +1,5 @@
 """The contract of data sets: what announces them, and what a sequence hands out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 

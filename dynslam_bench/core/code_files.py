@@ -1,7 +1,5 @@
 """Which files a program is made of: its code, and the data files beside it that its code names."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """How kernels are compiled: functions in numba's subset of Python that become machine code at their first call."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar, cast
 

@@ -1,7 +1,5 @@
 """Resumable download of one file over HTTP, bounded in size."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import ipaddress

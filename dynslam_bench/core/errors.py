@@ -3,8 +3,6 @@
 Each message is one line: what was found (with the measured numbers), what was expected. The `hint` says what to do.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

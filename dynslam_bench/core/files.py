@@ -3,8 +3,6 @@
 What is written has the permissions that the user's umask gives.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

@@ -4,8 +4,6 @@ Run ids and the stage cache's keys are made of these and nothing else, so that w
 Everything is read from files and folders: no plug-in is imported to know its digest.
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import hashlib

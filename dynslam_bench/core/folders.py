@@ -6,8 +6,6 @@ vocabularies). Compiled kernels lie where numba puts them: beside the source, or
 (``NUMBA_CACHE_DIR``).
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

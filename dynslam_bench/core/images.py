@@ -1,7 +1,5 @@
 """Decode image files; a file of a few bytes that claims to be huge is refused before any memory is taken for it."""
 
-from __future__ import annotations
-
 import io
 import struct
 import warnings

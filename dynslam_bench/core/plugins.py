@@ -7,8 +7,6 @@ ones, those of the environment variable ``DYNSLAM_BENCH_PLUGINS``, and those of 
 rest; the reason is kept and shown by ``trackers doctor``.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Persisted records: validated, versioned and digested (`core.files` writes them)."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 No password leaves the process: not in messages, records, reports or logs.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Every random number comes from one seed, through named streams that do not disturb each other."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

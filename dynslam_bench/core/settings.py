@@ -13,8 +13,6 @@ Example:
     1.5
 """
 
-from __future__ import annotations
-
 import json
 import os
 import types

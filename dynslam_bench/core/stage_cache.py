@@ -6,8 +6,6 @@ that appears by atomic rename, so many processes may share a cache; the least re
 over its bound.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections import Counter

@@ -1,7 +1,5 @@
 """Read TOML on every supported Python, and write settings as ``--set`` takes them."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

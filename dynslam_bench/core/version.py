@@ -1,7 +1,5 @@
 """The version of this package: that of the installed distribution, which its build takes from git's tags."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from importlib import metadata

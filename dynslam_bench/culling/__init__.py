@@ -4,8 +4,6 @@ The building blocks are numbered as in `docs/explanation/baselines.md` (B1 to B1
 keypoints and share the starvation guard (`guard`).
 """
 
-from __future__ import annotations
-
 from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np

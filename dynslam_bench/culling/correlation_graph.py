@@ -1,7 +1,5 @@
 """B7: Dai et al. 2020: a Delaunay graph of point correlations, of which the largest rigid component is static."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix

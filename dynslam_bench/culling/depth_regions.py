@@ -1,7 +1,5 @@
 """Rules that tell a person from the background by depth: depth RANSAC (B6), blocks of depth (B9), depth of a box."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -3,8 +3,6 @@
 The test finds motion along epipolar lines, and any motion while the camera only rotates or stands still.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 F is the fundamental matrix of the matches between the previous and the current image.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

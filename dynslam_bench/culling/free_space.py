@@ -1,7 +1,5 @@
 """Free-space violation: a point where earlier keyframes measured free space lies on a moving object."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

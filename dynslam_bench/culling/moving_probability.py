@@ -1,7 +1,5 @@
 """B8: the probability that a feature moves, accumulated over frames (RDS-SLAM, Detect-SLAM)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

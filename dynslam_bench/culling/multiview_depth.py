@@ -1,7 +1,5 @@
 """B4 and B5: DynaSLAM's multi-view geometry: an object that hides points of earlier keyframes is dynamic."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

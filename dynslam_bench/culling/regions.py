@@ -1,7 +1,5 @@
 """Cells of the image, and the region rule: in a moving region many points fail, and a lone failure is noise."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

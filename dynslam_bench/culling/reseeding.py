@@ -1,7 +1,5 @@
 """B12: extract more features than are used, so that culling leaves enough static ones (NGD-SLAM, Crowd-SLAM)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

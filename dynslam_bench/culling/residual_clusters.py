@@ -1,7 +1,5 @@
 """B14: image clusters with a high warped residual move, with a higher prior for people (DGS-SLAM of Yan 2022)."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """B1: drop the features on objects of a-priori dynamic classes (DynaSLAM's variant N); boxes of such objects."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Settings of the rejection rules, one class a rule; importing this module loads neither OpenCV nor torch."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 from pydantic import Field

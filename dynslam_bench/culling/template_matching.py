@@ -1,7 +1,5 @@
 """B13: inside boxes, keep the patches that match where the camera's motion predicts them (DynaTM-SLAM)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

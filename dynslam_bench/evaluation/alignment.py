@@ -1,7 +1,5 @@
 """Moving an estimate onto the ground truth before absolute errors are taken."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Absolute pose error (the paper's Eq. 27)."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

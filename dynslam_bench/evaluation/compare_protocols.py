@@ -1,7 +1,5 @@
 """How much the protocol alone changes the numbers of one trajectory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation

@@ -1,7 +1,5 @@
 """One trajectory against the ground truth under one protocol."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

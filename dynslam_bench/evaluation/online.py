@@ -1,7 +1,5 @@
 """Causal pose error, frame by frame, for environments and for ``frames.csv``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Relative pose error (the paper's Eq. 26)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

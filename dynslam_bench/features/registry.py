@@ -1,7 +1,5 @@
 """Feature extractors: by id (built in, or plug-ins of the entry-point group ``dynslam_bench.features``), and cached."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import cache

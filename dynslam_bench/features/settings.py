@@ -1,7 +1,5 @@
 """Settings of the feature stage; importing this module loads no OpenCV."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import Field

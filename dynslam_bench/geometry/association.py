@@ -1,7 +1,5 @@
 """One-to-one association of two lists of stamps, as the TUM RGB-D benchmark's ``associate.py`` does it."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

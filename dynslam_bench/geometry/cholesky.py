@@ -1,7 +1,5 @@
 """Small symmetric systems, solved inside compiled loops."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

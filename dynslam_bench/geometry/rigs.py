@@ -1,7 +1,5 @@
 """Rigs whose ground truth is that of a body that carries the camera, and what lies between the two."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dynslam_bench.geometry import se3

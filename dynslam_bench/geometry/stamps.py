@@ -6,8 +6,6 @@ float64 seconds, as TUM's scripts and evo do: the float of a stamp of up to nine
 nearest to its text.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from decimal import ROUND_HALF_EVEN, Context, Decimal, InvalidOperation
 

@@ -5,8 +5,6 @@ or with an all-zero quaternion are skipped; quaternions are normalised. Lines ma
 lines with one stamp the last holds. Whatever is not taken as it stands is counted in `FileNotes`.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass

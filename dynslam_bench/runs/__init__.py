@@ -5,8 +5,6 @@
 `export_run` writes them in the formats of others.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

@@ -4,8 +4,6 @@ It holds ``runs/<run_id>/`` with ``run.json`` and the trajectories, ``sequences/
 and ``SHA256SUMS`` of them all, in the format of ``sha256sum -c``. Whatever reads a results folder reads a bank.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The workers of a Dask scheduler: what each of them has, and runs on those that can make them."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

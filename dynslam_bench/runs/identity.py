@@ -1,7 +1,5 @@
 """What makes two runs the same run: everything that its result depends on, and nothing else."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

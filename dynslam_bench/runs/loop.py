@@ -1,7 +1,5 @@
 """The loop in which every run is made: it steps an environment and keeps what is recorded of each frame."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -1,7 +1,5 @@
 """Making runs: one in a child process; many, resumable and parallel, here or on any executor; runs as bytes."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

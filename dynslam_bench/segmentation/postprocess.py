@@ -1,7 +1,5 @@
 """From instances to the dynamic pixels: selection, repair, dilation. Pure functions."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Masks that no network computes here: read from PNG files, written to them, or exact masks of the sequence."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ The settings say where masks come from, which classes are dynamic, how masks are
 segmenter runs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, Literal

@@ -4,8 +4,6 @@ Reads with the pure-Python package ``rosbags`` (extra ``[bags]``). Stamps are th
 depth stay as they are to the last bit, and nothing is guessed where several topics would do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The cameras of the public data sets, and ``camera.toml`` files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

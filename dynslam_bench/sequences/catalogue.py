@@ -1,7 +1,5 @@
 """Every sequence by its id: the public data sets, the rendered ones, plug-ins, and folders of the user's own."""
 
-from __future__ import annotations
-
 import fnmatch
 import re
 from collections.abc import Iterator

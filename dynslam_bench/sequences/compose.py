@@ -5,8 +5,6 @@ and moved as a whole to a place before the host's camera. It is drawn from the h
 the host's world, hides what is behind it, is hidden by what is before it, and casts the depth camera's shadow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Frames that are decoded once, into one file of the stage cache that processes map into their memory."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The paper's preprocessing: undistort, resize to a common resolution, normalise brightness and contrast."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

@@ -3,8 +3,6 @@
 The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass

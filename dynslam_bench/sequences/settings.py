@@ -1,7 +1,5 @@
 """Settings of the preprocessing of frames; importing this loads neither torch nor OpenCV."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field, ValidationInfo, field_validator

@@ -1,7 +1,5 @@
 """What a sequence is hard for: how much of its scene moves, and how its camera moves."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import numpy as np

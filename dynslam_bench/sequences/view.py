@@ -1,7 +1,5 @@
 """Parts of a sequence: a view with renumbered frames, and the identity of the frames that it shows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Benchmark suites, as TOML files: which trackers run on which sequences, with which repeats."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path

@@ -4,8 +4,6 @@ Each ``check_*`` raises a `ConformanceError` that names the fault and its likely
 same checks and returns the outcome of every one. `pytest_plugin` makes tests of them.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

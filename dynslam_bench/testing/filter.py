@@ -1,7 +1,5 @@
 """Conformance of dynamic feature filters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial

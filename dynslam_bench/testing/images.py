@@ -1,7 +1,5 @@
 """Conformance of what is done to an image: feature extractors, optical flows and segmenters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

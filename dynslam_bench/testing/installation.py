@@ -1,7 +1,5 @@
 """What is installed here and what is missing: packages, extras, weights, sequences, folders, plug-ins."""
 
-from __future__ import annotations
-
 import platform
 import re
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The checks run one after the other in a child of the kind that makes runs. If th
 too long, the running check has failed, and another child continues with the next one.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Small exact scenes for conformance checks: a corner with a moving panel, and the corner from a turning camera."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Conformance of sequences."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 

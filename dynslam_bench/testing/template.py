@@ -1,7 +1,5 @@
 """A tracker to start from."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Conformance of trackers, and of changing their online settings in mid-episode."""
 
-from __future__ import annotations
-
 import json
 import random
 from collections.abc import Callable, Iterable, Mapping

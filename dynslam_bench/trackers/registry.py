@@ -1,7 +1,5 @@
 """All trackers by id: built in, from entry points, from the environment variable, from a file."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The first page of a report: the ranking by category, and what the pages of errors, runs and comparisons read."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace

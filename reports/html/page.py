@@ -1,7 +1,5 @@
 """The HTML pages: templates, the files that all pages share, and the data that they load on demand."""
 
-from __future__ import annotations
-
 import json
 import re
 from contextlib import suppress

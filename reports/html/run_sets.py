@@ -1,7 +1,5 @@
 """Runs beside a page that is no board: those of two results folders, and those of a study's trials."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

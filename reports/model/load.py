@@ -3,8 +3,6 @@
 Rows of unchanged runs are taken from the store's SQLite index. Many runs are scored by several processes.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """What the columns of a table are called: as short as tells them apart, parts always marked."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path

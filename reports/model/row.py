@@ -1,7 +1,5 @@
 """One row type from record to page: a run's record with its errors under a protocol and what follows from both."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Callable, Hashable, Iterable, Sequence

@@ -6,8 +6,6 @@ median, and are no further evidence about other sequences. Sequences may have we
 does not depend on how many sequences each category has; with equal weights all formulas are Student's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

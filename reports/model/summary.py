@@ -1,7 +1,5 @@
 """What a board says in words: one sentence, and one paragraph for readers without statistics."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The tables of a board: the leaderboard, errors by sequence, tables of the runs, and the paper's Tables 1 to 3."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence

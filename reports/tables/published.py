@@ -1,7 +1,5 @@
 """Published errors as tables, for a report and for the terminal: whose each is, and how it was measured."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pandas as pd

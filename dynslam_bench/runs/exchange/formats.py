@@ -1,7 +1,5 @@
 """Trajectories in the formats of others: EuRoC, VSLAM-LAB, COLMAP and bags of ROS 2 (MCAP); the file shows which."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

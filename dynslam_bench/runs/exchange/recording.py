@@ -9,8 +9,6 @@ Images are JPEG at half size, and everything in their plane is scaled with them.
 and without time, from the end of the run: ``world/map``, ``world/estimate``, ``world/truth`` (aligned to the estimate).
 """
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Stored runs as files of other tools with ``provenance.json`` beside them, and their trajectories as stored runs."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass

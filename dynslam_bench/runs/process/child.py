@@ -7,8 +7,6 @@ the job's folder: ``frames.jsonl``, written frame by frame so that a crash loses
 trajectory and the map. Its temporary files lie in a private folder that is removed with it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import faulthandler

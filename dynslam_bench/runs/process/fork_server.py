@@ -14,8 +14,6 @@ run are subreapers (``prctl(2)``): they become the parents of the orphans below 
 ``docs/decisions/fork-server.md``.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

@@ -1,7 +1,5 @@
 """The supervisor of a child: its messages, its limits, its memory, its end, and the size of its log."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

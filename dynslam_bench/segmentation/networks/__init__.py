@@ -1,7 +1,5 @@
 """Segmentation networks: Mask R-CNN, ONNX files, and where their weights lie."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Network weights: in the package, in the user's cache, or at a published address. Imports no torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Loading is strict and never unpickles.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import zipfile

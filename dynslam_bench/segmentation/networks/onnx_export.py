@@ -1,7 +1,5 @@
 """Export of a Mask R-CNN to ONNX, with fixed shapes and plain operators that light runtimes understand."""
 
-from __future__ import annotations
-
 import logging
 import re
 import warnings

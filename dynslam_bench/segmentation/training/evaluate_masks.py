@@ -1,7 +1,5 @@
 """``segmenter evaluate``: average precision, intersection over union and recall of masks on labelled images."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path

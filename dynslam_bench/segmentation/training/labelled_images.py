@@ -1,7 +1,5 @@
 """Labelled images for training and evaluation: COCO and YOLO files, sequences with masks, rendered sequences."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Settings, progress and result of ``segmenter train``; imports no torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """``segmenter train``: train a Mask R-CNN, resumably."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

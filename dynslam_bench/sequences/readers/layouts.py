@@ -4,8 +4,6 @@ A new layout is a function ``read(folder, fps) -> Contents`` and a row of `LAYOU
 function raises a `SequenceError` for a file that is missing or malformed, a `TrajectoryError` for such a ground truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a folder of images holds: stamped lists of files, their pairs, and counts of all that was not used."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Recorded RGB-D sequences of every layout: frames that are decoded when asked for."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from functools import cached_property

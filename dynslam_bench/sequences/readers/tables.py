@@ -1,7 +1,5 @@
 """Tables and calibration files of data sets: YAML with OpenCV's matrices, CSV with nanoseconds, poses of a body."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

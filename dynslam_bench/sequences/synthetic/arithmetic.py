@@ -6,8 +6,6 @@ for each width of SIMD vectors. Those of the C library depend on its version and
 here differ from numpy's by one unit in the last place at most where the result is above 1, else by 2.3e-16.
 """
 
-from __future__ import annotations
-
 import math
 from functools import reduce
 from operator import iadd

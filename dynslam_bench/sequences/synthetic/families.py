@@ -5,8 +5,6 @@ sensors dislike. Then moving objects after Bonn's, long paths that return, a fol
 fr1.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

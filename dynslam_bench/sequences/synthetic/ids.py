@@ -1,7 +1,5 @@
 """Ids of the rendered sequences; light: imports neither numba nor OpenCV."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """The renderer's numba kernels: intersections of rays, tiles, antialiased shading, flow, motion blur, two sensors."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Primitives of a scene: unit shapes in a local frame, how to collect them, and timelines of things that move."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

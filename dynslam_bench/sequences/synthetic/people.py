@@ -1,7 +1,5 @@
 """People of articulated volumes: a skeleton by forward kinematics, clothed with round cones and ellipsoids."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ All rows of a frame see the scene from one pose, or each from its own under a ro
 exact for every row, while things and people are placed as they are when the middle of the image is exposed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

@@ -4,8 +4,6 @@ Scenes for tuning and held-out ones share no size and no place: each is drawn fr
 the scene's split.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any

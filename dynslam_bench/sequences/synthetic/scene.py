@@ -3,8 +3,6 @@
 `World` is the description, `Scene` its primitives at any time, `View` how the rows of one frame see them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache

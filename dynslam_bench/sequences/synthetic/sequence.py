@@ -5,8 +5,6 @@ name them. Every file appears by an atomic rename and every read checks the PNG'
 render into one folder, an interrupted rendering is resumed, and a damaged file counts as missing.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Settings of the rendered sequences; light: imports neither numba nor OpenCV."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

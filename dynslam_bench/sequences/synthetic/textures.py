@@ -1,7 +1,5 @@
 """Procedural textures, drawn from a seed and packed with their mip levels into one atlas."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

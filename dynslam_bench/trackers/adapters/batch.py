@@ -1,7 +1,5 @@
 """A program that reads a whole sequence folder and writes one trajectory at its end: `batch:FILE.toml`."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

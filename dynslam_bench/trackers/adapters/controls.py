@@ -1,7 +1,5 @@
 """Controls, which measure little or nothing of the images, and the replay of a trajectory file."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The real ORB-SLAM3 (PyPI package pyorbslam3) in a process of its own; its vocabulary and settings file."""
 
-from __future__ import annotations
-
 import hashlib
 import lzma
 import math

@@ -1,7 +1,5 @@
 """The process in which ORB-SLAM3 runs: it isolates its crashes, its `exit()`, its threads and its output."""
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """The program's side of the JSON-lines protocol, for trackers in Python that run in a process of their own."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -3,8 +3,6 @@
 Imports neither torch nor OpenCV.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """The real SVO (PyPI package svo-cpp) in a process of its own, which isolates its crashes, threads and output."""
 
-from __future__ import annotations
-
 import ctypes
 import time
 from importlib import import_module

@@ -1,7 +1,5 @@
 """How a system is composed: one back end for all, and filters of its own; settings and specs that systems share."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
