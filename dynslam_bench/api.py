@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from dynslam_bench.contracts import Sequence as FrameSequence
     from dynslam_bench.contracts import Trajectory
-    from dynslam_bench.evaluation.protocol import Protocol
+    from dynslam_bench.evaluation import Protocol
     from dynslam_bench.reports import ReportPaths
     from dynslam_bench.runs import Plan, RunEvent
     from dynslam_bench.runs.running import OnFault

@@ -22,7 +22,7 @@ from dynslam_bench.envs.wrappers import (
     SequenceSampler,
     SmallImages,
 )
-from dynslam_bench.sequences.catalogue import sequence_ids
+from dynslam_bench.sequences import sequence_ids
 
 __all__ = [
     "GENERIC_ID",

@@ -9,10 +9,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dynslam_bench.evaluation.ape import static_camera
-from dynslam_bench.evaluation.protocol import RPESpec
+from dynslam_bench.evaluation import RPESpec, static_camera
 from dynslam_bench.evaluation.rpe import select_pairs
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.model.published import claimed, lines_of, published, static_camera_errors
 from dynslam_bench.reports.tables.table import Table, TableCell, number, numbers, texts, to_markdown
 

@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 import dynslam_bench
 from dynslam_bench.core import ReportError, read_json, write_atomic
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports import figures
 from dynslam_bench.reports.html.board_page import MEANINGS, entries_of, ratios_content, side_content
 from dynslam_bench.reports.html.page import (

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dynslam_bench.core import ReportError, setting_text, write_atomic
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports.html.board_page import ratio_numbers
 from dynslam_bench.reports.html.page import render, write_side
 from dynslam_bench.reports.html.run_sets import write_runs

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from dynslam_bench.core import StudyError, did_you_mean
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs import RunRecord, RunStore, score
 from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes

@@ -12,11 +12,11 @@ from typing import Any, Literal, cast
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.sequence import Frame, Sequence
+from dynslam_bench.contracts import Frame, Sequence
 from dynslam_bench.core import StudyError, find_data_root
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera
 from dynslam_bench.reports.model.row import SEEN, grouped
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence

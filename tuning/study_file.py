@@ -11,14 +11,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
-from dynslam_bench.contracts.sequence import Sequence
+from dynslam_bench.contracts import Sequence
 from dynslam_bench.core import SequenceError, StudyError, did_you_mean, read_toml, without_passwords
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs.spec import RunSpec
+from dynslam_bench.sequences import SequenceView
 from dynslam_bench.sequences.catalogue import entry_of, open_sequence, parse_frames
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
-from dynslam_bench.sequences.view import SequenceView
 
 FEWEST_FRAMES = 2
 """A shorter instance has no motion."""

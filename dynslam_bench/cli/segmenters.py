@@ -120,7 +120,7 @@ def record(
     from dynslam_bench.envs import resolve_device
     from dynslam_bench.segmentation.recorded import record_masks
     from dynslam_bench.segmentation.settings import SegmentationSettings
-    from dynslam_bench.sequences.catalogue import open_sequence
+    from dynslam_bench.sequences import open_sequence
 
     settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments)})
     opened = open_sequence(sequence, data_root=data_root, camera=camera, frames=frames)

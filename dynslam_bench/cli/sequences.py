@@ -200,7 +200,7 @@ def compose(
     as_json: AsJson = False,
 ) -> None:
     """Paste real people into a recording that has a truth: exact masks, the host's poses."""
-    from dynslam_bench.sequences.catalogue import open_sequence
+    from dynslam_bench.sequences import open_sequence
     from dynslam_bench.sequences.compose import compose as paste
 
     opened = open_sequence(host, data_root=data_root, frames=frames), open_sequence(people, data_root=data_root)
@@ -225,9 +225,9 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Measure the readout time of a rolling shutter, the delay of depth, and the depth factor."""
+    from dynslam_bench.sequences import open_sequence
     from dynslam_bench.sequences.calibration import calibrate as measure
     from dynslam_bench.sequences.cameras import write_camera
-    from dynslam_bench.sequences.catalogue import open_sequence
 
     sequence = open_sequence(name, data_root=data_root, camera=camera, frames=frames)
     with progress(name) as advance:

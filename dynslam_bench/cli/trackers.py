@@ -64,7 +64,7 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     """Show a tracker's description and its tunable settings; --json has all settings and the published numbers."""
     from dynslam_bench.core import assignments
     from dynslam_bench.core.settings import flatten, parameters
-    from dynslam_bench.trackers.registry import TRACKERS
+    from dynslam_bench.trackers import TRACKERS
 
     spec = TRACKERS.get(tracker)
     reported = _published(spec)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import MapOutputs, TrackResult
 from dynslam_bench.core import RunError, TrackerError, raising, read_npz
+from dynslam_bench.envs import SlamEnv
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
-from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import truths_at
 from dynslam_bench.geometry import Trajectory, se3
@@ -22,7 +22,7 @@ from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_pl
 from dynslam_bench.slam.run_figure import write_run_figure
 
 if TYPE_CHECKING:
-    from dynslam_bench.envs.episode import FrameOutcome
+    from dynslam_bench.envs import FrameOutcome
 
 
 SNAPSHOTS_FILE = "snapshots.npz"

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from dynslam_bench.core import RunError, find_data_root, raising
 from dynslam_bench.core.fingerprint import package_digest, versions
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.envs.arguments import resolve_device
+from dynslam_bench.envs import resolve_device
 from dynslam_bench.runs.identity import CODE_PACKAGES
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of

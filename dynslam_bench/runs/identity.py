@@ -22,8 +22,8 @@ from dynslam_bench.core.plugins import Registry, load_object
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.core.version import release
+from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.arguments import check_frames, open_frames, preprocessing_of, resolve_device
-from dynslam_bench.envs.wrappers import Degradation
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.registry import FLOWS
@@ -32,8 +32,7 @@ from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences import PreprocessingSettings
-from dynslam_bench.sequences.catalogue import DATASETS
+from dynslam_bench.sequences import DATASETS, PreprocessingSettings
 from dynslam_bench.sequences.view import Part, part_of
 from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings

@@ -10,11 +10,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from dynslam_bench.envs.slam_env import SlamEnv
-from dynslam_bench.envs.wrappers import DegradeFrames, DropFrames
+from dynslam_bench.envs import DegradeFrames, DropFrames, SlamEnv
+from dynslam_bench.evaluation import Protocol, compare_masks
 from dynslam_bench.evaluation.comparison import tracked_frames
-from dynslam_bench.evaluation.masks import compare_masks
-from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.geometry import write_tum
 from dynslam_bench.runs.artifacts import (
     SHEET_FILE,

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from dynslam_bench.core.fingerprint import GitRevision, Machine
 from dynslam_bench.core.records import Digest, Record, digest, schema
-from dynslam_bench.evaluation.evaluate import Evaluation
+from dynslam_bench.evaluation import Evaluation
 
 RUN_SCHEMA = 1
 METRIC_SCHEMA = 1

@@ -34,7 +34,7 @@ from dynslam_bench.core import (
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.runs.artifacts import PICTURE, SHEET_FILE, VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog

@@ -38,9 +38,7 @@ from dynslam_bench.core import (
 )
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
-from dynslam_bench.evaluation.evaluate import Evaluation, evaluate
-from dynslam_bench.evaluation.hints import hints
-from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol, get_protocol
+from dynslam_bench.evaluation import PROTOCOLS, Evaluation, Protocol, evaluate, get_protocol, hints
 from dynslam_bench.geometry import Trajectory, TumFile, format_ns, format_tum, load_tum, read_tum
 from dynslam_bench.runs.record import MetricRecord, RunRecord
 

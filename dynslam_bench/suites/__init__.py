@@ -11,7 +11,7 @@ from dynslam_bench.core import RunError, did_you_mean, parse_toml, read_text
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs.spec import Limits, RunSpec
-from dynslam_bench.trackers.registry import TRACKERS
+from dynslam_bench.trackers import TRACKERS
 
 __all__ = ["Suite", "Variant", "load_suite", "suite_names"]
 

@@ -101,8 +101,8 @@ def unavailable_plugins() -> list[Finding]:
     from dynslam_bench.features.registry import FEATURES
     from dynslam_bench.flow.registry import FLOWS
     from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
-    from dynslam_bench.sequences.catalogue import DATASETS
-    from dynslam_bench.trackers.registry import TRACKERS
+    from dynslam_bench.sequences import DATASETS
+    from dynslam_bench.trackers import TRACKERS
 
     failed = [
         (f"{registry.kind}: {failure.source}", failure.reason)

@@ -112,7 +112,7 @@ def _open(subject: str) -> Any:
     """A sequence by its name, or the first one of a `DatasetSpec`."""
     from dynslam_bench.core import PluginError, find_data_root
     from dynslam_bench.core.plugins import load_object
-    from dynslam_bench.sequences.catalogue import DATASETS
+    from dynslam_bench.sequences import DATASETS
 
     head, _, attribute = subject.rpartition(":")
     if not attribute.isidentifier() or not (head.endswith(".py") or head.replace(".", "").isidentifier()):

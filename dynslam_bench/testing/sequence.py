@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dynslam_bench.contracts import Camera, Frame, Sequence, Trajectory
-from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences import open_sequence
 from dynslam_bench.testing.report import (
     ConformanceReport,
     NotApplicable,

@@ -12,7 +12,7 @@ from dynslam_bench.contracts import Frame, Sequence, Tracker, TrackerContext, Tr
 from dynslam_bench.contracts.checks import Fault, blemishes, faults, trajectory_faults
 from dynslam_bench.core import DynslamError
 from dynslam_bench.core.settings import Settings, apply_overrides, build, online_parameters
-from dynslam_bench.evaluation.hints import hints
+from dynslam_bench.evaluation import hints
 from dynslam_bench.testing.report import (
     ConformanceError,
     ConformanceReport,

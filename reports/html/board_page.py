@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from dynslam_bench.core import setting_text
-from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.evaluation import Protocol
 from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.model.board import Board, Cell, compare_pairs
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped

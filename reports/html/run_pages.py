@@ -21,9 +21,8 @@ from scipy.spatial.transform import Rotation
 from dynslam_bench.core import TABLE_BYTES, DynslamError, RunError, read_bytes
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
-from dynslam_bench.evaluation.evaluate import pose_errors
-from dynslam_bench.evaluation.protocol import Protocol, RPESpec
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
+from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
 from dynslam_bench.reports.html.page import read_remark, write_side
 from dynslam_bench.reports.model.load import JOB, run_jobs

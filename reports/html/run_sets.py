@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import setting_text, write_atomic
-from dynslam_bench.evaluation.protocol import Protocol
+from dynslam_bench.evaluation import Protocol
 from dynslam_bench.reports.html.board_page import cell_content
 from dynslam_bench.reports.html.page import render, write_assets, write_side
 from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages

@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from dynslam_bench.core import ReportError, assignments, did_you_mean
-from dynslam_bench.evaluation.protocol import Protocol, get_protocol
+from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import OUR_BACK_END, OUR_OWN, make_labels, name_columns, shortened
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options

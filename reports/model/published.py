@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from dynslam_bench.evaluation.protocol import PROTOCOLS, Protocol
+from dynslam_bench.evaluation import PROTOCOLS, Protocol
 
 CLAIMED = "claimed by the paper"
 _LEAST_FRAMES = {

@@ -13,11 +13,10 @@ from pydantic import ConfigDict, Field
 
 from dynslam_bench.core import TABLE_BYTES, DynslamError, setting_text, write_lines
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.evaluation import Evaluation, Protocol
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
-from dynslam_bench.evaluation.evaluate import Evaluation
-from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training

@@ -10,8 +10,8 @@ from statistics import median
 import numpy as np
 
 from dynslam_bench.core import label_text
+from dynslam_bench.evaluation import Protocol
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
-from dynslam_bench.evaluation.protocol import Protocol
 from dynslam_bench.reports.model.board import (
     OVERALL,
     STATIC_CAMERA,

@@ -11,7 +11,7 @@ from pydantic import ConfigDict
 from dynslam_bench.contracts import Frame
 from dynslam_bench.core import SegmentationError, write_atomic
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
+from dynslam_bench.evaluation import MaskCounts, compare_masks
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.labelled_images import open_labelled

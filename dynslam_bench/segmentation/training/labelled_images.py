@@ -30,7 +30,7 @@ from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.recorded import instances_of
 from dynslam_bench.segmentation.settings import COCO_NAMES
 from dynslam_bench.segmentation.training.settings import TrainSettings
-from dynslam_bench.sequences.catalogue import open_sequence
+from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, parse_synthetic_id
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.sequences.synthetic.settings import RENDERER_VERSION

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from dynslam_bench.core import SegmentationError, raising, read_json, replacing, write_atomic
-from dynslam_bench.evaluation.masks import MaskCounts, compare_masks
+from dynslam_bench.evaluation import MaskCounts, compare_masks
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.backbone import EMBEDDED, RESNET18, NetworkConfig
 from dynslam_bench.segmentation.networks.loading import load_strictly, read_checkpoint, read_weights, save_network

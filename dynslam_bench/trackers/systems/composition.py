@@ -15,7 +15,7 @@ from dynslam_bench.culling.settings import GuardSettings, Unmatched
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes
-from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
