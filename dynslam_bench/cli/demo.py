@@ -16,6 +16,7 @@ from dynslam_bench.cli.options import Jobs, Results
 from dynslam_bench.cli.output import SOME_RUNS_FAILED, note, progress, report_table, wrapped, write
 from dynslam_bench.cli.running import WatchedRuns
 from dynslam_bench.cli.studies import StudyBar, silence_optuna
+from dynslam_bench.core import find_data_root
 
 if TYPE_CHECKING:
     from dynslam_bench.reports import RunRow
@@ -107,7 +108,6 @@ def study_spec(frames: int, trials: int) -> StudySpec:
 
 def render(sequences: set[str]) -> None:
     """Render sequences ahead of the runs, so that no run waits for another's frames."""
-    from dynslam_bench.core import find_data_root
     from dynslam_bench.sequences.synthetic import render_synthetic
 
     for name in sorted(sequences):

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from dynslam_bench.cli.output import set_json_mode
-from dynslam_bench.core import DynslamError
+from dynslam_bench.core import DynslamError, read_settings
 
 if TYPE_CHECKING:
     from dynslam_bench.contracts import TrackerSpec
@@ -237,7 +237,6 @@ def gather_settings(assignments: list[str] | None, file: Path | None = None) -> 
     Raises:
         SettingsError: The file cannot be read, or an assignment is not of the form NAME=VALUE.
     """
-    from dynslam_bench.core import read_settings
     from dynslam_bench.core.settings import parse_assignments
 
     overrides = {} if file is None else read_settings(file)

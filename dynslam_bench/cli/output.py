@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import from_json, to_json
 
-from dynslam_bench.core import printable
+from dynslam_bench.core import DynslamError, printable
 
 if TYPE_CHECKING:
-    from dynslam_bench.core import DynslamError
     from dynslam_bench.core.download import Report
     from dynslam_bench.reports.tables.table import Table
 

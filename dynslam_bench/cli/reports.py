@@ -7,6 +7,7 @@ import typer
 
 from dynslam_bench.cli.options import AsJson, DataRoot, DefaultGroup, ProtocolId, names_of
 from dynslam_bench.cli.output import present, progress, report_table, wrapped
+from dynslam_bench.core import ReportError, did_you_mean, find_data_root, write_atomic
 
 MOST_ROWS = 5
 """Rows of the leaderboard that `report` shows."""
@@ -47,7 +48,6 @@ def make(
 ) -> None:
     """Make an offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it."""
     from dynslam_bench.api import report
-    from dynslam_bench.core import ReportError
     from dynslam_bench.reports.model.load import trial_words
 
     if on not in ("common", "all"):
@@ -148,7 +148,6 @@ def audit_paper(
     as_json: AsJson = False,
 ) -> None:
     """Hold the numbers that the paper prints against arithmetic, and against a static camera."""
-    from dynslam_bench.core import find_data_root, write_atomic
     from dynslam_bench.geometry import read_tum
     from dynslam_bench.reports.audit import audit_paper as audit
     from dynslam_bench.reports.model.published import claimed
@@ -187,7 +186,6 @@ def published(
     as_json: AsJson = False,
 ) -> None:
     """Show the published errors of a sequence: whose, how measured, and how far those of one system differ."""
-    from dynslam_bench.core import ReportError, did_you_mean
     from dynslam_bench.evaluation import get_protocol
     from dynslam_bench.reports.model.published import published_for, spans
     from dynslam_bench.reports.tables.published import published_table, span_table

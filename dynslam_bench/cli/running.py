@@ -28,11 +28,10 @@ from dynslam_bench.cli.output import (
     write_error,
 )
 from dynslam_bench.cli.runs import recording_note, show_files, show_runs, training_scene_note
-from dynslam_bench.core import RunError, label_text
+from dynslam_bench.core import DynslamError, RunError, label_text, weights_folder
 
 if TYPE_CHECKING:
     from dynslam_bench.api import RunResult
-    from dynslam_bench.core import DynslamError
     from dynslam_bench.segmentation.networks.checkpoints import Checkpoint
 
 
@@ -314,8 +313,6 @@ def finish(
 
 def confirm_fetch(checkpoint: Checkpoint) -> bool:
     """Ask on a terminal whether a network may be downloaded; elsewhere the answer is no."""
-    from dynslam_bench.core import weights_folder
-
     if not is_interactive():
         return False
     warn(

@@ -12,6 +12,7 @@ import typer
 
 from dynslam_bench.cli.options import AsJson, Camera, DataRoot, Frames, complete_sequences
 from dynslam_bench.cli.output import VERIFICATION_FAILED, fields, note, present, progress, table, warn, write
+from dynslam_bench.core import SequenceError, did_you_mean, find_data_root
 
 if TYPE_CHECKING:
     from dynslam_bench.sequences.calibration import Quantity
@@ -31,7 +32,6 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List all sequences and whether they are on this machine."""
-    from dynslam_bench.core import SequenceError, did_you_mean
     from dynslam_bench.sequences.catalogue import summaries
 
     everything = summaries(data_root=data_root)
@@ -179,7 +179,6 @@ def render(
     threads: Annotated[Optional[int], typer.Option(min=1, help="Frames rendered at a time.")] = None,  # noqa: UP045
 ) -> None:
     """Render sequences now, in place of when they are first read."""
-    from dynslam_bench.core import find_data_root
     from dynslam_bench.sequences.synthetic import render_synthetic
 
     for name in names:

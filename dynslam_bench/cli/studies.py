@@ -15,6 +15,7 @@ from dynslam_bench.cli.options import AsJson, Jobs, Results
 from dynslam_bench.cli.output import Advance, announce, fields, note, present, progress, table, write
 from dynslam_bench.cli.running import event_text
 from dynslam_bench.cli.trackers import range_text
+from dynslam_bench.core import write_atomic
 
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
@@ -122,8 +123,6 @@ def best(
     output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")] = None,  # noqa: UP045
 ) -> None:
     """Write a study's settings as a preset that `run --settings` takes."""
-    from dynslam_bench.core import write_atomic
-
     text = tuning.read_preset_text(tuning.read_study(study), results, trial)
     if output is not None:
         write_atomic(output, text)

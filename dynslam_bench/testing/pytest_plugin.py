@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from dynslam_bench.core import DynslamError, PluginError, find_data_root
+
 if TYPE_CHECKING:
     from dynslam_bench.testing.report import Check, ConformanceReport
 
@@ -35,8 +37,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
     """Run the checks of every subject that was asked for, and add an item for each."""
-    from dynslam_bench.core import DynslamError
-
     for kind in OPTIONS:
         for subject in config.getoption(f"--dynslam-{kind}"):
             try:
@@ -110,7 +110,6 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
 
 def _open(subject: str) -> Any:
     """A sequence by its name, or the first one of a `DatasetSpec`."""
-    from dynslam_bench.core import PluginError, find_data_root
     from dynslam_bench.core.plugins import load_object
     from dynslam_bench.sequences import DATASETS
 
