@@ -12,9 +12,8 @@ import numpy as np
 
 from dynslam_bench.core import ReportError, setting_text, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
-from dynslam_bench.reports.html.board_page import ratio_numbers
+from dynslam_bench.reports.html.board_page import ratio_numbers, write_runs
 from dynslam_bench.reports.html.page import render, write_side
-from dynslam_bench.reports.html.run_sets import write_runs
 from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell, mean_coverage
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns

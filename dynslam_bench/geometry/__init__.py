@@ -1,10 +1,18 @@
 """Camera model, SE(3), association of stamps, and trajectories with their file formats."""
 
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.association import associate, nearest_gap
 from dynslam_bench.geometry.camera import Camera, inside, pixel_index
 from dynslam_bench.geometry.se3 import Array
-from dynslam_bench.geometry.stamps import format_ns, from_seconds, ns_of, parse_ns, refuse_close, to_seconds
+from dynslam_bench.geometry.stamps import (
+    associate,
+    format_ns,
+    from_seconds,
+    nearest_gap,
+    ns_of,
+    parse_ns,
+    refuse_close,
+    to_seconds,
+)
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 from dynslam_bench.geometry.trajectory_files import (
     FileNotes,

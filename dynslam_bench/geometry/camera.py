@@ -114,6 +114,14 @@ class Camera:
         )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
+    def undistortion_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where each pixel of an undistorted image lies in the distorted one: columns and rows, ``[H, W]``."""
+        import cv2
+
+        distortion, turn, size = np.asarray(self.distortion), np.eye(3), (self.width, self.height)
+        columns, rows = cv2.initUndistortRectifyMap(self.matrix, distortion, turn, self.matrix, size, cv2.CV_32FC1)
+        return np.asarray(columns, dtype=np.float32), np.asarray(rows, dtype=np.float32)
+
     def distort_points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distorted pixels ``[N, 2]`` of the undistorted pixels ``[N, 2]``; the inverse of `undistort_points`."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)

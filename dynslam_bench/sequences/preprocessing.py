@@ -65,14 +65,7 @@ class Preprocessed(Wrapped):
         return resize(image, self.camera.width, self.camera.height, colour=colour)
 
 
-@lru_cache(maxsize=4)
-def _undistortion(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where each pixel of an undistorted image lies in the distorted one: columns and rows, ``[H, W]``."""
-    size = camera.width, camera.height
-    map_x, map_y = cv2.initUndistortRectifyMap(
-        camera.matrix, np.asarray(camera.distortion), np.eye(3), camera.matrix, size, cv2.CV_32FC1
-    )
-    return np.asarray(map_x, dtype=np.float32), np.asarray(map_y, dtype=np.float32)
+_undistortion = lru_cache(maxsize=4)(Camera.undistortion_maps)
 
 
 def preprocessed_camera(camera: Camera, settings: PreprocessingSettings) -> Camera:

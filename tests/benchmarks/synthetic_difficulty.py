@@ -19,7 +19,7 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackerContext
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.geometry.association import associate
+from dynslam_bench.geometry.stamps import associate
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence

@@ -9,7 +9,7 @@ from evo.tools import file_interface
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.geometry import se3, stamps
-from dynslam_bench.geometry.association import associate, nearest_gap
+from dynslam_bench.geometry.stamps import associate, nearest_gap
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import (
     FileNotes,

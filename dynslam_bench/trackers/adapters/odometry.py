@@ -53,7 +53,7 @@ class FrameToFrame(ABC):
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; nothing here is random."""
         self.start(camera.undistorted())
-        self._maps = undistortion_maps(camera)
+        self._maps = camera.undistortion_maps() if camera.is_distorted else None
         self._reference: Any = None
         self._pose: NDArray[np.float64] = np.eye(4)
         self._failures = 0
@@ -83,15 +83,6 @@ class FrameToFrame(ABC):
         if aligned or self._failures >= MAX_FAILURES:
             self._reference = current
         return aligned
-
-
-def undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Column and row ``[H, W]`` in the distorted image of each undistorted pixel; None without distortion."""
-    if not camera.is_distorted:
-        return None
-    distortion, turn, size = np.asarray(camera.distortion), np.eye(3), (camera.width, camera.height)
-    columns, rows = cv2.initUndistortRectifyMap(camera.matrix, distortion, turn, camera.matrix, size, cv2.CV_32FC1)
-    return np.asarray(columns, dtype=np.float32), np.asarray(rows, dtype=np.float32)
 
 
 def unavailable() -> str:

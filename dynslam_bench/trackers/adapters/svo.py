@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import TrackerContext
 from dynslam_bench.geometry import Camera, se3
-from dynslam_bench.trackers.adapters.odometry import undistortion_maps
 from dynslam_bench.trackers.adapters.serve import serve
 from dynslam_bench.trackers.adapters.specs import SvoSettings
 from dynslam_bench.trackers.adapters.subprocess_tracker import ProgramTracker, python_program
@@ -55,7 +54,7 @@ class Worker:
         stated = request["camera"]
         names = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
         camera = Camera(**{name: stated[name] for name in names})
-        self._maps = undistortion_maps(camera)
+        self._maps = camera.undistortion_maps() if camera.is_distorted else None
         self._svo.set_svo_config(request["options"])
         self._system = self._svo.SVO(self._svo.PinholeCamera(*(float(stated[name]) for name in names[:6])))
         self._system.start()

@@ -32,7 +32,7 @@ from dynslam_bench.sequences.catalogue import DATASETS, open_sequence
 from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.adapters import odometry as opencv_odometry
-from dynslam_bench.trackers.adapters.odometry import FrameToFrame, undistortion_maps
+from dynslam_bench.trackers.adapters.odometry import FrameToFrame
 from dynslam_bench.trackers.adapters.orbslam3 import check_camera, find_vocabulary, settings_yaml
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 from dynslam_bench.trackers.registry import resolve_settings
@@ -241,11 +241,10 @@ def test_lost_frames_are_bridged_from_the_last_good_one(failing, blind, states, 
 
 def test_undistortion_maps_invert_the_distortion():
     camera = Camera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.26, -0.95, -0.005, 0.003, 1.16))
-    columns, rows = undistortion_maps(camera)
+    columns, rows = camera.undistortion_maps()
     grid = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1).reshape(-1, 2)
     expected = camera.distort_points(grid).reshape(48, 64, 2)
     assert np.abs(columns - expected[..., 0]).max() < 1e-3 and np.abs(rows - expected[..., 1]).max() < 1e-3
-    assert undistortion_maps(CAMERA) is None
 
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
