@@ -28,11 +28,11 @@ CORRELATION = 100.0
 THRESHOLD_SHARE = 0.05
 """Added to the pixel threshold, as a share of the flow that the camera's motion explains (rolling shutter)."""
 MEMORY_S = 1.65
-"""Time constant of the decay of a point's evidence: points are dropped for 0.69 times as long after they last failed.
-
-An object that stands still for a moment, or begins to move slowly, would otherwise become a part of the map, and the
-camera would follow it.
-"""
+"""Time constant with which the count of a point's failures decays."""
+MAX_FAILURES = 2.5
+"""Above this count a point is dropped although it passes now: from the third failure in a row on, and for some seconds
+after an object has stopped. It would otherwise become a part of the map, and take the camera along when it moves on. A
+whole image that fails in a frame or two, as after a wrong stamp, stays below."""
 
 
 def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -177,9 +177,9 @@ def _align(
 class RigidMotionFilter(Rule[RigidMotionSettings]):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
-    A point's evidence is 1 where it fails in the image or in depth. The evidence follows the flow and decays over the
-    next second (`MEMORY_S`), so that people and objects that pause stay culled. It is averaged over 3x3 cells, as many
-    a cell holds no point in some frame.
+    Points are dropped that fail now, or failed more than `MAX_FAILURES` times before, so that people and objects that
+    pause stay culled. The count decays, and follows the flow; it is averaged over 3x3 cells, as many a cell holds no
+    point in some frame.
     Stats: ``dropped``, ``tested``, ``failed`` (in this frame alone).
     """
 
@@ -189,28 +189,28 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
     stats_names = ("dropped", "tested", "failed")
 
     def reset(self, camera: Camera | None = None) -> None:
-        """Forget the evidence of the previous sequence."""
-        self._evidence: NDArray[np.float64] | None = None
+        """Forget the previous sequence."""
+        self._failures: NDArray[np.float64] | None = None
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the points that have flow and depth."""
         flow, xy, shape = state.flow, frame.keypoints.xy, frame.gray.shape
         if flow is None or state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
-            self._evidence = None
+            self._failures = None
             return self.verdict(np.ones(len(xy), dtype=bool))
         tested = flow.valid & (frame.z > 0)
         failed = np.zeros(len(xy), dtype=bool)
         failed[tested] = self._fails(frame, state, tested)
         failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
-        evidence = failed.astype(np.float64)
-        if self._evidence is not None:
-            carried = np.exp((state.previous.timestamp - frame.timestamp) / MEMORY_S)
-            evidence[flow.valid] += carried * self._evidence[cell_index(flow.xy[flow.valid], CELL // 2, shape)[0]]
-        evidence = evidence.clip(0, 1)
+        carried = np.exp((state.previous.timestamp - frame.timestamp) / MEMORY_S)
+        failures = failed.astype(np.float64)
+        if self._failures is not None:
+            failures[flow.valid] += carried * self._failures[cell_index(flow.xy[flow.valid], CELL // 2, shape)[0]]
         cell, grid = cell_index(xy, CELL // 2, shape)
-        total, count = (neighbourhood_sum(v, cell, grid, (3, 3)) for v in (evidence, np.ones(len(xy))))
-        self._evidence = total / np.maximum(count, 1)
-        return self.verdict(evidence < 0.5, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
+        total, count = (neighbourhood_sum(v, cell, grid, (3, 3)) for v in (failures, np.ones(len(xy))))
+        self._failures = total / np.maximum(count, 1)
+        keep = ~failed & (failures <= MAX_FAILURES)
+        return self.verdict(keep, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
 
     def _fails(self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
         assert state.flow is not None and state.previous is not None

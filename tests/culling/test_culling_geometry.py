@@ -23,7 +23,6 @@ from dynslam_bench.contracts.filter import FilterState, FrameBundle, KeyframeVie
 from dynslam_bench.culling.correlation_graph import CorrelationFilter, depth_variance, point_covariance
 from dynslam_bench.culling.ego_motion import (
     CORRELATION,
-    MEMORY_S,
     RigidMotionFilter,
     depth_sigma,
     prior_information,
@@ -112,16 +111,18 @@ def test_rigid_motion_detects_what_the_epipolar_test_cannot(camera_motion: np.nd
     assert rule.apply(still.frame, still.state).keep.all()
 
 
-def test_what_moved_stays_culled_for_a_second_after_it_stopped() -> None:
+@pytest.mark.parametrize(("moving_frames", "held_s"), [(1, 0.0), (20, 2.0)])
+def test_what_moved_for_some_frames_stays_culled_after_it_stopped(moving_frames: int, held_s: float) -> None:
     made, still = far_wall_and_walker(250, 300), far_wall_and_walker(250, 300)
     still.state.flow.xy[:] = still.frame.xy
     rule = RigidMotionFilter(RigidMotionSettings())
-    rule.apply(made.frame, made.state)
+    for _ in range(moving_frames):
+        assert not rule.apply(made.frame, made.state).keep[made.moving].any()
     middle, far = on_rectangle(still, 230, 130, 300, 350), ~on_rectangle(still, 140, 40, 390, 440)
-    culled = [~rule.apply(still.frame, still.state).keep for _ in range(60)]
-    held = int(0.4 * MEMORY_S * 30)
-    assert all(keypoints[middle].mean() > 0.9 and not keypoints[far].any() for keypoints in culled[:held])
-    assert not culled[-1].any()
+    culled = [~rule.apply(still.frame, still.state).keep for _ in range(150)]
+    held = int(held_s * 30)
+    assert all(keypoints[middle].all() and not keypoints[far].any() for keypoints in culled[:held])
+    assert not culled[-1].any() and (held or not culled[0].any())
 
 
 def far_wall_and_walker(n_static: int, n_moving: int) -> Scene:
