@@ -16,10 +16,10 @@ from pathlib import Path
 from command_line import parser_of
 
 from dynslam_bench.core.settings import field_names
-from dynslam_bench.runs import RunStore
+from dynslam_bench.runs import RunStore, run_many
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.judgement import compared
-from dynslam_bench.tuning.objectives import SPEED, Outcome, evaluate
+from dynslam_bench.tuning.objectives import SPEED, Outcome, held_protocol, outcome
 from dynslam_bench.tuning.study_file import ProblemInstance, parse_instances
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
@@ -46,9 +46,11 @@ def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> 
     instances = [instance for text in PARTS[part] for instance in parse_instances(text)]
     settings = [source, {**source, **spec.presets[preset]}]
     outcomes: list[dict[ProblemInstance, Outcome]] = [{}, {}]
+    store, protocol = RunStore(options.results), held_protocol("tum-rgbd/v1")
     for instance in instances:
-        for found, values in zip(outcomes, settings, strict=True):
-            found |= evaluate(tracker, values, [instance], results=RunStore(options.results))
+        for of_settings, values in zip(outcomes, settings, strict=True):
+            (record,) = run_many([instance.run_spec(tracker, settings=values)], results=store, protocol=protocol)
+            of_settings[instance] = outcome(store, record, instance, protocol, None)
     default, own = outcomes
     error, time_taken = compared(own, default), compared(own, default, objective=SPEED)
     lost = max(1 - run.coverage for run in own.values())
