@@ -37,7 +37,8 @@ def neighbourhood_sum(
 ) -> NDArray[np.float64]:
     """Sum of values ``[N]`` in the cells around each cell of a grid; `size` in cells, odd; cells as in `cell_index`."""
     total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1]).reshape(grid)
-    return cv2.boxFilter(total, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT).ravel()
+    summed = cv2.boxFilter(total, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(summed, dtype=np.float64).ravel()
 
 
 def failing_regions(
