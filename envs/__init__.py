@@ -1,13 +1,20 @@
 """Gymnasium environments, wrappers and rendering.
 
-Importing this package registers ``dynslam/<sequence>-v0`` for every listed sequence and ``dynslam/Sequence-v0``; in
-worker processes write ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequence=...)``.
+Importing this package registers ``dynslam/<sequence>-v0`` for every listed sequence, ``dynslam/Sequence-v0``, and the
+benchmarks ``dynslam/masks-v0`` and ``dynslam/features-v0``; in worker processes write
+``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequence=...)``.
 """
 
 import gymnasium as gym
 
 from dynslam_bench.contracts import TrackerContractError
 from dynslam_bench.envs.arguments import resolve_device
+from dynslam_bench.envs.control_benchmarks import (
+    CONTROL_BENCHMARKS,
+    ControlBenchmark,
+    control_benchmark,
+    make_control,
+)
 from dynslam_bench.envs.episode import Episode, FrameOutcome
 from dynslam_bench.envs.rewards import REWARDS, AccuracyMinusCost, NegWindowError
 from dynslam_bench.envs.slam_env import EpisodeState, SlamEnv
@@ -25,6 +32,7 @@ from dynslam_bench.envs.wrappers import (
 from dynslam_bench.sequences import sequence_ids
 
 __all__ = [
+    "CONTROL_BENCHMARKS",
     "GENERIC_ID",
     "KEYPOINT_LAYOUT",
     "PRIVILEGED_LAYOUT",
@@ -32,6 +40,7 @@ __all__ = [
     "STATS_LAYOUT",
     "AccuracyMinusCost",
     "ActionMap",
+    "ControlBenchmark",
     "Degradation",
     "DegradeFrames",
     "DiscreteActions",
@@ -46,7 +55,9 @@ __all__ = [
     "SlamEnv",
     "SmallImages",
     "TrackerContractError",
+    "control_benchmark",
     "env_id",
+    "make_control",
     "register_envs",
     "resolve_device",
 ]
@@ -62,16 +73,18 @@ def env_id(sequence: str) -> str:
 def register_envs() -> list[str]:
     """Register all environments that are not registered yet; calling it again changes nothing.
 
-    Every id makes a `SlamEnv`; the generic one needs ``sequence=``. There is no ``max_episode_steps``: the sequence
-    ends the episode.
+    Every id makes a `SlamEnv`; the generic one needs ``sequence=``, that of a `ControlBenchmark` takes the arguments of
+    its `make`. There is no ``max_episode_steps``: the sequence ends the episode.
 
     Returns:
-        All ids, the generic one first.
+        All ids: the generic one, those of the benchmarks, those of the sequences.
     """
-    ids: dict[str, dict[str, str]] = {GENERIC_ID: {}} | {env_id(name): {"sequence": name} for name in sequence_ids()}
-    for name, kwargs in ids.items():
+    ids: dict[str, tuple[str, dict[str, str]]] = {GENERIC_ID: ("SlamEnv", {})}
+    ids |= {f"dynslam/{name}": ("make_control", {"benchmark": name}) for name in CONTROL_BENCHMARKS}
+    ids |= {env_id(name): ("SlamEnv", {"sequence": name}) for name in sequence_ids()}
+    for name, (maker, kwargs) in ids.items():
         if name not in gym.registry:
-            gym.register(id=name, entry_point="dynslam_bench.envs:SlamEnv", kwargs=kwargs)
+            gym.register(id=name, entry_point=f"dynslam_bench.envs:{maker}", kwargs=kwargs)
     return list(ids)
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from dynslam_bench.envs.episode import Episode
+from dynslam_bench.envs.episode import Episode, FrameOutcome
 from dynslam_bench.geometry import se3
 
 Reward = Callable[[Episode], float]
@@ -59,19 +59,26 @@ class AccuracyMinusCost:
 
     Attributes:
         weight: Metres that one unit of the cost counts as.
-        cost: ``network_calls``: 1 where the segmentation network ran (``segmented`` of the tracker's stats), the same
-            on every machine; ``processor_s``: seconds of processor time, which differ from run to run.
+        cost: ``network_calls``: 1 where the segmentation network ran (``segmented`` of the tracker's stats);
+            ``keypoints``: thousands of extracted keypoints (``keypoints``), which processor time grows with; both are
+            the same on every machine. ``processor_s``: seconds of processor time, which differ from run to run.
     """
 
     weight: float = 0.001
-    cost: Literal["network_calls", "processor_s"] = "network_calls"
+    cost: Literal["network_calls", "keypoints", "processor_s"] = "network_calls"
 
     def __call__(self, episode: Episode) -> float:
         """What the newest frame earns."""
-        last = episode.outcomes[-1]
-        calls = self.cost == "network_calls"
-        cost = last.stats.get("segmented", 0.0) if calls else last.timings.get("processor", 0.0)
-        return neg_rpe(episode) - self.weight * cost
+        return neg_rpe(episode) - self.weight * self.cost_of(episode.outcomes[-1])
+
+    def cost_of(self, outcome: FrameOutcome) -> float:
+        """What a frame cost, in units of the cost."""
+        match self.cost:
+            case "network_calls":
+                return outcome.stats.get("segmented", 0.0)
+            case "keypoints":
+                return outcome.stats.get("keypoints", 0.0) / 1000.0
+        return outcome.timings.get("processor", 0.0)
 
 
 REWARDS: dict[str, Reward] = {

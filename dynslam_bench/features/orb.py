@@ -78,7 +78,7 @@ class OrbExtractor:
         self._half_widths = patch_half_widths(PATCH_RADIUS)
 
     def configure(self, settings: FeatureSettings) -> None:
-        """Use other FAST thresholds; with a second threshold above the first, the second alone applies."""
+        """Use other FAST thresholds and numbers; with a second threshold above the first, the second alone applies."""
         self.settings = settings
         self._detector.setThreshold(settings.fast_threshold_min)
 

@@ -14,8 +14,9 @@ class FeatureSettings(Settings):
         "orb", "features", meaning="id of the extractor: built in ('orb') or a plug-in of kind 'features'"
     )
     n_features: int = tunable(
-        1000, low=300, high=3000, limits=(1, 20000), scale="log", meaning="keypoints extracted from each image"
-    )
+        1000, low=300, high=3000, limits=(1, 20000), scale="log", online=True,
+        meaning="keypoints extracted from each image",
+    )  # fmt: skip
     fast_threshold: int = tunable(
         20, low=8, high=40, limits=(1, 254), unit="grey levels", online=True, meaning="FAST contrast tried first"
     )

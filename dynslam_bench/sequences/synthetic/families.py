@@ -1,8 +1,8 @@
 """The rendered sequences, family by family: what stands and moves in each, and how its camera moves.
 
-There are replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, and conditions that
-sensors dislike. Then moving objects after Bonn's, long paths that return, a followed person, and the tempo of TUM's
-fr1.
+There are replicas of TUM's fr3 dynamic sequences, a crowd, people who step in time with the camera, conditions that
+sensors dislike, and scenes that change. Then moving objects after Bonn's, long paths that return, a followed person,
+and the tempo of TUM's fr1.
 """
 
 import itertools
@@ -27,7 +27,7 @@ from dynslam_bench.sequences.synthetic.parts import (
     on_track,
     turn,
 )
-from dynslam_bench.sequences.synthetic.people import Draw, Posture, draw_person, posture, write_script
+from dynslam_bench.sequences.synthetic.people import Draw, Person, Posture, draw_person, posture, write_script
 from dynslam_bench.sequences.synthetic.rooms import (
     Plan,
     Point,
@@ -47,6 +47,7 @@ from dynslam_bench.sequences.synthetic.rooms import (
     trolley,
 )
 from dynslam_bench.sequences.synthetic.scene import Actor, Body, Optics, Placement, Variant, World
+from dynslam_bench.sequences.tags import Tag
 
 # The camera's motions, after the descriptions of TUM's fr3 sequences, at their tempo.
 #
@@ -276,6 +277,13 @@ def build_crowd(motion: str, scene: int) -> World:
 
 
 def _walker(scene: int, number: int, lane: float) -> Actor:
+    """A person on a lane, at a drawn place from the start."""
+    rng, person, keys = _lane_keys(scene, number, lane)
+    start = pick(rng, scene, 0.0, keys[-1].t)
+    return person, lambda time: replace(posture(keys, keys[-1].t, time + start), clock=time)
+
+
+def _lane_keys(scene: int, number: int, lane: float) -> tuple[np.random.Generator, Person, tuple[Key, ...]]:
     """To and fro on a lane, with a stop in the middle where the person turns to the camera and talks."""
     rng, side = stream(scene, "synthetic", "crowd", number), 1.0 if number % 2 else -1.0
     reach, pause = pick(rng, scene, 1.0, 1.45), pick(rng, scene, 0.8, 2.0)
@@ -290,10 +298,7 @@ def _walker(scene: int, number: int, lane: float) -> Actor:
         Key(t, x, lane, 180.0 - 90.0 * direction if direction else 180.0, 0, talk)
         for t, (_, x, direction, talk) in zip(times, stations, strict=True)
     )
-    period = keys[-1].t
-    start = pick(rng, scene, 0.0, period)
-    person = replace(draw_person(scene, number), instance=number + 1)
-    return person, lambda time: replace(posture(keys, period, time + start), clock=time)
+    return rng, replace(draw_person(scene, number), instance=number + 1), keys
 
 
 CROWDS = {f"crowd_{motion}": Variant(partial(build_crowd, motion), "high-dynamic") for motion in ("xyz", "static")}
@@ -385,6 +390,81 @@ CONDITIONS = {
     )
     for name, change in _CHANGES.items()
     for kind in ("empty", "walking")
+}
+
+
+# What changes within the sequence: the people, the camera's tempo, the light. The change comes 3 to 5 s after the
+# start, one way in the even scenes and the other way in the odd ones.
+
+CHANGING_FRAMES = 240
+_CHANGE_S = 0.8
+_TEMPO = 0.4, 3.5
+_LIGHT = 1.0, 0.1
+_ENTRY_S, _OUTSIDE_M = 1.8, 3.0
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A level that goes smoothly from one value to another.
+
+    Attributes:
+        at_s: When it begins to change.
+        before: The level until then.
+        after: The level `_CHANGE_S` later.
+    """
+
+    at_s: float
+    before: float
+    after: float
+
+    def level(self, time: float) -> float:
+        """The level at a time (seconds)."""
+        return self.before + (self.after - self.before) * ease(min(max((time - self.at_s) / _CHANGE_S, 0.0), 1.0))
+
+    def integral(self, times: Array) -> Array:
+        """The integral of the level from 0 to each time, seconds."""
+        since = np.maximum(times - self.at_s, 0.0)
+        x = np.minimum(since / _CHANGE_S, 1.0)
+        eased = np.maximum(since - _CHANGE_S, 0.0) + _CHANGE_S * (x * x * x * (1.0 - 0.5 * x))
+        return np.asarray(self.before * times + (self.after - self.before) * eased)
+
+
+def build_changing(name: str, scene: int) -> World:
+    """The office of the replicas: four people who come (or leave), a camera that speeds up, or a light that fades."""
+    plan, rng = plan_room(scene), stream(scene, "synthetic", "changing", name)
+    at_s, order = pick(rng, scene, 3.0, 5.0), -1 if scene % 2 else 1
+    camera = partial(camera_poses, "halfsphere" if name == "tempo" else "xyz", "changing", scene)
+    world = World(build_room(scene, plan), camera, window_of(plan))
+    if name == "crowd":
+        visitors = (_visitor(scene, k, lane, at_s + 0.3 * k, order > 0) for k, lane in enumerate(LANES_M))
+        return replace(world, actors=tuple(visitors))
+    if name == "tempo":
+        tempo = Ramp(at_s, *_TEMPO[::order])
+        return replace(world, camera=lambda times: camera(tempo.integral(np.asarray(times, dtype=np.float64))))
+    return replace(world, optics=Optics(gain=Ramp(at_s, *_LIGHT[::order]).level))
+
+
+def _visitor(scene: int, number: int, lane: float, at_s: float, comes: bool) -> Actor:
+    """A person of the crowd who comes from outside of the view, or leaves it."""
+    _, person, keys = _lane_keys(scene, number, lane)
+    inside, side = keys[0], math.copysign(1.0, keys[0].x)
+    outside = replace(inside, x=inside.x + side * _OUTSIDE_M, facing=90.0 * side if comes else -90.0 * side)
+    first, last = (outside, inside) if comes else (replace(inside, facing=-90.0 * side), outside)
+    way = (replace(first, t=0.0), replace(last, t=_ENTRY_S), replace(last, t=1e6))
+
+    def at(time: float) -> Posture:
+        since = time - at_s
+        among = since - _ENTRY_S if comes else since
+        walks = among >= 0 if comes else among < 0
+        moved = posture(keys, keys[-1].t, among) if walks else posture(way, way[-1].t, max(since, 0.0))
+        return replace(moved, clock=time)
+
+    return person, at
+
+
+_CHANGING: dict[str, Tag] = {"crowd": "high-dynamic", "tempo": "static", "light": "static"}
+CHANGING = {
+    f"changing_{name}": Variant(partial(build_changing, name), tag, CHANGING_FRAMES) for name, tag in _CHANGING.items()
 }
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 from dynslam_bench.core import SequenceError, did_you_mean
 from dynslam_bench.sequences.synthetic.families import (
+    CHANGING,
     CONDITIONS,
     CROWDS,
     FAST,
@@ -19,7 +20,7 @@ from dynslam_bench.sequences.synthetic.scene import Variant
 from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, HELD_OUT_SCENES, MAX_FRAMES
 
 VARIANTS: dict[str, Variant] = {
-    **REPLICAS, **LOOPS, **FAST, **OBJECTS, **CROWDS, **SYNCHRONOUS, **TRACKING, **CONDITIONS,
+    **REPLICAS, **LOOPS, **FAST, **OBJECTS, **CROWDS, **SYNCHRONOUS, **TRACKING, **CONDITIONS, **CHANGING,
 }  # fmt: skip
 """Every rendered sequence by its name, for example ``walking_xyz``."""
 REPLICA_IDS = tuple(f"synthetic/{name}" for name in REPLICAS)

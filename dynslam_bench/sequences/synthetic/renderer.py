@@ -355,9 +355,10 @@ class Renderer:
         drift = 0.7 * sin(2 * math.pi * time / 6.1) + 0.3 * sin(2 * math.pi * time / 1.9 + 1.0)
         gain = 1 + sensor.exposure_drift * drift
         gain *= 1 + sensor.flicker * sin(2 * math.pi * 100.0 * time * 1.0013)
-        if optics.gain != 1 or optics.auto_exposure:
-            mean = max(float(color.mean(dtype=np.float64)) * optics.gain, 1.0)
-            gain *= optics.gain * power(_MEAN_GREY / mean, optics.auto_exposure)
+        lamps = optics.gain(index / FPS) if callable(optics.gain) else optics.gain
+        if lamps != 1 or optics.auto_exposure:
+            mean = max(float(color.mean(dtype=np.float64)) * lamps, 1.0)
+            gain *= lamps * power(_MEAN_GREY / mean, optics.auto_exposure)
         seed = self._noise_seed(2 * index + 1)
         read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
         self._rows(lambda a, b: kernels.expose(a, b, seed, color, gain, read, shot, rgb))

@@ -52,14 +52,14 @@ class Optics:
         readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The frame's stamp and pose
             belong to the middle of the image.
         auto_exposure: 0 keeps the exposure, 1 brings every image to the same mean brightness.
-        gain: Brightness of the lamps.
+        gain: Brightness of the lamps, or what gives it for a time in seconds.
         color: Settings of `ColorSensor` that differ, where the user left them.
         depth: Settings of `DepthSensor` that differ, where the user left them.
     """
 
     readout_s: float = 0.0
     auto_exposure: float = 0.0
-    gain: float = 1.0
+    gain: float | Callable[[float], float] = 1.0
     color: Mapping[str, Any] = field(default_factory=dict)
     depth: Mapping[str, Any] = field(default_factory=dict)
 
