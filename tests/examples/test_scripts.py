@@ -54,10 +54,22 @@ def test_own_tracker_keeps_the_contract(monkeypatch: pytest.MonkeyPatch) -> None
     check_tracker("own_tracker:SPEC")
 
 
-def test_ppo_trains_and_is_judged(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("benchmark", ["masks-v0", "features-v0"])
+def test_agents_are_compared(
+    benchmark: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("stable_baselines3", reason="the extra [rl] is not installed")
-    main_of("ppo.py")(8, frames=4, scenes=1)
-    assert "default settings:" in (text := capsys.readouterr().out) and "after 8 steps" in text
+    monkeypatch.syspath_prepend(EXAMPLES / "online_control")
+    main_of("online_control/compare.py")(
+        benchmark, steps=12, seeds=1, scenes=1, test=2, data_root=str(tmp_path), frames=(0, 10)
+    )
+    text = capsys.readouterr().out
+    rows = [row.split(" | ") for row in text.splitlines() if row.count(" | ") == 7]
+    losses = {row[0][2:].partition(":")[0]: float(row[1]) for row in rows[2:]}
+    assert losses["best static of each scene"] <= losses["best static"]
+    assert {"default", "random", "hindsight splice", "rule by hand", "PPO (1 seeds)"} < set(losses)
+    assert losses["hindsight splice"] <= losses["best static of each scene"]
+    assert "left out" in text and "is not at" in text, "no recordings there"
 
 
 # The notebooks run from the first cell to the last, on less data, and are stored without outputs.

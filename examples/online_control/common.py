@@ -1,0 +1,59 @@
+"""What the agents share: the environment with a memory, and the score of an episode."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+
+from dynslam_bench.envs import STATS_LAYOUT, ControlBenchmark
+
+Policy = Callable[[np.ndarray, int], object]
+"""From the observation and the number of the step to the action."""
+FIELDS = {name: index for index, name in enumerate([*(name for name, _ in STATS_LAYOUT), "since_network"])}
+"""Where each entry of the observation stands."""
+
+
+class Memory(gym.ObservationWrapper):
+    """Appends n / (n + 10) of the frames n since the network last ran, which no single frame tells."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        space = env.observation_space
+        self.observation_space = gym.spaces.Box(
+            *(np.append(end, np.float32(e)) for end, e in ((space.low, 0), (space.high, 1)))
+        )
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        frames = self.unwrapped.episode.outcomes[::-1]
+        since = next((n for n, frame in enumerate(frames) if frame.stats.get("segmented")), len(frames))
+        return np.append(observation, np.float32(since / (since + 10)))
+
+
+@dataclass(frozen=True)
+class Score:
+    """An episode: rewards, their part without the cost (metres, as loss), and the cost in its unit."""
+
+    earned: float
+    error: float
+    cost: float
+
+
+def score(benchmark: ControlBenchmark, env: gym.Env) -> Score:
+    """Of the frames so far but the first, which no action has changed."""
+    frames = env.unwrapped.episode.outcomes[1:]
+    earned, cost = (
+        float(sum(values))
+        for values in ([frame.reward for frame in frames], [benchmark.reward.cost_of(frame) for frame in frames])
+    )
+    return Score(earned, -earned - benchmark.reward.weight * cost, cost)
+
+
+def play(benchmark: ControlBenchmark, env: gym.Env, policy: Policy, seed: int = 0) -> Score:
+    """One episode."""
+    observation, _ = env.reset(seed=seed)
+    step, over = 0, False
+    while not over:
+        observation, _, terminated, truncated, _ = env.step(policy(observation, step))
+        step, over = step + 1, terminated or truncated
+    return score(benchmark, env)
