@@ -149,8 +149,14 @@ class SequenceSampler(SlamWrapper):
             self._rng = stream(seed, "sequences")  # apart from the environment's own numbers
         chosen = self._draw()
         options = {"sequence": chosen} | (options or {})
+        self._shown = str(options["sequence"])
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation, info | {"sequence": str(options["sequence"])}
+        return observation, info | {"sequence": self._shown}
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step, with the sequence in ``info`` as after `reset`."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, info | {"sequence": self._shown}
 
     def _draw(self) -> str:
         if self._mode == "random":

@@ -25,6 +25,6 @@ def rule(env: gym.Env) -> Policy:
 
 
 def masks(observation: np.ndarray, step: int) -> int:
-    since = 10 * observation[FIELDS["since_network"]] / (1 - observation[FIELDS["since_network"]])
-    pause = 4 if observation[FIELDS["mask_fraction"]] > 0.01 else 8
-    return 0 if since + 1 >= pause else 3
+    share = float(observation[FIELDS["since_network"]])
+    pause = 2 if observation[FIELDS["mask_fraction"]] > 0.01 else 8
+    return 0 if round(10 * share / (1 - share)) + 1 >= pause else 3

@@ -252,6 +252,8 @@ def test_sub_environments_run_other_sequences(tmp_path: Path) -> None:
     orders = [vector.reset(seed=4 if first else None)[1]["sequence"].tolist() for first in (True, False, False)]
     assert all(sorted(order) == sorted(folders) for order in orders) and len({tuple(order) for order in orders}) == 3
     random = SequenceSampler(SlamEnv(folders[0], TARGET, window=4), folders, mode="random")
+    name = random.reset(seed=0)[1]["sequence"]
+    assert random.step(0)[4]["sequence"] == name, "Minari needs the same keys on every step"
     drawn = [[random.reset(seed=seed if n == 0 else None)[1]["sequence"] for n in range(6)] for seed in (1, 2, 3)]
     assert drawn[0] != drawn[1] != drawn[2]
 

@@ -72,6 +72,15 @@ def test_agents_are_compared(
     assert "left out" in text and "is not at" in text, "no recordings there"
 
 
+def test_static_settings_become_a_minari_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("minari", "jax", "h5py"):
+        pytest.importorskip(module, reason="Minari is not installed")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.syspath_prepend(EXAMPLES / "online_control")
+    data = main_of("online_control/dataset.py")("features-v0", 1, frames=[0, 6])
+    assert [len(episode.rewards) for episode in data] == [2] * 12
+
+
 # The notebooks run from the first cell to the last, on less data, and are stored without outputs.
 
 
