@@ -20,11 +20,14 @@ from scipy.spatial import cKDTree
 
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
+from dynslam_bench.flow import layout
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, usable_points
 from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
+    Reference,
     appearance,
+    cell_of,
     cost_tables,
     descriptor_distance,
     quantised,
@@ -35,8 +38,8 @@ from dynslam_bench.flow.orientation_maps import OrientationMaps, Side
 from dynslam_bench.flow.propagation import labels_as_seen, nearest
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
-from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs
-from dynslam_bench.flow.sparse import SparseDaisyFlow
+from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs, Words
+from dynslam_bench.flow.sparse import SparseDaisyFlow, side_of
 
 NEIGHBOURS = 9
 """Reliable regions that a regional motion is fitted to."""
@@ -44,6 +47,9 @@ SHARE = 0.5
 """A region is reliable if this share of its pixels is consistent."""
 SMOOTH_PX = 3.0
 """Consistent pixels this close to the fitted motion take it: a similarity a region cannot follow a slanted plane."""
+SAME_PX = 0.5
+"""A label is tried on a region only if it moves one of its pixels by more than this from where it is: the maps' cells
+are no finer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,21 +97,21 @@ class DenseDaisyFlow:
             FlowSettings(**common, support=9, support_spacing_px=max(1, settings.superpixel_px // 2))
         )
 
-    def prepare(self, gray: NDArray[np.uint8]) -> OrientationMaps:
-        """The orientation maps of a uint8 ``[H, W]`` image."""
-        return self._sparse.prepare(gray)
+    def prepare(self, gray: NDArray[np.uint8]) -> DescribedImage:
+        """Orientation maps, superpixels and descriptors of a uint8 ``[H, W]`` image."""
+        return describe_image(self._sparse.prepare(gray), self.settings, self._sparse)
 
     def track(
         self,
-        reference: OrientationMaps,
-        target: OrientationMaps,
+        reference: DescribedImage,
+        target: DescribedImage,
         points: NDArray[np.float32],
         *,
         guess: NDArray[np.float32] | None = None,
         seed: int = 0,
     ) -> FlowResult:
         """Find points of the reference in the target; see `FlowEstimator.track`. The guess is not used."""
-        cleaned = clean_points(reference.gray, target.gray, points)
+        cleaned = clean_points(reference.maps.gray, target.maps.gray, points)
         if isinstance(cleaned, FlowResult):
             return cleaned
         clean, usable = cleaned
@@ -113,34 +119,79 @@ class DenseDaisyFlow:
         pixel = _pixels(clean)
         xy = (clean + dense.flow[pixel]).astype(np.float32)
         cost = dense.cost[pixel]
-        valid = usable & dense.valid[pixel] & usable_points(xy, target.gray.shape) & (cost < MAX_COST)
+        valid = usable & dense.valid[pixel] & usable_points(xy, target.maps.gray.shape) & (cost < MAX_COST)
         if self.settings.forward_backward_px > 0:
             ends = np.where(valid[:, None], xy, clean)
             error = np.linalg.norm(ends + dense.back[_pixels(ends)] - clean, axis=1)
             valid &= error <= self.settings.forward_backward_px
         return FlowResult(xy, valid, cost, flow_stats(len(clean), int(valid.sum()), dense.evaluations))
 
-    def flow(self, reference: OrientationMaps, target: OrientationMaps, *, seed: int = 0) -> DenseFlow:
+    def flow(self, reference: DescribedImage, target: DescribedImage, *, seed: int = 0) -> DenseFlow:
         """Flow of every pixel from the reference to the target."""
-        tolerance = self.settings.consistency_px
         forward = _RegionLabels(self.settings, self._sparse, reference, target, seed)
         backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
         flow, back = forward.flow(), backward.flow()
         if self.settings.second_round:
-            forward.try_regional_motion(consistent(flow, back, tolerance))
-            backward.try_regional_motion(consistent(back, flow, tolerance))
+            forward.try_regional_motion(self._consistent(flow, back))
+            backward.try_regional_motion(self._consistent(back, flow))
             flow, back = forward.flow(), backward.flow()
-        valid = consistent(flow, back, tolerance)
-        fitted = fit_regional_motion(flow, valid, forward.regions, forward.half)
+        valid = self._consistent(flow, back)
+        fitted = fit_regional_motion(flow, valid, reference.regions, reference.half)
         if fitted is not None:
-            flow = fill_and_smooth(flow, valid, fitted)
+            height, smooth = len(flow), np.empty_like(flow)
+            self._sparse.workers.run(
+                fill_and_smooth, 0, height, flow, valid, reference.regions.labels, *fitted.affine(), smooth
+            )
+            flow = smooth
         return DenseFlow(flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back)
+
+    def _consistent(self, forward: Floats, backward: Floats) -> Flags:
+        valid = np.empty(forward.shape[:2], dtype=np.bool_)
+        tolerance = np.float32(self.settings.consistency_px)
+        self._sparse.workers.run(consistent, 0, len(valid), forward, backward, tolerance, valid)
+        return valid
 
 
 def _pixels(points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Row and column of the pixels that contain points inside an image."""
     column, row = np.rint(points).astype(np.intp).T
     return row, column
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedImage:
+    """What both directions, and the next pair, need of one image; sizes are those of the half-resolution image.
+
+    Attributes:
+        maps: Its orientation maps.
+        half: uint8 ``[h, w]``, grey levels.
+        regions: Its superpixels.
+        centres: float32 ``[K, 2]``, their centres, full-image pixels.
+        neighbours: int64 ``[K, 8]``, the nearest other regions.
+        described: The centres for the label search.
+        descriptors: uint8, flat ``[h, w, 136]``, unrotated.
+    """
+
+    maps: OrientationMaps
+    half: NDArray[np.uint8]
+    regions: Superpixels
+    centres: NDArray[np.float32]
+    neighbours: NDArray[np.int64]
+    described: Reference
+    descriptors: NDArray[np.uint8]
+
+
+def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: SparseDaisyFlow) -> DescribedImage:
+    """Compute superpixels and descriptors of an image."""
+    half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
+    regions = superpixels(half, max(2, settings.superpixel_px // 2))
+    centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+    tables = sparse.pair(maps, maps).tables
+    descriptors = np.empty(half.size * layout.LENGTH, dtype=np.uint8)
+    cells, words = (array.view(np.uint64) for array in (maps.side.histograms, descriptors))
+    sparse.workers.run(read_descriptors, 0, *half.shape, cells, tables, words)
+    neighbours = nearest(centres, sparse.workers.run)
+    return DescribedImage(maps, half, regions, centres, neighbours, sparse.describe(maps, centres, tables), descriptors)
 
 
 class _RegionLabels:
@@ -153,22 +204,17 @@ class _RegionLabels:
         self,
         settings: DenseFlowSettings,
         sparse: SparseDaisyFlow,
-        reference: OrientationMaps,
-        target: OrientationMaps,
+        reference: DescribedImage,
+        target: DescribedImage,
         seed: int,
     ) -> None:
-        self.settings, self._sparse = settings, sparse
-        self._pair = sparse.pair(reference, target)
-        self.half = np.ascontiguousarray(reference.framed_half[BORDER:-BORDER, BORDER:-BORDER])
-        self.regions = superpixels(self.half, max(2, settings.superpixel_px // 2))
-        self.centres = self.regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
-        self._tables = cost_tables(reference.gray.shape, settings.terms)
-        self._best = np.full(self.half.shape, np.inf, dtype=np.float32)
-        self._winner = np.zeros((*self.half.shape, 4), dtype=np.float32)
-        pair, centres = self._pair, self.centres
-        neighbours = nearest(centres, sparse.workers.run)
-        described = sparse.describe(pair.reference, centres, pair.tables)
-        state = sparse.search(described, pair, neighbours, None, seed)
+        self.settings, self._sparse, self._image = settings, sparse, reference
+        self._pair = pair = sparse.pair(reference.maps, target.maps)
+        self._tables = cost_tables(reference.maps.gray.shape, settings.terms)
+        self._best = np.full(reference.half.shape, np.inf, dtype=np.float32)
+        self._winner = np.zeros((*reference.half.shape, 4), dtype=np.float32)
+        centres, neighbours = reference.centres, reference.neighbours
+        state = sparse.search(reference.described, pair, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
         if settings.refinement == "lucas-kanade":
             sparse.refine_together(centres, labels, neighbours, pair)
@@ -178,36 +224,40 @@ class _RegionLabels:
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
         """Try, on every region, the motion of the consistent regions around it, as fitted and refined."""
-        fitted = fit_regional_motion(self.flow(), valid, self.regions, self.half)
+        fitted = fit_regional_motion(self.flow(), valid, self._image.regions, self._image.half)
         if fitted is None:
             return
         candidates = [fitted.labels()]
         if self.settings.refinement == "lucas-kanade":
             candidates.append(candidates[0].copy())
-            self._sparse.refine(self.centres, candidates[1], self._pair)
+            self._sparse.refine(self._image.centres, candidates[1], self._pair)
         self._choose(np.stack(candidates, axis=1))
 
     def _choose(self, candidates: NDArray[np.float32]) -> None:
         """Let every pixel take the best of its region's candidates ``[K, C, 4]``, if it beats the label it has."""
-        evaluations = np.zeros(len(self.centres), dtype=np.int64)
-        regions = (self.regions.members, self.regions.starts, self.centres, candidates)
-        sides = (self._pair.reference.side, self._pair.target.side, self._tables)
-        guide, radius = self.half.astype(np.float32) / np.float32(255), max(1, self.settings.filter_radius_px // 2)
+        image, centres, pair = self._image, self._image.centres, self._pair
+        evaluations = np.zeros(len(centres), dtype=np.int64)
+        regions = (image.regions.members, image.regions.starts, centres, candidates)
+        sides = (*(side_of(maps, self._tables) for maps in (pair.reference, pair.target)), self._tables)
+        guide, radius = image.half.astype(np.float32) / np.float32(255), max(1, self.settings.filter_radius_px // 2)
         smoothing = (guide, radius, np.float32(self.settings.filter_epsilon))
         chosen = (self._best, self._winner, evaluations)
-        self._sparse.workers.run(aggregate_and_choose, 0, len(self.centres), *regions, *sides, *smoothing, *chosen)
+        self._sparse.workers.run(
+            aggregate_and_choose, 0, len(centres), *regions, *sides, image.descriptors, *smoothing, *chosen
+        )
         self.evaluations += int(evaluations.sum())
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
-        height, width = self._pair.reference.gray.shape
+        image = self._image
+        height, width = image.maps.gray.shape
         flow = np.empty((height, width, 2), dtype=np.float32)
-        self._sparse.workers.run(spread_labels, 0, height, self._winner, self.regions.labels, self.centres, flow)
+        self._sparse.workers.run(spread_labels, 0, height, self._winner, image.regions.labels, image.centres, flow)
         return flow
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        share = self._best[_half_pixels(self._pair.reference.gray.shape, self.half.shape)]
+        share = self._best[_half_pixels(self._image.maps.gray.shape, self._image.half.shape)]
         return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)  # may overshoot
 
 
@@ -216,14 +266,28 @@ def _half_pixels(shape: tuple[int, ...], half: tuple[int, ...]) -> tuple[NDArray
     return np.ix_(*(np.minimum(np.arange(full) // 2, size - 1) for full, size in zip(shape, half, strict=True)))
 
 
-def consistent(forward: NDArray[np.float32], backward: NDArray[np.float32], tolerance: float) -> NDArray[np.bool_]:
-    """Pixels whose flow, followed by the backward flow where it ends, returns to within `tolerance` pixels."""
-    height, width = forward.shape[:2]
-    y, x = np.mgrid[:height, :width]
-    column, row = np.rint(x + forward[..., 0]).astype(np.int64), np.rint(y + forward[..., 1]).astype(np.int64)
-    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    back = backward[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    return np.asarray(inside & (np.hypot(*np.moveaxis(forward + back, -1, 0)) <= tolerance), dtype=np.bool_)
+@kernel
+def consistent(start: int, stop: int, forward: Floats, backward: Floats, tolerance: Scalar, valid: Flags) -> None:
+    """Mark pixels whose flow, followed by the backward flow where it ends, returns to within `tolerance` pixels.
+
+    Args:
+        start: First row.
+        stop: One past the last.
+        forward: float32 ``[H, W, 2]``.
+        backward: Likewise.
+        tolerance: Pixels.
+        valid: bool ``[H, W]``, filled.
+    """
+    height, width = valid.shape
+    limit = tolerance * tolerance
+    for y in range(start, stop):
+        for x in range(width):
+            u, v = forward[y, x, 0], forward[y, x, 1]
+            column, row = np.int64(np.rint(np.float32(x) + u)), np.int64(np.rint(np.float32(y) + v))
+            valid[y, x] = False
+            if 0 <= column < width and 0 <= row < height:
+                dx, dy = u + backward[row, column, 0], v + backward[row, column, 1]
+                valid[y, x] = dx * dx + dy * dy <= limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,13 +298,17 @@ class RegionalMotion:
         centres: float64 ``[K, 2]``, full-image pixels.
         spread: float64 ``[K, 1]``, pixels a unit of `motion`.
         motion: float64 ``[K, 3, 2]``, flow at the centre, and its change per unit along x and y.
-        region: int64 ``[H * W]``, region of every full-image pixel.
     """
 
     centres: NDArray[np.float64]
     spread: NDArray[np.float64]
     motion: NDArray[np.float64]
-    region: NDArray[np.int64]
+
+    def affine(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Centres ``[K, 2]``, and ``[K, 3, 2]``: flow there and its change per pixel along x and y."""
+        motion = self.motion.copy()
+        motion[:, 1:] /= self.spread[:, :, None]
+        return self.centres.astype(np.float32), motion.astype(np.float32)
 
     def labels(self) -> NDArray[np.float32]:
         """The similarity nearest to each region's motion at its centre, as labels ``[K, 4]``."""
@@ -265,20 +333,14 @@ def fit_regional_motion(
     Returns:
         The motions; None where fewer than three regions are reliable.
     """
-    width = valid.shape[1]
-    region = regions.labels[_half_pixels(valid.shape, guide.shape)].ravel().astype(np.int64)
     count = len(regions.centres)
-    good = valid.ravel()
-    pixels = np.maximum(np.bincount(region, minlength=count), 1)
-    consistent = np.bincount(region, weights=good, minlength=count)
-    reliable = np.flatnonzero((consistent >= SHARE * pixels) & (consistent > 0))
+    sums = np.zeros((count, 6))
+    sum_regions(flow, valid, regions.labels, sums)
+    consistent = sums[:, 1]
+    reliable = np.flatnonzero((consistent >= SHARE * np.maximum(sums[:, 0], 1)) & (consistent > 0))
     if len(reliable) < 3:
         return None
-    rows = np.flatnonzero(good)
-    mean = np.empty((count, 4))  # position and flow of each region's consistent pixels
-    columns = (rows % width, rows // width, *flow.reshape(-1, 2)[rows].T)
-    for column, values in enumerate(columns):
-        mean[:, column] = np.bincount(region[rows], weights=values, minlength=count) / np.maximum(consistent, 1)
+    mean = sums[:, 2:] / np.maximum(consistent, 1)[:, None]  # position and flow of each region's consistent pixels
     centres = regions.centres.astype(np.float64) * 2 + 0.5
     total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
     grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
@@ -298,20 +360,52 @@ def fit_regional_motion(
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
         motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
         weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
-    return RegionalMotion(centres, spread, motion, region)
+    return RegionalMotion(centres, spread, motion)
 
 
-def fill_and_smooth(flow: NDArray[np.float32], valid: NDArray[np.bool_], fitted: RegionalMotion) -> NDArray[np.float32]:
-    """Replace pixels that are not valid, or lie within `SMOOTH_PX` of it, by the fitted motion."""
-    height, width = valid.shape
-    r = fitted.region
-    at = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
-    local = ((at - fitted.centres[r]) / fitted.spread[r]).astype(np.float32)
-    motion = fitted.motion.astype(np.float32)
-    smooth = motion[r, 0] + local[:, :1] * motion[r, 1] + local[:, 1:] * motion[r, 2]
-    own = flow.reshape(-1, 2)
-    replaced = ~valid.ravel() | (((smooth - own) ** 2).sum(axis=1) < SMOOTH_PX**2)
-    return np.where(replaced[:, None], smooth, own).astype(np.float32).reshape(flow.shape)
+@kernel
+def sum_regions(flow: Floats, valid: Flags, labels: Ints, sums: Doubles) -> None:
+    """Add up pixels, consistent pixels, and their x, y and flow, by region: float64 ``[K, 6]``."""
+    for y in range(len(valid)):
+        row = labels[min(y // 2, len(labels) - 1)]
+        for x in range(valid.shape[1]):
+            r = row[min(x // 2, len(row) - 1)]
+            sums[r, 0] += 1
+            if valid[y, x]:
+                sums[r, 1] += 1
+                sums[r, 2] += x
+                sums[r, 3] += y
+                sums[r, 4] += flow[y, x, 0]
+                sums[r, 5] += flow[y, x, 1]
+
+
+@kernel
+def fill_and_smooth(
+    start: int, stop: int, flow: Floats, valid: Flags, labels: Ints, centres: Floats, motion: Floats, out: Floats
+) -> None:
+    """Copy rows start..stop; pixels not valid, or within `SMOOTH_PX` of it, take their region's fitted motion.
+
+    Args:
+        start: First row.
+        stop: One past the last.
+        flow: float32 ``[H, W, 2]``.
+        valid: bool ``[H, W]``, consistent pixels.
+        labels: `Superpixels.labels`.
+        centres: float32 ``[K, 2]`` of `RegionalMotion.affine`.
+        motion: float32 ``[K, 3, 2]``, likewise.
+        out: float32 ``[H, W, 2]``, filled.
+    """
+    limit = np.float32(SMOOTH_PX**2)
+    for y in range(start, stop):
+        row = labels[min(y // 2, len(labels) - 1)]
+        for x in range(flow.shape[1]):
+            r = row[min(x // 2, len(row) - 1)]
+            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
+            u = motion[r, 0, 0] + dx * motion[r, 1, 0] + dy * motion[r, 2, 0]
+            v = motion[r, 0, 1] + dx * motion[r, 1, 1] + dy * motion[r, 2, 1]
+            own_u, own_v = flow[y, x, 0], flow[y, x, 1]
+            replaced = not valid[y, x] or (u - own_u) * (u - own_u) + (v - own_v) * (v - own_v) < limit
+            out[y, x, 0], out[y, x, 1] = (u, v) if replaced else (own_u, own_v)
 
 
 # ---------------------------------------------------------------------- superpixels
@@ -399,72 +493,124 @@ def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, itera
 # ---------------------------------------------------------------------- aggregation (Eq. 1-3)
 
 
-@kernel
-def filter_patch(
-    guide: Floats, values: Floats, height: int, width: int, radius: int, epsilon: Scalar, work: Floats, out: Floats
-) -> None:
-    """The guided filter (He, Sun, Tang 2010): an average of `values` that preserves the edges of `guide`.
+@inlined
+def box_mean(values: Floats, pitch: int, radius: int, share: Floats, line: Floats, out: Floats) -> None:
+    """Means over windows clipped at the edges: columns, then rows, as flat vector code over a framed patch.
 
-    Within each ``(2 radius + 1)**2`` window (clipped at the image's edge) the output is a linear function of the guide;
+    Args:
+        values: float32, flat ``[rows * pitch]``, zero in a frame `radius` wide.
+        pitch: Numbers a row.
+        radius: Of the window.
+        share: float32, flat, one over the pixels in each window, zero in the frame.
+        line: float32, flat, scratch, zero in the first and last `radius` rows and in the corners.
+        out: float32, flat, filled but for the outermost rows.
+    """
+    first, last = radius * pitch, len(values) - radius * pitch
+    for k in range(first, last):
+        line[k] = values[k]
+    for d in range(1, radius + 1):
+        for k in range(first, last):
+            line[k] += values[k - d * pitch] + values[k + d * pitch]
+    for k in range(first, last):
+        out[k] = line[k]
+    for d in range(1, radius + 1):
+        for k in range(first, last):
+            out[k] += line[k - d] + line[k + d]
+    for k in range(first, last):
+        out[k] *= share[k]
+
+
+@kernel
+def frame_patch(
+    guide: Floats, top: int, left: int, height: int, width: int, radius: int, patch: Floats, work: Floats
+) -> None:
+    """Read a patch of the guide and what `filter_patch` needs of it.
+
+    Args:
+        guide: float32 ``[h, w]``, grey levels in [0, 1].
+        top: Of the patch.
+        left: Of the patch.
+        height: Of the patch.
+        width: Of the patch.
+        radius: Of the window, pixels.
+        patch: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, the patch in a frame of zeros.
+        work: float32 ``[8, ...]``, scratch of at least that length; rows 0 to 2: share, mean and variance of the guide.
+    """
+    pitch = width + 2 * radius
+    n = len(patch)
+    patch[:] = 0
+    work[:, :n] = 0
+    share, mean, variance, line, square = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+    for y in range(height):
+        rows = np.float32(min(y + radius, height - 1) - max(y - radius, 0) + 1)
+        at = (y + radius) * pitch + radius
+        for x in range(width):
+            columns = np.float32(min(x + radius, width - 1) - max(x - radius, 0) + 1)
+            patch[at + x], share[at + x] = guide[top + y, left + x], np.float32(1) / (rows * columns)
+    box_mean(patch, pitch, radius, share, line, mean)
+    for k in range(n):
+        square[k] = patch[k] * patch[k]
+    box_mean(square, pitch, radius, share, line, variance)
+    for k in range(n):
+        variance[k] = max(variance[k] - mean[k] * mean[k], np.float32(0))
+
+
+@kernel
+def filter_patch(patch: Floats, values: Floats, pitch: int, radius: int, epsilon: Scalar, work: Floats) -> None:
+    """The guided filter (He, Sun, Tang 2010): an average of `values` that preserves the edges of the guide, in place.
+
+    Within each ``(2 radius + 1)**2`` window (clipped at the patch's edge) the output is a linear function of the guide;
     overlapping windows are averaged.
 
     Args:
-        guide: float32, flat ``[height * width]``, grey levels in [0, 1].
-        values: float32, flat, what is filtered (matching costs).
-        height: Of the image.
-        width: Of the image.
+        patch: float32, flat, the guide of `frame_patch`.
+        values: float32, flat, likewise framed; what is filtered (matching costs).
+        pitch: Numbers a row.
         radius: Of the window, pixels.
         epsilon: Regularisation, squared grey levels.
-        work: float32 ``[6, height * width]``, scratch.
-        out: float32, flat, filled.
+        work: Of `frame_patch`.
     """
-    n = height * width
-    mean_guide, mean_value = work[0, :n], work[1, :n]
-    product, square, line = work[2, :n], work[3, :n], work[4, :n]
-    box_mean(guide, height, width, radius, line, mean_guide)
-    box_mean(values, height, width, radius, line, mean_value)
+    n = len(patch)
+    share, mean, variance, line = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
+    offset, slope, product = work[4, :n], work[5, :n], work[6, :n]
+    box_mean(values, pitch, radius, share, line, offset)
     for k in range(n):
-        out[k] = guide[k] * values[k]
-    box_mean(out, height, width, radius, line, product)
+        product[k] = patch[k] * values[k]
+    box_mean(product, pitch, radius, share, line, slope)
     for k in range(n):
-        out[k] = guide[k] * guide[k]
-    box_mean(out, height, width, radius, line, square)
-    slope, offset = product, square
-    for k in range(n):
-        spread = max(square[k] - mean_guide[k] * mean_guide[k], np.float32(0)) + epsilon
-        a = (product[k] - mean_guide[k] * mean_value[k]) / spread if spread > 0 else np.float32(0)
+        spread = variance[k] + epsilon
+        a = (slope[k] - mean[k] * offset[k]) / spread if spread > 0 else np.float32(0)
         slope[k] = a
-        offset[k] = mean_value[k] - a * mean_guide[k]
-    box_mean(slope, height, width, radius, line, mean_guide)
-    box_mean(offset, height, width, radius, line, mean_value)
+        offset[k] -= a * mean[k]
+    box_mean(slope, pitch, radius, share, line, product)
+    box_mean(offset, pitch, radius, share, line, slope)
     for k in range(n):
-        out[k] = mean_guide[k] * guide[k] + mean_value[k]
+        values[k] = product[k] * patch[k] + slope[k]
 
 
-@inlined
-def box_mean(values: Floats, height: int, width: int, radius: int, line: Floats, out: Floats) -> None:
-    """Mean over the window clipped at the edges; columns first (vectorised), then running sums along rows."""
-    for y in range(height):
-        low, high = max(y - radius, 0), min(y + radius, height - 1)
-        row = line[y * width : (y + 1) * width]
-        first = values[low * width : (low + 1) * width]
-        for x in range(width):
-            row[x] = first[x]
-        for other in range(low + 1, high + 1):
-            more = values[other * width : (other + 1) * width]
-            for x in range(width):
-                row[x] += more[x]
-        count = np.float32(high - low + 1)
-        total = np.float32(0)
-        for x in range(min(radius, width)):
-            total += row[x]
-        for x in range(width):
-            if x + radius < width:
-                total += row[x + radius]
-            if x - radius - 1 >= 0:
-                total -= row[x - radius - 1]
-            columns = np.float32(min(x + radius, width - 1) - max(x - radius, 0) + 1)
-            out[y * width + x] = total / (count * columns)
+@kernel
+def read_descriptors(start: int, stop: int, columns: int, histograms: Words, tables: CostTables, out: Words) -> None:
+    """Unrotated descriptors of half-resolution rows start..stop.
+
+    Args:
+        start: First row.
+        stop: One past the last.
+        columns: Half-resolution pixels a row.
+        histograms: uint64, flat, the histograms as one number each.
+        tables: `matching_cost.CostTables`.
+        out: uint64, flat ``[h, w, 17]``.
+    """
+    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
+    for y in range(start, stop):
+        for x in range(columns):
+            px, py = np.float32(2 * x) + np.float32(0.5), np.float32(2 * y) + np.float32(0.5)
+            near, near_phase = cell_of(px, py, tables.ring0[neutral])
+            far, far_phase = cell_of(px, py, tables.ring1[neutral])
+            at = (y * columns + x) * 17
+            for k in range(9):
+                out[at + k] = histograms[(near + tables.samples[neutral, straight, near_phase, k]) >> 3]
+            for k in range(9, 17):
+                out[at + k] = histograms[(far + tables.samples[neutral, straight, far_phase, k]) >> 3]
 
 
 Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
@@ -474,8 +620,8 @@ Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 @kernel
 def aggregate_and_choose(
     start: int, stop: int, members: Longs, starts: Longs, centres: Floats, candidates: Floats, reference: Side,
-    target: Side, tables: CostTables, guide: Floats, radius: int, epsilon: Scalar, best: Floats, winner: Floats,
-    evaluations: Longs,
+    target: Side, tables: CostTables, straight: Bytes, guide: Floats, radius: int, epsilon: Scalar, best: Floats,
+    winner: Floats, evaluations: Longs,
 ) -> None:  # fmt: skip
     """Raw cost, guided filter and winner takes all (Eq. 1-3) for regions start..stop, at half resolution.
 
@@ -489,49 +635,79 @@ def aggregate_and_choose(
         reference: `orientation_maps.Side`.
         target: `orientation_maps.Side`.
         tables: `matching_cost.CostTables` without support.
+        straight: `DescribedImage.descriptors` of the reference.
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
         radius: Of the guided filter, half-resolution pixels.
         epsilon: Of the guided filter.
         best: float32 ``[h, w]``, lowest aggregated cost, changed in place.
-        winner: float32 ``[h, w, 4]``, its label around the region's centre.
+        winner: float32 ``[h, w, 4]``, its label around the region's centre: displacement, and ``2**s (cos, sin)``.
         evaluations: int64 ``[K]``, raw costs computed.
     """
     rows, columns = guide.shape
-    descriptors, turned = np.empty(0, dtype=np.uint8), np.empty((4, 136), dtype=np.int32)
+    rotated, turned = np.empty(0, dtype=np.uint8), np.empty((4, 136), dtype=np.int32)
     size = 0
     described = np.zeros(13, dtype=np.bool_)
-    raw = np.empty(0, dtype=np.float32)
-    patch_guide, filtered, work = np.empty(0, dtype=np.float32), np.empty(0, np.float32), np.empty((6, 0), np.float32)
+    values, patch, work = np.empty(0, np.float32), np.empty(0, np.float32), np.empty((8, 0), np.float32)
     for r in range(start, stop):
         if starts[r] == starts[r + 1]:
             continue
-        top, left, high, wide = patch_around(members[starts[r] : starts[r + 1]], rows, columns, 2 * radius)
-        n = high * wide
+        region = members[starts[r] : starts[r + 1]]
+        top, left, high, wide = patch_around(region, rows, columns, 2 * radius)
+        pitch = wide + 2 * radius
+        n = (high + 2 * radius) * pitch
         if n > size:
             size = n
-            descriptors = np.empty(13 * n * 136, dtype=np.uint8)
-            raw, patch_guide, filtered = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-            work = np.empty((6, n), np.float32)
+            rotated = np.empty(13 * n * 136, dtype=np.uint8)
+            values, patch, work = np.empty(n, np.float32), np.empty(n, np.float32), np.empty((8, n), np.float32)
         described[:] = False
-        for y in range(high):
-            for x in range(wide):
-                patch_guide[y * wide + x] = guide[top + y, left + x]
+        framed = False
         for c in range(candidates.shape[1]):
             u, v, s, theta = candidates[r, c, 0], candidates[r, c, 1], candidates[r, c, 2], candidates[r, c, 3]
-            if not np.isfinite(u + v + s + theta):
+            scale = np.float32(np.exp2(s))
+            a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
+            if not np.isfinite(u + v + a + b):
                 continue
             centre, corner = (centres[r, 0], centres[r, 1]), (left, top, wide, high)
+            if not differs((u, v, a, b), centre, region, columns, best, winner):
+                continue
+            if not framed:
+                frame_patch(guide, top, left, high, wide, radius, patch[:n], work)
+                values[:n] = 0
+                framed = True
+            si, ti = quantised(s, theta)
             sides = (reference, target, tables)
-            ti = raw_costs((u, v, s, theta), centre, corner, size, sides, descriptors, described, turned, raw)
+            raw_costs(
+                (u, v, a, b), (si, ti), centre, corner, radius, sides, straight, columns, rotated, size, described,
+                turned, values[:n],
+            )  # fmt: skip
             described[ti] = True
-            evaluations[r] += n
-            filter_patch(patch_guide[:n], raw[:n], high, wide, radius, epsilon, work, filtered[:n])
-            for k in range(starts[r], starts[r + 1]):
-                y, x = members[k] // columns, members[k] % columns
-                cost = filtered[(y - top) * wide + x - left]
+            evaluations[r] += high * wide
+            filter_patch(patch[:n], values[:n], pitch, radius, epsilon, work)
+            for member in region:
+                y, x = member // columns, member % columns
+                cost = values[(y - top + radius) * pitch + x - left + radius]
                 if cost < best[y, x]:
                     best[y, x] = cost
-                    winner[y, x, 0], winner[y, x, 1], winner[y, x, 2], winner[y, x, 3] = u, v, s, theta
+                    winner[y, x, 0], winner[y, x, 1], winner[y, x, 2], winner[y, x, 3] = u, v, a, b
+
+
+@inlined
+def differs(
+    label: Label, centre: tuple[Scalar, Scalar], region: Longs, columns: int, best: Floats, winner: Floats
+) -> bool:
+    """Whether a label moves a pixel of the region by more than `SAME_PX` from where its label so far does."""
+    u, v, a, b = label
+    limit = np.float32(SAME_PX * SAME_PX)
+    for member in region:
+        y, x = member // columns, member % columns
+        if best[y, x] == np.inf:
+            return True
+        dx, dy = np.float32(2 * x) + np.float32(0.5) - centre[0], np.float32(2 * y) + np.float32(0.5) - centre[1]
+        da, db = a - winner[y, x, 2], b - winner[y, x, 3]
+        ex, ey = u - winner[y, x, 0] + da * dx - db * dy, v - winner[y, x, 1] + db * dx + da * dy
+        if ex * ex + ey * ey > limit:
+            return True
+    return False
 
 
 @inlined
@@ -548,51 +724,51 @@ def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[
 
 @inlined
 def raw_costs(
-    label: Label, centre: tuple[Scalar, Scalar], patch: tuple[int, int, int, int], size: int,
-    sides: tuple[Side, Side, CostTables], descriptors: Bytes, described: Flags, turned: Ints,
-    raw: Floats,
-) -> Scalar:  # fmt: skip
+    label: Label, index: tuple[Scalar, Scalar], centre: tuple[Scalar, Scalar], patch: tuple[int, int, int, int],
+    radius: int, sides: tuple[Side, Side, CostTables], straight: Bytes, columns: int, rotated: Bytes, size: int,
+    described: Flags, turned: Ints, raw: Floats,
+) -> None:  # fmt: skip
     """Fill `raw` with Eq. 1 of a label around a centre, for every half-resolution pixel of a patch.
 
     Args:
-        label: Displacement, scale and rotation at the centre.
+        label: Displacement at the centre, and scale times cosine and sine of the rotation.
+        index: Of its scale and rotation.
         centre: Full-image pixels.
         patch: Its left and top, width and height, half-resolution pixels.
-        size: Descriptors a rotation that `descriptors` has room for.
+        radius: Width of the frame around it in `raw`.
         sides: Reference, target and tables.
-        descriptors: uint8, flat ``[13, size, 136]``, filled for rotations that are not `described` yet.
+        straight: `DescribedImage.descriptors` of the reference.
+        columns: Half-resolution pixels a row of the image.
+        rotated: uint8, flat ``[13, size, 136]``, filled for rotations that are not `described` yet.
+        size: Descriptors a rotation that `rotated` has room for.
         described: bool ``[13]``.
         turned: int32 ``[4, 136]``, scratch.
-        raw: float32, flat ``[height * width]`` of the patch, filled.
-
-    Returns:
-        The index of the label's rotation.
+        raw: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, filled inside the frame.
     """
-    (u, v, s, theta), (left, top, wide, high), (reference, target, tables) = label, patch, sides
+    (u, v, a, b), (left, top, wide, high), (reference, target, tables), (si, ti) = label, patch, sides, index
     height, width = target.gray.shape
-    si, ti = quantised(s, theta)
-    scale = np.float32(np.exp2(s))
-    a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
+    neutral = ti == -layout.ANGLE_LOW
+    own = straight if neutral else rotated
     for y in range(high):
         for x in range(wide):
-            k = y * wide + x
             px, py = np.float32(2 * (left + x)) + np.float32(0.5), np.float32(2 * (top + y)) + np.float32(0.5)
-            mine = (ti * size + k) * 136
-            if not described[ti]:
-                read_descriptor(px, py, reference, tables, turned)
-                rotate_descriptor(turned, ti, descriptors, mine)
+            mine = ((top + y) * columns + left + x) * 136
+            if not neutral:
+                mine = (ti * size + y * wide + x) * 136
+                if not described[ti]:
+                    read_descriptor(px, py, reference, tables, turned)
+                    rotate_descriptor(turned, ti, rotated, mine)
             dx, dy = px - centre[0], py - centre[1]
             tx, ty = centre[0] + u + a * dx - b * dy, centre[1] + v + b * dx + a * dy
             cost = np.int64(tables.ceiling)
             if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
-                cost = np.int64(descriptor_distance(tx, ty, si, ti, mine, descriptors, target, tables))
+                cost = np.int64(descriptor_distance(tx, ty, si, ti, mine, own, target, tables))
                 if tables.appearance:
-                    gray, gradient = appearance(target.gray, tx, ty)
-                    own_gray, own_gradient = appearance(reference.gray, px, py)
+                    gray, gradient = appearance(target, tx, ty)
+                    own_gray, own_gradient = appearance(reference, px, py)
                     cost += tables.intensity[abs(gray - own_gray)]
-                    cost += tables.gradient[min(abs(gradient - own_gradient), 255)]
-            raw[k] = np.float32(cost)
-    return ti
+                    cost += tables.gradient[abs(gradient - own_gradient)]
+            raw[(y + radius) * (wide + 2 * radius) + x + radius] = np.float32(cost)
 
 
 @kernel
@@ -602,10 +778,8 @@ def spread_labels(start: int, stop: int, winner: Floats, regions: Ints, centres:
         row = min(y // 2, winner.shape[0] - 1)
         for x in range(flow.shape[1]):
             column = min(x // 2, winner.shape[1] - 1)
-            u, v, s, theta = winner[row, column]
+            u, v, a, b = winner[row, column]
             r = regions[row, column]
-            scale = np.float32(np.exp2(s))
-            a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
             dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
             flow[y, x, 0] = u + a * dx - b * dy - dx
             flow[y, x, 1] = v + b * dx + a * dy - dy

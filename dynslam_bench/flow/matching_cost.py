@@ -232,7 +232,7 @@ def label_cost(
         mine = ((i * supports + q) * 13 + ti) * 136
         total += descriptor_distance(tx, ty, si, ti, mine, reference.descriptors, target, tables)
         if tables.appearance:
-            gray, gradient = appearance(target.gray, tx, ty)
+            gray, gradient = appearance(target, tx, ty)
             total += tables.intensity[abs(gray - reference.appearance[i, q, 0])]
             total += tables.gradient[min(abs(gradient - reference.appearance[i, q, 1]), 255)]
         if total >= bound:
@@ -241,15 +241,12 @@ def label_cost(
 
 
 @inlined
-def appearance(gray: Bytes, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
-    """Grey level and gradient magnitude (central differences) at the pixel nearest to a position."""
-    height, width = gray.shape
+def appearance(image: Side, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
+    """Grey level and gradient magnitude at the pixel nearest to a position."""
+    height, width = image.gray.shape
     column = min(max(np.int64(x + np.float32(0.5)), 0), width - 1)
     row = min(max(np.int64(y + np.float32(0.5)), 0), height - 1)
-    gx = np.int64(gray[row, min(column + 1, width - 1)]) - np.int64(gray[row, max(column - 1, 0)])
-    gy = np.int64(gray[min(row + 1, height - 1), column]) - np.int64(gray[max(row - 1, 0), column])
-    magnitude = np.int64(np.sqrt(np.float32(gx * gx + gy * gy)) * np.float32(0.5) + np.float32(0.5))
-    return np.int64(gray[row, column]), magnitude
+    return np.int64(image.gray[row, column]), np.int64(image.gradients[row, column])
 
 
 @kernel
@@ -258,7 +255,7 @@ def reference_appearance(points: Floats, image: Side, tables: CostTables, out: I
     for i in range(len(points)):
         for q in range(len(tables.support)):
             gray, gradient = appearance(
-                image.gray,
+                image,
                 points[i, 0] + np.float32(tables.support[q, 0]),
                 points[i, 1] + np.float32(tables.support[q, 1]),
             )

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import weakref
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +45,7 @@ FIXED_POINT = 256
 Buffers = list[tuple[NDArray[np.uint8], ...]]
 """Arrays of maps that were deleted. The first access to a page of fresh memory costs more than computing its content
 (`docs/lab/README.md`)."""
+NO_GRADIENTS = np.empty((0, 0), dtype=np.uint8)
 RING = 16
 """Lines stored of each level; a power of two above twice the farthest tap."""
 SPILL = 64
@@ -51,10 +53,11 @@ SPILL = 64
 
 
 class Side(NamedTuple):
-    """One image as the kernels see it: flat histogram bytes and grey levels."""
+    """One image as the kernels see it: flat histogram bytes, grey levels and, for all terms of Eq. 1, gradients."""
 
     histograms: NDArray[np.uint8]
     gray: NDArray[np.uint8]
+    gradients: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,8 @@ class OrientationMaps:
         framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, likewise.
         histograms: uint8 ``[total, 8]``, all levels as `layout.map_geometry` arranges them; a unit-norm histogram has
             Euclidean length 255.
-        side: Histograms and image for the kernels.
+        side: Histograms and image for the kernels, without gradients.
+        full_side: The same with gradients.
     """
 
     gray: NDArray[np.uint8]
@@ -75,6 +79,24 @@ class OrientationMaps:
     framed_half: NDArray[np.uint8]
     histograms: NDArray[np.uint8]
     side: Side
+
+    @cached_property
+    def full_side(self) -> Side:  # noqa: D102 - see the class
+        gradients = np.empty_like(self.gray)
+        gradient_magnitudes(self.gray, gradients)
+        return self.side._replace(gradients=gradients)
+
+
+@kernel
+def gradient_magnitudes(gray: Bytes, out: Bytes) -> None:
+    """Fill ``[H, W]`` with the gradients' rounded magnitudes, by central differences, edges repeated."""
+    height, width = gray.shape
+    for y in range(height):
+        above, below = gray[max(y - 1, 0)], gray[min(y + 1, height - 1)]
+        for x in range(width):
+            gx = np.int32(gray[y, min(x + 1, width - 1)]) - np.int32(gray[y, max(x - 1, 0)])
+            gy = np.int32(below[x]) - np.int32(above[x])
+            out[y, x] = np.uint8(np.sqrt(np.float32(gx * gx + gy * gy)) * np.float32(0.5) + np.float32(0.5))
 
 
 def orientation_maps(
@@ -108,7 +130,7 @@ def orientation_maps(
     whole[BORDER:-BORDER, BORDER:-BORDER] = gray
     repeat_edges(half)
     repeat_edges(whole)
-    maps = OrientationMaps(gray, whole, half, histograms, Side(cells, gray))
+    maps = OrientationMaps(gray, whole, half, histograms, Side(cells, gray, NO_GRADIENTS))
     weakref.finalize(maps, buffers.append, arrays)
     return maps
 

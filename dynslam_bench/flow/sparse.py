@@ -24,7 +24,7 @@ from dynslam_bench.flow.matching_cost import (
     parabola,
     reference_appearance,
 )
-from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, orientation_maps
+from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, Side, orientation_maps
 from dynslam_bench.flow.propagation import (
     common_motions,
     dissenting_labels,
@@ -51,6 +51,11 @@ class Pair(NamedTuple):
     reference: OrientationMaps
     target: OrientationMaps
     tables: CostTables
+
+
+def side_of(image: OrientationMaps, tables: CostTables) -> Side:
+    """The image as the kernels see it, with gradients where the terms of Eq. 1 need them."""
+    return image.full_side if tables.appearance else image.side
 
 
 class SparseDaisyFlow:
@@ -104,7 +109,7 @@ class SparseDaisyFlow:
         state = self.search(described, pair, neighbours, guess, seed)
         labels, cost, evaluations = state.flames[:, 0].copy(), state.costs[:, 0], state.used
         if settings.refinement == "lucas-kanade":
-            costs = (described, target.side, pair.tables)
+            costs = (described, side_of(target, pair.tables), pair.tables)
             self.workers.run(parabola, 0, len(points), labels, PARABOLA_STEP_PX, *costs, evaluations)
         good = (cost < MAX_COST * pair.tables.ceiling) & (evaluations > 0)
         if settings.refinement == "lucas-kanade":
@@ -136,7 +141,7 @@ class SparseDaisyFlow:
         self.workers.run(describe, 0, count, points, image.side, tables, descriptors)
         appearance = np.zeros((count, supports, 2), dtype=np.int32)
         if tables.appearance:
-            reference_appearance(points, image.side, tables, appearance)
+            reference_appearance(points, image.full_side, tables, appearance)
         return Reference(points, descriptors, appearance)
 
     def search(
@@ -179,7 +184,7 @@ class SparseDaisyFlow:
                 candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
                 sources = (points, best, label_turns(best), neighbours, motions)
                 run(transported_labels, 0, n, *sources, lower, upper, candidates)
-            images = described, pair.target.side, pair.tables
+            images = described, side_of(pair.target, pair.tables), pair.tables
             run(run_phase, 0, n, *images, state, candidates, end, phase, np.uint64(seed), *options)
         return state
 

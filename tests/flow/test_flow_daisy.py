@@ -52,7 +52,7 @@ def label_costs(labels, reference, target, tables, out):
 def compiled_cost(first, second, points, labels, terms=1, support=1):
     """Costs ``[N]`` of one label a point, the tables, and the reference descriptors."""
     tables = matching_cost.cost_tables(first.shape, terms, support)
-    here, there = (orientation_maps(image).side for image in (first, second))
+    here, there = (orientation_maps(image).full_side for image in (first, second))
     descriptors = np.empty(len(points) * support * 13 * 136, np.uint8)
     matching_cost.describe(0, len(points), points, here, tables, descriptors)
     appearance = np.zeros((len(points), support, 2), np.int32)

@@ -6,7 +6,7 @@ from exact_reference import binomial, quantised_maps
 from pictures import moved, moved_points, picture
 
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.dense_flow import DenseDaisyFlow, consistent, filter_patch, superpixels
+from dynslam_bench.flow.dense_flow import DenseDaisyFlow, consistent, filter_patch, frame_patch, superpixels
 from dynslam_bench.flow.orientation_maps import orientation_maps
 from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import DenseFlowSettings
@@ -15,11 +15,11 @@ from dynslam_bench.flow.workers import Workers
 
 def guided_filter(guide, values, radius, epsilon):
     """`filter_patch` of a whole image."""
-    guide, values = (np.ascontiguousarray(array, np.float32) for array in (guide, values))
-    out, work = np.empty_like(guide), np.empty((6, guide.size), np.float32)
-    size = guide.shape
-    filter_patch(guide.ravel(), values.ravel(), *size, radius, np.float32(epsilon), work, out.reshape(-1))
-    return out
+    framed = np.pad(np.asarray(values, np.float32), radius)
+    patch, work = np.empty(framed.size, np.float32), np.empty((8, framed.size), np.float32)
+    frame_patch(np.ascontiguousarray(guide, np.float32), 0, 0, *guide.shape, radius, patch, work)
+    filter_patch(patch, framed.reshape(-1), framed.shape[1], radius, np.float32(epsilon), work)
+    return framed[radius:-radius, radius:-radius]
 
 
 def direct_guided_filter(guide, values, radius, epsilon):
@@ -74,14 +74,21 @@ def test_superpixels_cover_the_image_and_follow_edges():
         assert len(np.unique(image.ravel()[members])) <= 1  # no region straddles the edge
 
 
+def check(forward, backward, tolerance):
+    """`consistent` of all rows."""
+    valid = np.empty(forward.shape[:2], bool)
+    consistent(0, len(valid), forward, backward, np.float32(tolerance), valid)
+    return valid
+
+
 def test_consistency_check():
     forward = np.zeros((10, 12, 2), np.float32)
     forward[..., 0] = 3
     backward = -forward
-    valid = consistent(forward, backward, 1.0)
+    valid = check(forward, backward, 1.0)
     assert valid[:, :9].all() and not valid[:, 9:].any()
     backward[5, 6] = 2
-    assert not consistent(forward, backward, 1.0)[5, 3]
+    assert not check(forward, backward, 1.0)[5, 3]
 
 
 def test_dense_flow_of_a_similarity_and_its_thread_independence():
