@@ -32,7 +32,7 @@ def evolve(
 ) -> tuple[np.ndarray, list[tuple[int, float]]]:
     """The weights after so many steps, and the learning curve: steps and the generation's mean return.
 
-    All candidates of a generation play the same two scenes.
+    All candidates of a generation play the same scene.
     """
     rng = np.random.default_rng(seed)
     rows = 1 if isinstance(env.action_space, gym.spaces.Discrete) else env.action_space.shape[0]
@@ -42,11 +42,9 @@ def evolve(
     used, generation, curve = 0, 0, []
     while used < steps:
         candidates = centre + sigma * rng.normal(size=(population, len(centre)))
-        returns = []
-        for weights in candidates:
-            scenes = [1000 * seed + 2 * generation, 1000 * seed + 2 * generation + 1]
-            returns.append(np.mean([play(benchmark, env, linear(env, weights), scene).earned for scene in scenes]))
-            used += 2 * (env.unwrapped.episode.next_index - 1)
+        played = [play(benchmark, env, linear(env, weights), 1000 * seed + generation) for weights in candidates]
+        returns = [score.earned for score in played]
+        used += population * (env.unwrapped.episode.next_index - 1)
         centre = share @ candidates[np.argsort(returns)[::-1][: len(share)]]
         sigma, generation = 0.9 * sigma, generation + 1
         curve.append((used, float(np.mean(returns))))

@@ -12,7 +12,7 @@ from common import Policy, Score, score
 from dynslam_bench.envs import ControlBenchmark
 
 
-def spliced(benchmark: ControlBenchmark, env: gym.Env, policies: Iterable[Policy], stretch: int = 20) -> Score:
+def spliced(benchmark: ControlBenchmark, env: gym.Env, policies: Iterable[Policy], stretch: int = 30) -> Score:
     """The episode that is spliced from the policies' best stretches."""
     inner, policies = env.unwrapped, list(policies)
     env.reset(seed=0)
