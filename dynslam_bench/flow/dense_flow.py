@@ -27,7 +27,6 @@ from dynslam_bench.flow.matching_cost import (
     CostTables,
     Reference,
     appearance,
-    cell_of,
     cost_tables,
     descriptor_distance,
     quantised,
@@ -169,7 +168,7 @@ class DescribedImage:
         centres: float32 ``[K, 2]``, their centres, full-image pixels.
         neighbours: int64 ``[K, 8]``, the nearest other regions.
         described: The centres for the label search.
-        descriptors: uint8, flat ``[h, w, 136]``, unrotated.
+        descriptors: uint64, flat ``[h, w, 17]``, unrotated, a histogram each.
     """
 
     maps: OrientationMaps
@@ -178,7 +177,7 @@ class DescribedImage:
     centres: NDArray[np.float32]
     neighbours: NDArray[np.int64]
     described: Reference
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[np.uint64]
 
 
 def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: SparseDaisyFlow) -> DescribedImage:
@@ -187,9 +186,8 @@ def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: S
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
     centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
     tables = sparse.pair(maps, maps).tables
-    descriptors = np.empty(half.size * layout.LENGTH, dtype=np.uint8)
-    cells, words = (array.view(np.uint64) for array in (maps.side.histograms, descriptors))
-    sparse.workers.run(read_descriptors, 0, *half.shape, cells, tables, words)
+    descriptors = np.empty(half.size * layout.HISTOGRAMS, dtype=np.uint64)
+    sparse.workers.run(read_descriptors, 0, *half.shape, maps.side, tables, descriptors)
     neighbours = nearest(centres, sparse.workers.run)
     return DescribedImage(maps, half, regions, centres, neighbours, sparse.describe(maps, centres, tables), descriptors)
 
@@ -589,28 +587,12 @@ def filter_patch(patch: Floats, values: Floats, pitch: int, radius: int, epsilon
 
 
 @kernel
-def read_descriptors(start: int, stop: int, columns: int, histograms: Words, tables: CostTables, out: Words) -> None:
-    """Unrotated descriptors of half-resolution rows start..stop.
-
-    Args:
-        start: First row.
-        stop: One past the last.
-        columns: Half-resolution pixels a row.
-        histograms: uint64, flat, the histograms as one number each.
-        tables: `matching_cost.CostTables`.
-        out: uint64, flat ``[h, w, 17]``.
-    """
-    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
+def read_descriptors(start: int, stop: int, columns: int, image: Side, tables: CostTables, out: Words) -> None:
+    """Fill rows start..stop of ``out``, uint64, flat ``[h, columns, 17]``, with half-resolution pixels' descriptors."""
     for y in range(start, stop):
         for x in range(columns):
             px, py = np.float32(2 * x) + np.float32(0.5), np.float32(2 * y) + np.float32(0.5)
-            near, near_phase = cell_of(px, py, tables.ring0[neutral])
-            far, far_phase = cell_of(px, py, tables.ring1[neutral])
-            at = (y * columns + x) * 17
-            for k in range(9):
-                out[at + k] = histograms[(near + tables.samples[neutral, straight, near_phase, k]) >> 3]
-            for k in range(9, 17):
-                out[at + k] = histograms[(far + tables.samples[neutral, straight, far_phase, k]) >> 3]
+            read_descriptor(px, py, image, tables, out, (y * columns + x) * 17)
 
 
 Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
@@ -620,7 +602,7 @@ Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 @kernel
 def aggregate_and_choose(
     start: int, stop: int, members: Longs, starts: Longs, centres: Floats, candidates: Floats, reference: Side,
-    target: Side, tables: CostTables, straight: Bytes, guide: Floats, radius: int, epsilon: Scalar, best: Floats,
+    target: Side, tables: CostTables, straight: Words, guide: Floats, radius: int, epsilon: Scalar, best: Floats,
     winner: Floats, evaluations: Longs,
 ) -> None:  # fmt: skip
     """Raw cost, guided filter and winner takes all (Eq. 1-3) for regions start..stop, at half resolution.
@@ -644,7 +626,7 @@ def aggregate_and_choose(
         evaluations: int64 ``[K]``, raw costs computed.
     """
     rows, columns = guide.shape
-    rotated, turned = np.empty(0, dtype=np.uint8), np.empty((4, 136), dtype=np.int32)
+    rotated, turned = np.empty(0, dtype=np.uint8), np.empty((2, 17), dtype=np.uint64)
     size = 0
     described = np.zeros(13, dtype=np.bool_)
     values, patch, work = np.empty(0, np.float32), np.empty(0, np.float32), np.empty((8, 0), np.float32)
@@ -725,8 +707,8 @@ def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[
 @inlined
 def raw_costs(
     label: Label, index: tuple[Scalar, Scalar], centre: tuple[Scalar, Scalar], patch: tuple[int, int, int, int],
-    radius: int, sides: tuple[Side, Side, CostTables], straight: Bytes, columns: int, rotated: Bytes, size: int,
-    described: Flags, turned: Ints, raw: Floats,
+    radius: int, sides: tuple[Side, Side, CostTables], straight: Words, columns: int, rotated: Bytes, size: int,
+    described: Flags, turned: Words, raw: Floats,
 ) -> None:  # fmt: skip
     """Fill `raw` with Eq. 1 of a label around a centre, for every half-resolution pixel of a patch.
 
@@ -742,22 +724,22 @@ def raw_costs(
         rotated: uint8, flat ``[13, size, 136]``, filled for rotations that are not `described` yet.
         size: Descriptors a rotation that `rotated` has room for.
         described: bool ``[13]``.
-        turned: int32 ``[4, 136]``, scratch.
+        turned: uint64 ``[2, 17]``, scratch.
         raw: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, filled inside the frame.
     """
     (u, v, a, b), (left, top, wide, high), (reference, target, tables), (si, ti) = label, patch, sides, index
     height, width = target.gray.shape
     neutral = ti == -layout.ANGLE_LOW
-    own = straight if neutral else rotated
+    own = straight.view(np.uint8) if neutral else rotated
     for y in range(high):
         for x in range(wide):
             px, py = np.float32(2 * (left + x)) + np.float32(0.5), np.float32(2 * (top + y)) + np.float32(0.5)
-            mine = ((top + y) * columns + left + x) * 136
+            at = (top + y) * columns + left + x
+            mine = at * 136
             if not neutral:
                 mine = (ti * size + y * wide + x) * 136
                 if not described[ti]:
-                    read_descriptor(px, py, reference, tables, turned)
-                    rotate_descriptor(turned, ti, rotated, mine)
+                    rotate_descriptor(straight, at * 17, ti, turned, rotated, mine)
             dx, dy = px - centre[0], py - centre[1]
             tx, ty = centre[0] + u + a * dx - b * dy, centre[1] + v + b * dx + a * dy
             cost = np.int64(tables.ceiling)

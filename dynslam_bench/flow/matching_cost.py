@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.orientation_maps import Side
-from dynslam_bench.flow.simd import Bytes, Floats, Ints, Longs, descriptor_sum
+from dynslam_bench.flow.simd import Bytes, Floats, Ints, Longs, Words, descriptor_sum
 
 OUTSIDE = 1 << 20
 """Cost of a label that leaves the target image."""
@@ -123,31 +123,40 @@ def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
 
 
 @inlined
-def read_descriptor(x: Scalar, y: Scalar, image: Side, tables: CostTables, turned: Ints) -> None:
-    """Fill int32 ``[4, 136]`` with the unrotated descriptor of a position, its bins shifted by -1, 0, 1 and 2."""
-    neutral, straight = -layout.SCALE_LOW, -layout.ANGLE_LOW
-    cell0, phase0 = cell_of(x, y, tables.ring0[neutral])
-    cell1, phase1 = cell_of(x, y, tables.ring1[neutral])
-    for k in range(17):
-        if k < 9:
-            cell = cell0 + tables.samples[neutral, straight, phase0, k]
-        else:
-            cell = cell1 + tables.samples[neutral, straight, phase1, k]
-        for b in range(8):
-            value = np.int32(image.histograms[cell + b])
-            for turn in range(4):
-                turned[turn, 8 * k + ((b + turn - 1) & 7)] = value
+def read_descriptor(x: Scalar, y: Scalar, image: Side, tables: CostTables, out: Words, first: int) -> None:
+    """Write the unrotated descriptor of a position: 17 histograms, a number each, of `out` from `first` on."""
+    neutral, straight, histograms = -layout.SCALE_LOW, -layout.ANGLE_LOW, image.histograms.view(np.uint64)
+    near, near_phase = cell_of(x, y, tables.ring0[neutral])
+    far, far_phase = cell_of(x, y, tables.ring1[neutral])
+    for k in range(9):
+        out[first + k] = histograms[(near + tables.samples[neutral, straight, near_phase, k]) >> 3]
+    for k in range(9, 17):
+        out[first + k] = histograms[(far + tables.samples[neutral, straight, far_phase, k]) >> 3]
 
 
 @inlined
-def rotate_descriptor(turned: Ints, a: int, out: Bytes, first: int) -> None:
-    """Write the descriptor for rotation index `a`: 136 bytes of `out` from `first` on."""
+def rotate_descriptor(descriptor: Words, at: int, a: int, turned: Words, out: Bytes, first: int) -> None:
+    """Write a descriptor for rotation index `a`: 136 bytes of `out` from `first` on.
+
+    Args:
+        descriptor: Unrotated, 17 numbers from `at` on.
+        at: Where it begins.
+        a: Index of the rotation.
+        turned: uint64 ``[2, 17]``, scratch.
+        out: Flat uint8 array.
+        first: Index in it.
+    """
     # bin b of the histogram rotated by theta is the unrotated one's at b - theta / 45 degrees
     sixths = a - 6
     whole = sixths // 6
     far_weight = np.int32((sixths - 6 * whole) * 171)  # 1026 / 6
     near_weight = np.int32(1026) - far_weight
-    near, far, rotated = turned[whole + 1], turned[whole + 2], out[first : first + 136]
+    for turn in range(2):
+        left = np.uint64(8 * (whole + turn) & 63)
+        right = np.uint64(-8 * (whole + turn) & 63)
+        for k in range(17):
+            turned[turn, k] = descriptor[at + k] << left | descriptor[at + k] >> right
+    near, far, rotated = turned[0].view(np.uint8), turned[1].view(np.uint8), out[first : first + 136]
     for b in range(136):
         rotated[b] = np.uint8((near_weight * near[b] + far_weight * far[b] + np.int32(512)) >> 10)
 
@@ -165,15 +174,15 @@ def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTab
         out: uint8, flat ``[N, S, ROTATIONS, 17 * 8]``.
     """
     height, width = image.gray.shape
-    turned = np.empty((4, 136), dtype=np.int32)
+    descriptor, turned = np.empty(17, dtype=np.uint64), np.empty((2, 17), dtype=np.uint64)
     supports = len(tables.support)
     for i in range(start, stop):
         for q in range(supports):
             x = min(max(points[i, 0] + np.float32(tables.support[q, 0]), np.float32(0)), np.float32(width - 1))
             y = min(max(points[i, 1] + np.float32(tables.support[q, 1]), np.float32(0)), np.float32(height - 1))
-            read_descriptor(x, y, image, tables, turned)
+            read_descriptor(x, y, image, tables, descriptor, 0)
             for a in range(13):
-                rotate_descriptor(turned, a, out, ((i * supports + q) * 13 + a) * 136)
+                rotate_descriptor(descriptor, 0, a, turned, out, ((i * supports + q) * 13 + a) * 136)
 
 
 @inlined
