@@ -310,10 +310,15 @@ def report(
 
     Raises:
         ReportError: There are no runs.
+        RunError: The results are an archive, and no output is named.
     """
     from dynslam_bench.reports import build_report
 
     folders = [Path(results)] if isinstance(results, str | Path) else [Path(folder) for folder in results]
+    if output is None and folders[0].is_file():
+        raise RunError(
+            f"{folders[0]} is an archive, which cannot hold its report", "name the report's folder: -o FOLDER"
+        )
     return build_report(folders, output or folders[0] / "report", **options)
 
 

@@ -129,9 +129,9 @@ class SequenceSampler(SlamWrapper):
         sequences: Sequence[str],
         mode: Literal["round_robin", "random"] = "round_robin",
     ) -> None:
+        if isinstance(sequences, str) or not sequences:
+            raise SettingsError(f"SequenceSampler takes a list of sequences, not {sequences!r}")
         super().__init__(env, sequences=list(sequences), mode=mode)
-        if not sequences:
-            raise SettingsError("SequenceSampler got no sequences")
         if mode not in ("round_robin", "random"):
             raise SettingsError(f"unknown mode '{mode}'", "known: round_robin, random")
         self._sequences = tuple(sequences)
@@ -181,9 +181,9 @@ class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
     """
 
     def __init__(self, env: gym.Env[Any, Any], actions: Sequence[Mapping[str, Any]]) -> None:
+        if not actions or not all(isinstance(values, Mapping) for values in actions):
+            raise SettingsError(f"DiscreteActions takes a list of settings by name, one an action, not {actions!r}")
         super().__init__(env, actions=[dict(values) for values in actions])
-        if not actions:
-            raise SettingsError("DiscreteActions got no actions")
         for values in actions:
             self._base.action_of(values)
         self._actions = tuple(actions)

@@ -5,11 +5,14 @@ Between its runs, masks are carried along by optical flow.
 
 from __future__ import annotations
 
+import atexit
 import time
 from concurrent.futures import Future, wait
+from copy import copy
 from dataclasses import dataclass, replace
 from threading import Thread
 from typing import Any
+from weakref import WeakSet
 
 import cv2
 import numpy as np
@@ -17,7 +20,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Instances, Segmenter
 from dynslam_bench.geometry import Camera
-from dynslam_bench.segmentation.build_segmenter import ConfiguredSegmenter
+from dynslam_bench.segmentation.build_segmenter import CachedSegmenter, ConfiguredSegmenter
 from dynslam_bench.segmentation.postprocess import boxes_of, region, select
 from dynslam_bench.segmentation.settings import MAX_CARRY, SegmentationSettings
 
@@ -27,6 +30,12 @@ LEAST_HITS = 2
 """Detections of an object before a miss is bridged, so that a single false detection is not."""
 SMOOTHING = 0.5
 """Weight of the newest velocity."""
+STAMP_TOLERANCE_S = 1e-3
+"""Masks are due so much early: sums of stamps and latencies are rounded."""
+EXIT_S = 10.0
+"""At its end the process waits so long for a segmenter: a thread that it stops within a network would abort it."""
+_working: WeakSet[Future[tuple[Instances, float]]] = WeakSet()
+atexit.register(lambda: wait(_working, EXIT_S))
 
 
 @dataclass(eq=False)
@@ -66,7 +75,8 @@ class MaskScheduler:
     With schedule ``async`` the segmenter runs in a thread of its own, on one frame at a time. The masks of a frame are
     taken `latency_s` later by the frames' stamps, carried to the frame of that time, and the segmenter begins with that
     frame; they are at least one frame late. If it is slower than `latency_s`, tracking waits for it: the same settings
-    give the same masks everywhere.
+    give the same masks everywhere. It works with the settings of the time when it begins, and without the stage cache,
+    so that the wait is measured.
 
     Args:
         settings: When to segment, how to carry masks, how long to bridge missed detections.
@@ -138,7 +148,7 @@ class MaskScheduler:
         flow, request = dense_flow(self._gray, gray), self._request
         if request is not None:
             request.follow(flow)
-        taken = request is not None and frame.timestamp >= request.due
+        taken = request is not None and frame.timestamp >= request.due - STAMP_TOLERANCE_S
         if request is not None and taken:
             instances, self.beside_s = request.answer.result()
             self._instances = carry_dense(self._missed.update(instances, request.since), request.flow)
@@ -146,10 +156,15 @@ class MaskScheduler:
             self._instances = carry_dense(self._instances, flow)
         if request is None or taken:
             answer: Future[tuple[Instances, float]] = Future()
-            Thread(target=_segment, args=(self.segmenter, frame, answer), daemon=True).start()
+            _working.add(answer)
+            Thread(target=_segment, args=(self._frozen(), frame, answer), daemon=True).start()
             since = self._age if request is None else request.age
             self._request = _Request(frame.timestamp + self._settings.latency_s, since, answer, np.zeros_like(flow))
         return taken
+
+    def _frozen(self) -> Segmenter:
+        """The segmenter with the settings of now."""
+        return copy(self.segmenter) if isinstance(self.segmenter, ConfiguredSegmenter) else self.segmenter
 
     def _due(self, keyframe: bool) -> bool:
         settings = self._settings
@@ -164,8 +179,10 @@ class MaskScheduler:
 
 def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances, float]]) -> None:
     """Segment a frame in a thread of its own; the answer holds the objects and the seconds, or the error."""
-    start = time.perf_counter()
     try:
+        if isinstance(segmenter, ConfiguredSegmenter) and isinstance(segmenter.inner, CachedSegmenter):
+            segmenter.inner = segmenter.inner.network()
+        start = time.perf_counter()
         answer.set_result((segmenter.segment(frame), time.perf_counter() - start))
     except BaseException as error:  # raised again where the masks are taken
         answer.set_exception(error)

@@ -43,21 +43,29 @@ class Decoded(Wrapped):
 
 
 def _mapped(sequence: Sequence) -> NDArray[np.void]:
-    """The frames as a mapped array of records ``rgb`` and ``depth``, which is written if it is not there."""
+    """The frames as a mapped array of records ``rgb`` and ``depth``, which is written if it is not there or damaged."""
     cache, part = StageCache(), part_of(sequence)
     code = [package_digest(("core", "geometry", "sequences")), opencv_version()]
     path = cache.path("frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy")
-    if not path.exists():
+    if (frames := _read(path)) is None:
         with raising(DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"):
             path.parent.mkdir(parents=True, exist_ok=True)
         with turn(path.with_suffix(".lock")):
-            if not path.exists():
+            if (frames := _read(path)) is None:
                 _write(sequence, path, cache.max_bytes)
                 cache.prune()
-    frames: NDArray[np.void] = np.load(path, mmap_mode="r", allow_pickle=False)
+                frames = np.load(path, mmap_mode="r", allow_pickle=False)
     with contextlib.suppress(OSError):  # a cache that can only be read
         os.utime(path)
     return frames
+
+
+def _read(path: Path) -> NDArray[np.void] | None:
+    """The mapped array of a file; None if it is not there, or damaged."""
+    try:
+        return np.asanyarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    except (FileNotFoundError, EOFError, ValueError):
+        return None
 
 
 def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:

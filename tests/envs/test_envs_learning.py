@@ -144,12 +144,15 @@ def test_a_state_goes_to_another_environment_that_is_made_alike(tmp_path: Path) 
     assert rest(other) == rest(env)
 
 
-def test_a_state_of_another_sequence_tracker_control_or_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_of_another_sequence_tracker_settings_or_version_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     state = stepped(SlamEnv(ToySequence(9), TARGET), 2).clone_state()
     for env, words in (
         (SlamEnv(ToySequence(10), TARGET), "of sequence 'toy/walk' .9 frames"),
         (SlamEnv(ToySequence(9), "never-move"), "of tracker 'toy'"),
         (SlamEnv(ToySequence(9), TARGET, control=["noise.clip"]), "of control"),
+        (SlamEnv(ToySequence(9), TARGET, settings={"noise.passes": 3}), "of settings"),
         (SlamEnv(ToySequence(9), TARGET), "of version 0.0.1"),
     ):
         if "version" in words:

@@ -25,7 +25,7 @@ import pytest
 from envs_toys import TARGET, truth, write_folder
 from hostile import until
 
-from dynslam_bench.api import bench
+from dynslam_bench.api import bench, report
 from dynslam_bench.cli.running import parse_shard, show_workers
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
 from dynslam_bench.geometry.trajectory import Trajectory
@@ -571,6 +571,8 @@ def test_a_shard_is_merged_and_read_as_one_file(suite: Path, tmp_path: Path) -> 
     frame = pd.concat([open_store(file).frame() for file in files]).sort_values("started", ignore_index=True)
     pd.testing.assert_frame_equal(frame, target.frame())
     assert len(load_frame(files)) == 5
+    with pytest.raises(RunError, match=r"shard1.tgz is an archive.*-o"):
+        report(files)
     contradicted = files[1].rename(tmp_path / "other.zip")
     trajectory = target.folder(parts[1].ids()[0]) / "trajectory_online.txt"
     trajectory.write_text("")

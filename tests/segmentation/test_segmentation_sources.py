@@ -2,10 +2,12 @@
 
 import hashlib
 import json
+import subprocess
 import sys
 import time
 from contextlib import nullcontext
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,9 +21,12 @@ from dynslam_bench.contracts.sequence import Frame, FrameMasks
 from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.core.settings import apply_overrides, build, parameters
+from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.segmentation import build_segmenter as building
 from dynslam_bench.segmentation import schedule
 from dynslam_bench.segmentation.build_segmenter import (
+    CachedSegmenter,
+    ConfiguredSegmenter,
     SegmenterSpec,
     build_segmenter,
     resolve_source,
@@ -701,6 +706,66 @@ def test_beside_tracking_missed_detections_count_the_frames_between_those_segmen
         gray = scene(3 * index)[0]
         stage.masks_for(frame_of(gray, index), gray, keyframe=False)
     assert stage.segmenter.calls[:4] == [0, 1, 4, 7] and apart == [1, 1, 3, 3]
+
+
+@pytest.mark.parametrize("epoch", [0.0, 1311868164.3])
+def test_beside_tracking_masks_are_due_at_the_same_frames_from_any_first_stamp(epoch):
+    """A latency of three frames is three frames, however the sum of stamp and latency is rounded."""
+    stage, taken = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.1), Square()), []
+    for index in range(20):
+        frame = frame_of(scene(3 * index)[0], index)
+        stage.masks_for(replace(frame, timestamp=epoch + index / 30), frame.rgb[:, :, 0], keyframe=False)
+        taken += [index] * stage.segmented
+    assert taken == [0, 4, 7, 10, 13, 16, 19]
+
+
+def test_beside_tracking_the_segmenter_keeps_the_settings_that_it_began_with():
+    class Slow(Square):
+        def segment(self, frame):
+            time.sleep(0.05)
+            return super().segment(frame)
+
+    settings = SegmentationSettings(schedule="async", latency_s=0.09)
+    strict = settings.model_copy(update={"confidence": 0.95})  # its objects have less
+    stage, found = MaskScheduler(settings, ConfiguredSegmenter(Slow(), settings, "test")), []
+    for index in range(8):
+        gray = scene(3 * index)[0]
+        found.append(len(stage.masks_for(frame_of(gray, index), gray, keyframe=False)))
+        stage.configure(strict if index in (1, 2, 3) else settings)
+    assert found == [1] * 8
+
+
+def test_beside_tracking_nothing_comes_from_the_stage_cache(tmp_path):
+    network, settings = Square(), SegmentationSettings(schedule="async", latency_s=0.09)
+    cached = CachedSegmenter(lambda: network, "test", StageCache(tmp_path))
+    for _ in range(2):
+        stage = MaskScheduler(settings, ConfiguredSegmenter(cached, settings, "test"))
+        for index in range(5):
+            gray = scene(3 * index)[0]
+            stage.masks_for(frame_of(gray, index), gray, keyframe=False)
+        stage.reset()
+    assert network.calls == [0, 1, 4, 1, 4], "the first frame is segmented before it is tracked, and stored"
+
+
+def test_a_process_waits_at_its_end_for_the_segmenter_beside_tracking():
+    code = """
+import time
+import numpy as np
+from dynslam_bench.contracts import Frame, Instances
+from dynslam_bench.segmentation.schedule import MaskScheduler
+from dynslam_bench.segmentation.settings import SegmentationSettings
+class Slow:
+    def segment(self, frame):
+        time.sleep(0.3 * frame.index)
+        print(frame.index)
+        return Instances.empty(60, 80)
+stage = MaskScheduler(SegmentationSettings(schedule="async"), Slow())
+for index in range(2):
+    frame = Frame(index, index / 30, np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), np.float32))
+    stage.masks_for(frame, frame.rgb[:, :, 0], keyframe=False)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "0\n1\n"), done.stderr
 
 
 def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken():

@@ -639,6 +639,14 @@ def test_frames_are_the_same_and_decoded_once(folder: Path, reads: list[str], ca
         mapped[0].rgb[0] = 0
 
 
+@pytest.mark.parametrize("damage", [lambda data: data[:-9], lambda _: b"", lambda data: b"x" * len(data)])
+def test_a_damaged_file_is_written_again(folder: Path, cache: StageCache, damage) -> None:
+    Decoded(open_sequence(folder))
+    (file,) = files(cache)
+    file.write_bytes(damage(file.read_bytes()))
+    assert same(frames(Decoded(open_sequence(folder))), frames(open_sequence(folder)))
+
+
 def test_other_frames_are_another_file(folder: Path, cache: StageCache) -> None:
     whole = open_sequence(folder)
     smaller = open_sequence(folder, preprocessing=PreprocessingSettings(width=16, height=16))

@@ -151,7 +151,7 @@ def read_seven_scenes(folder: Path, fps: float | None) -> Contents:
     truth = Trajectory(to_seconds(stamps[tracked]), matrices, stamps[tracked]) if tracked else None
     lost = len(poses) - len(tracked)
     dropped = f"ground truth: {lost} of {len(poses)} poses lost" if lost else ""
-    return Contents(colour, depth, True, truth, dropped, _SEVEN_SCENES_CAMERA, rate, missing_depth=65535)
+    return Contents(colour, depth, True, truth, dropped, _SEVEN_SCENES_CAMERA, rate)
 
 
 def _kinect_fusion_pose(path: Path) -> Array | None:

@@ -171,7 +171,6 @@ class Contents:
         truth_dropped: One phrase on the poses that were not taken as they stand; empty for none.
         camera: Intrinsics that the folder states; None where it does not.
         fps: Nominal frame rate in Hz that the folder or the layout states; None where neither does.
-        missing_depth: Raw value beside 0 that stands for a missing depth; None for none.
         furthest_m: Depth beyond this, in metres, is no measurement (a rendered sky); None for no limit.
         people: Exact masks of people, with the stamps of the colour images; None where there are none.
     """
@@ -183,7 +182,6 @@ class Contents:
     truth_dropped: str = ""
     camera: Camera | None = None
     fps: float | None = None
-    missing_depth: int | None = None
     furthest_m: float | None = None
     people: ImageList | None = None
 

@@ -80,7 +80,7 @@ class RecordedSequence:
         self.folder, self.id, self.camera = folder, id, camera
         self.license, self.citation, self.tags, self.split = license, citation, tags, split
         self._any_depth_size = any_depth_size
-        self._missing_depth, self._furthest_m = contents.missing_depth, contents.furthest_m
+        self._furthest_m = contents.furthest_m
         delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
         colour, depth = contents.colour, replace(contents.depth, stamps_ns=delayed)
         people = contents.people
@@ -172,8 +172,8 @@ class RecordedSequence:
             raise SequenceError(
                 f"cannot read {error.filename}: {error.strerror}", "fetch the sequence again"
             ) from error
-        special = [self._missing_depth, self._furthest_m]
-        return digest([repr(self.camera), self.fps, self.timestamps_ns.tolist(), images, poses, special])
+        stamps = self.timestamps_ns.tolist()
+        return digest([repr(self.camera), self.fps, stamps, images, poses, self._furthest_m])
 
     def __len__(self) -> int:
         return len(self._colour)
@@ -191,7 +191,6 @@ class RecordedSequence:
             self.camera.depth_factor,
             size=None if self._any_depth_size else size,
             mismatch=f"but its colour image is {expected}",
-            missing=self._missing_depth,
             furthest_m=self._furthest_m,
         )
         return Frame(index, float(self.timestamps[index]), rgb, depth)
@@ -264,13 +263,16 @@ def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
 
 
+SATURATED = np.iinfo(np.uint16).max
+"""Raw value of a depth beyond the range of 16 bits, or of a missing one."""
+
+
 def read_depth(
     path: Path,
     depth_factor: float,
     *,
     size: tuple[int, int] | None = None,
     mismatch: str = "",
-    missing: int | None = None,
     furthest_m: float | None = None,
 ) -> NDArray[np.float32]:
     """The image as float32 ``[H, W]`` in metres, 0 where the depth is missing.
@@ -280,7 +282,6 @@ def read_depth(
         depth_factor: Raw units a metre of an image.
         size: Width and height that it has to have; None for any.
         mismatch: Ends the message where it has another one.
-        missing: Raw value beside 0 that stands for a missing depth; None for none.
         furthest_m: Depth beyond this is missing; None for no limit.
 
     Raises:
@@ -300,8 +301,7 @@ def read_depth(
                 f"store depth x {depth_factor:g} as 16-bit PNG; an 8-bit image has lost its range",
             )
         depth = raw.astype(np.float32) / np.float32(depth_factor)
-        if missing is not None:
-            depth[raw == missing] = 0
+        depth[raw == SATURATED] = 0
     if furthest_m is not None:
         depth[depth > furthest_m] = 0
     return depth
