@@ -64,26 +64,29 @@ def main(
         f"best static: {best}": [statics[best]],
         "rule by hand": [rule],
     }
-    curves, began = {}, time.perf_counter()
-    for name, learn in {"evolution strategy": learn_evolution, "PPO": learn_ppo}.items():
-        learnt = [learn(bench, train, steps, seed) for seed in range(seeds)]
-        agents[f"{name} ({seeds} seeds)"] = [agent for agent, _ in learnt]
-        curves |= {(name, seed): curve for seed, (_, curve) in enumerate(learnt)}
-    learnt_s = time.perf_counter() - began
-
     rows = {
         name: average([[play(bench, env, agent(env)) for env in tests] for agent in agents[name]]) for name in agents
     }
     each = [max(scores, key=lambda s: s.earned) for scores in zip(*sweep.values(), strict=True)]
     ways = [spliced(bench, env, static.sweep(env).values()) for env in tests]
-    splice = [max(scores, key=lambda s: s.earned) for scores in zip(each, ways, strict=True)]
-    gap = {"best static of each scene": each, "hindsight splice": splice}
-    first = {name: rows.pop(name) for name in ("default", f"best static: {best}")}
+    rows["best static of each scene"] = each
+    rows["hindsight splice"] = [max(scores, key=lambda s: s.earned) for scores in zip(each, ways, strict=True)]
     print(f"{len(tests)} held-out scenes, {scenes} training scenes, {steps} steps a learner.\n")
-    print_table(first | gap | rows, sweep)
+    print_table(rows, sweep, list(rows))
+
+    curves, began = {}, time.perf_counter()
+    for name, learn in {"evolution strategy": learn_evolution, "PPO": learn_ppo}.items():
+        learnt = [learn(bench, train, steps, seed) for seed in range(seeds)]
+        agents[name] = [agent for agent, _ in learnt]
+        curves |= {(name, seed): curve for seed, (_, curve) in enumerate(learnt)}
+    learnt_s = time.perf_counter() - began
+    learners = list(dict.fromkeys(name for name, _ in curves))
+    scores = {name: [[play(bench, env, agent(env)) for env in tests] for agent in agents[name]] for name in learners}
+    print(f"\nLearners, means of {seeds} seeds.\n")
+    print_table(rows | {name: average(runs) for name, runs in scores.items()}, sweep, learners)
+    print_curves(curves, scores)
     if data_root is not None:
         print_recordings(bench, agents, data_root, {} if masks is None else {"segmentation.source": masks})
-    print_curves(curves)
     print(f"\n{2 * seeds * steps / learnt_s:.0f} steps a second while learning.")
 
 
@@ -132,7 +135,7 @@ def front(statics: np.ndarray, scenes: np.ndarray) -> np.ndarray:
     return means[np.r_[True, means[1:, 1] < np.minimum.accumulate(means[:, 1])[:-1]]]
 
 
-def print_table(rows: dict[str, list[Score]], sweep: dict[str, list[Score]]) -> None:
+def print_table(rows: dict[str, list[Score]], sweep: dict[str, list[Score]], shown: list[str]) -> None:
     """A row an agent: mean loss (minus the return), error and cost, and what static settings have instead.
 
     The error is compared with that of static settings at the agent's cost, the cost with theirs at the agent's error:
@@ -143,7 +146,8 @@ def print_table(rows: dict[str, list[Score]], sweep: dict[str, list[Score]]) -> 
     best = next(table for name, table in tables.items() if name.startswith("best static:"))
     print("| agent | loss, mm | error, mm | cost | loss against default, % | loss against best static, % ", end="")
     print("| error at equal cost, % | cost at equal error, % |\n| --- |" + " ---: |" * 7)
-    for name, table in tables.items():
+    for name in shown:
+        table = tables[name]
         loss, error, cost = table.mean(axis=0)
 
         def error_there(scenes: np.ndarray, table=table) -> float:
@@ -158,7 +162,7 @@ def print_table(rows: dict[str, list[Score]], sweep: dict[str, list[Score]]) -> 
             percent(table, 1, error_there),
             percent(table, 2, cost_there),
         ]
-        print(f"| {name} | {1e3 * loss:.0f} | {1e3 * error:.0f} | {cost:.1f} | {' | '.join(changes)} |")
+        print(f"| {name} | {1e3 * loss:.0f} | {1e3 * error:.0f} | {cost:.1f} | {' | '.join(changes)} |", flush=True)
 
 
 def print_recordings(
@@ -176,11 +180,12 @@ def print_recordings(
             print(f"| {name} | left out: {error} | | | |")
 
 
-def print_curves(curves: dict[tuple[str, int], list[tuple[int, float]]]) -> None:
-    """A row a learner: mean loss of its training episodes, from the first eighth of the steps to the last."""
-    print("\n| learner | seed | loss of training episodes, mm, by steps |\n| --- | ---: | --- |")
+def print_curves(curves: dict[tuple[str, int], list[tuple[int, float]]], scores: dict[str, list[list[Score]]]) -> None:
+    """A row a learner: mean loss of its training episodes from the first steps to the last, then on held-out scenes."""
+    print("\n| learner | seed | loss of training episodes, mm, by steps | held out |\n| --- | ---: | --- | ---: |")
     for (name, seed), curve in curves.items():
-        print(f"| {name} | {seed} | {', '.join(f'{steps}: {-1e3 * earned:.0f}' for steps, earned in curve)} |")
+        parts = ", ".join(f"{steps}: {-1e3 * earned:.0f}" for steps, earned in curve)
+        print(f"| {name} | {seed} | {parts} | {-1e3 * np.mean([s.earned for s in scores[name][seed]]):.0f} |")
 
 
 if __name__ == "__main__":

@@ -65,9 +65,9 @@ def test_agents_are_compared(
     )
     text = capsys.readouterr().out
     rows = [row.split(" | ") for row in text.splitlines() if row.count(" | ") == 7]
-    losses = {row[0][2:].partition(":")[0]: float(row[1]) for row in rows[2:]}
+    losses = {row[0][2:].partition(":")[0]: float(row[1]) for row in rows if row[1][0].isdigit()}
     assert losses["best static of each scene"] <= losses["best static"]
-    assert {"default", "random", "hindsight splice", "rule by hand", "PPO (1 seeds)"} < set(losses)
+    assert {"default", "random", "hindsight splice", "rule by hand", "PPO"} < set(losses)
     assert losses["hindsight splice"] <= losses["best static of each scene"]
     assert "left out" in text and "is not at" in text, "no recordings there"
 
