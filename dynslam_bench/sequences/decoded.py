@@ -63,9 +63,10 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
 def _read(path: Path) -> NDArray[np.void] | None:
     """The mapped array of a file; None if it is not there, or damaged."""
     try:
-        return np.asanyarray(np.load(path, mmap_mode="r", allow_pickle=False))
+        frames: NDArray[np.void] = np.load(path, mmap_mode="r", allow_pickle=False)
     except (FileNotFoundError, EOFError, ValueError):
         return None
+    return frames
 
 
 def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:
