@@ -383,13 +383,15 @@ def test_a_choice_leaves_what_it_does_not_name() -> None:
 @pytest.mark.parametrize(
     ("actions", "words"),
     [
-        ([], "no actions"),
+        ([], r"one an action, not \[\]"),
+        ([None], r"one an action, not \[None\]"),
+        ("ab", "one an action, not 'ab'"),
         ([{"noise.clip": 1.0}], "'noise.clip' is not in control"),
         ([{"noise.level_m": 7.0}], "noise.level_m"),
         ([{"noise.level_m": "x"}], "noise.level_m"),
     ],
 )
-def test_choices_that_are_none(actions: list[dict[str, Any]], words: str) -> None:
+def test_choices_that_are_none(actions: Any, words: str) -> None:
     with pytest.raises(SettingsError, match=words):
         DiscreteActions(SlamEnv(ToySequence(6), TARGET, control=["noise.level_m"]), actions)
 
