@@ -93,12 +93,15 @@ _ERRORS = {
 
 
 def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
-    """Index, stamp, state and stats of a frame, its pose if it was tracked, its errors where they are defined."""
+    """Index, stamp, state and stats of a frame, its pose if it was tracked, its errors where they are defined.
+
+    What the stage cache answered is no part of the stats: it differs between two episodes that are otherwise equal.
+    """
     info: dict[str, Any] = {
         "frame_index": outcome.index,
         "timestamp": float(outcome.timestamp),
         "tracking_state": str(outcome.state),
-        "stats": dict(outcome.stats),
+        "stats": {name: value for name, value in outcome.stats.items() if name != "cached_stages"},
     }
     if outcome.T_world_cam is not None:
         info["pose"] = np.concatenate(se3.to_quaternion(outcome.T_world_cam))

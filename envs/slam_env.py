@@ -122,7 +122,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         camera: Name or file of the camera for folders that do not say theirs; None to read it from the folder.
         threads: Threads that the tracker may use.
         cache: Whether features and network masks come from the stage cache where they are stored; poses and reported
-            stage times are the same either way, and `stats` says which came from it (``cached_stages``).
+            stage times are the same either way.
         fixed_info: Whether ``info`` has the same keys on every step, as Minari needs.
         memory_map: Whether all frames are decoded once into a file of the stage cache that environments and processes
             share (2.2 MB a frame of 640 x 480); the tracker then gets arrays that cannot be written.

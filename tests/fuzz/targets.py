@@ -626,7 +626,7 @@ def _read_colour(data: bytes | None, folder: Path) -> None:
 
 def _read_depth(data: bytes | None, folder: Path) -> None:
     path = at(folder, "1.npy" if data and data.startswith(b"\x93") else "1.png", data)
-    reader.read_depth(path, 5000.0, missing=90, furthest_m=2.0)  # any size
+    reader.read_depth(path, 5000.0, furthest_m=2.0)  # any size
     image = reader.read_depth(path, 5000.0, size=(16, 12), mismatch="but the camera is 16x12")
     assert image.shape == (12, 16) and image.dtype == np.float32
 
