@@ -100,7 +100,7 @@ _NEVER = 1_000_000
 _BENCHMARKS = (
     ControlBenchmark(
         id="masks-v0",
-        summary="when the segmentation network runs, and how far its masks are grown, in rooms that fill or empty",
+        summary="when the segmentation network runs, and how far its masks are grown, in scenes that fill or empty",
         train=_scenes(["changing_crowd"], range(100)),
         test=_scenes(["changing_crowd"], range(100, 112)),
         recordings=("bonn/crowd",),
