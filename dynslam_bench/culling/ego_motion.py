@@ -7,12 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, failing_regions, neighbourhood_sum
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
+Array = NDArray[np.float64]
+
 MIN_POINTS = 12
+NEAR_M = 0.05
+"""Points nearer than this to the camera plane have no weight."""
 TURN_PX = (12.0, 6.0, 4.0)
 """Scale of the redescending kernel in the first Gauss-Newton steps, which change the rotation only."""
 KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
@@ -141,23 +146,11 @@ def _align(
 
     `information` ``[6, 6]`` is that of the prior, the start pose.
     """
-    rolling_shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
-    pose, weight, inverse_start = start, prior_weight, se3.inverse(start)
+    shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
+    lens = camera.fx, camera.fy, camera.cx, camera.cy
+    pose, total, inverse_start = start, 0.0, se3.inverse(start)
     for number, scale in enumerate(TURN_PX + KERNEL_PX):
-        moved = se3.transform(pose, points)
-        z = np.maximum(moved[:, 2], 0.05)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            projected = moved[:, :2] / moved[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        error = np.nan_to_num(projected - pixels, posinf=1e4, neginf=-1e4)
-        error = np.where(moved[:, 2:] > 0.05, error, 1e4)
-        weight = prior_weight / np.square(1 + (error**2).sum(axis=1) / (scale**2 + rolling_shutter))
-        x, y = moved[:, 0] / z, moved[:, 1] / z
-        zero = np.zeros_like(x)
-        # derivative of the pixel by a left perturbation exp(rho, phi) of the pose
-        du = camera.fx * np.stack([1 / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=1)
-        dv = camera.fy * np.stack([zero, 1 / z, -y / z, -1 - y * y, x * y, x], axis=1)
-        hessian = (du * weight[:, None]).T @ du + (dv * weight[:, None]).T @ dv
-        gradient = du.T @ (weight * error[:, 0]) + dv.T @ (weight * error[:, 1])
+        hessian, gradient, total = _linearise(pose, points, pixels, prior_weight, shutter, scale**2, *lens)
         if information is not None:
             hessian += information
             gradient += information @ se3.log(pose @ inverse_start)
@@ -171,7 +164,36 @@ def _align(
         if not np.isfinite(step).all() or np.linalg.norm(step[3:]) > 1.0:
             return None
         pose = se3.exp(step) @ pose
-    return pose if weight.sum() >= 0.5 * MIN_POINTS else None
+    return pose if total >= 0.5 * MIN_POINTS else None
+
+
+@kernel
+def _linearise(
+    pose: Array, points: Array, pixels: Array, prior_weight: Array, shutter: Array, scale2: float,
+    fx: float, fy: float, cx: float, cy: float,
+) -> tuple[Array, Array, float]:  # fmt: skip
+    """Gauss-Newton matrix ``[6, 6]`` and gradient ``[6]`` by a left perturbation (rho, phi), and the sum of weights."""
+    hessian, gradient, total = np.zeros((6, 6)), np.zeros(6), 0.0
+    j = np.zeros((2, 6))
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        if z <= NEAR_M:
+            continue
+        x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z
+        y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z
+        du, dv = fx * x + cx - pixels[i, 0], fy * y + cy - pixels[i, 1]
+        weight = prior_weight[i] / (1 + (du * du + dv * dv) / (scale2 + shutter[i])) ** 2
+        total += weight
+        j[0, 0], j[0, 2], j[0, 3], j[0, 4], j[0, 5] = fx / z, -fx * x / z, -fx * x * y, fx * (1 + x * x), -fx * y
+        j[1, 1], j[1, 2], j[1, 3], j[1, 4], j[1, 5] = fy / z, -fy * y / z, -fy * (1 + y * y), fy * x * y, fy * x
+        for row, error in ((0, du), (1, dv)):
+            for m in range(6):
+                scaled = weight * j[row, m]
+                gradient[m] += scaled * error
+                for n in range(6):
+                    hessian[m, n] += scaled * j[row, n]
+    return hessian, gradient, total
 
 
 class RigidMotionFilter(Rule[RigidMotionSettings]):

@@ -46,7 +46,7 @@ def log(pose: Array) -> Array:
     """Twists ``[..., 6]`` = (rho, phi) of poses ``[..., 4, 4]``; rotation angles in [0, pi]."""
     pose = np.asarray(pose, dtype=np.float64)
     flat = pose.reshape(-1, 4, 4)
-    phi = _rotations().from_matrix(flat[:, :3, :3]).as_rotvec()
+    phi = rotation_vectors(flat)
     theta = np.linalg.norm(phi, axis=-1)[:, None, None]
     small = theta < 1e-5
     safe = np.where(small, 1.0, theta)
@@ -95,12 +95,29 @@ def to_quaternion(pose: Array) -> tuple[Array, Array]:
 
 def rotation_angle(pose: Array) -> Array:
     """Rotation angles ``[...]`` in rad, in [0, pi], all of them accurate: by sine and cosine together."""
+    return _sine_axes(pose)[1]
+
+
+def rotation_vectors(pose: Array) -> Array:
+    """Rotation vectors ``[..., 3]`` in rad of poses or rotation matrices, of length in [0, pi]."""
+    pose = np.asarray(pose, dtype=np.float64)
+    axes, angle = _sine_axes(pose)
+    if np.max(angle, initial=0.0) > 3.0:  # near a half turn the sine does not tell the axis
+        rotation = _rotations().from_matrix(pose[..., :3, :3].reshape(-1, 3, 3))
+        return np.asarray(rotation.as_rotvec().reshape(*angle.shape, 3))
+    sine = np.sin(angle)
+    return np.asarray(axes * np.where(sine > 1e-9, angle / np.where(sine > 1e-9, sine, 1.0), 1.0)[..., None])
+
+
+def _sine_axes(pose: Array) -> tuple[Array, Array]:
+    """Axes ``[..., 3]`` times the sine of the angle, and the angles ``[...]``, of rotations."""
     pose = np.asarray(pose, dtype=np.float64)
     x = pose[..., 2, 1] - pose[..., 1, 2]
     y = pose[..., 0, 2] - pose[..., 2, 0]
     z = pose[..., 1, 0] - pose[..., 0, 1]
     trace = pose[..., 0, 0] + pose[..., 1, 1] + pose[..., 2, 2]
-    return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0))
+    angle = np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0)
+    return 0.5 * np.stack([x, y, z], axis=-1), np.asarray(angle)
 
 
 STILL_M, STILL_DEG = 1e-3, 0.1

@@ -110,7 +110,7 @@ class MotionState:
     def difference(self, T_cam_world: Array) -> Array:
         """(position, rotation) ``[6]`` that leads from this state's pose to another."""
         r = T_cam_world[:3, :3]
-        rotation = Rotation.from_matrix(r @ self.rotation.T).as_rotvec()
+        rotation = se3.rotation_vectors(r @ self.rotation.T)
         return np.concatenate([-r.T @ T_cam_world[:3, 3] - self.position, rotation])
 
     def moved(self, correction: Array, covariance: Array) -> MotionState:
@@ -289,7 +289,7 @@ class CameraVelocity:
     @classmethod
     def between(cls, before: Array, now: Array, seconds: float) -> CameraVelocity:
         """From two world-to-camera poses ``[4, 4]`` so many seconds apart; in the camera frame of the later one."""
-        angular = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).as_rotvec() / seconds
+        angular = se3.rotation_vectors(now[:3, :3] @ before[:3, :3].T) / seconds
         return cls(now[:3, :3] @ (se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]) / seconds, angular)
 
 
