@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, failing_regions, neighbourhood_sum
+from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, failing_regions
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
@@ -32,8 +32,12 @@ CORRELATION = 100.0
 
 THRESHOLD_SHARE = 0.05
 """Added to the pixel threshold, as a share of the flow that the camera's motion explains (rolling shutter)."""
+SLOW_PX, MEAN_S = 1.2, 0.1
+"""Threshold of the mean residual, which finds slow steady motion, and the mean's time constant."""
 MEMORY_S = 1.65
 """Time constant with which the count of a point's failures decays."""
+NEARBY_PX, SIMILAR_DEPTH = 24.0, 0.1
+"""Points within this distance share their counts if their depths differ by no more than this share."""
 MAX_FAILURES = 2.5
 """Above this count a point is dropped although it passes now: from the third failure in a row on, and for some seconds
 after an object has stopped. It would otherwise become a part of the map, and take the camera along when it moves on. A
@@ -199,9 +203,9 @@ def _linearise(
 class RigidMotionFilter(Rule[RigidMotionSettings]):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
-    Points are dropped that fail now, or failed more than `MAX_FAILURES` times before, so that people and objects that
-    pause stay culled. The count decays, and follows the flow; it is averaged over 3x3 cells, as many a cell holds no
-    point in some frame.
+    A point fails by its residual in this frame, or by the mean of the last few, in which slow motion adds up and noise
+    does not. Points are dropped that fail now, or failed more than `MAX_FAILURES` times before, so that people and
+    objects that pause stay culled. Mean and count decay and follow the flow; points nearby share them at similar depth.
     Stats: ``dropped``, ``tested``, ``failed`` (in this frame alone).
     """
 
@@ -212,38 +216,76 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget the previous sequence."""
-        self._failures: NDArray[np.float64] | None = None
+        self._memory: Array | None = None
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the points that have flow and depth."""
         flow, xy, shape = state.flow, frame.keypoints.xy, frame.gray.shape
         if flow is None or state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
-            self._failures = None
+            self._memory = None
             return self.verdict(np.ones(len(xy), dtype=bool))
         tested = flow.valid & (frame.z > 0)
-        failed = np.zeros(len(xy), dtype=bool)
-        failed[tested] = self._fails(frame, state, tested)
+        failed, residual = np.zeros(len(xy), dtype=bool), np.zeros((len(xy), 2))
+        failed[tested], residual[tested] = self._fails(frame, state, tested)
+        before, dt = np.zeros((len(xy), 3)), frame.timestamp - state.previous.timestamp
+        if self._memory is not None:
+            origin = np.where(flow.valid[:, None], flow.xy, xy)
+            before = nearby_mean(state.previous.keypoints.xy, state.previous.z, self._memory, origin, frame.z)
+        carried = np.exp(-dt / MEAN_S)
+        mean = (1 - carried) * residual + carried * before[:, 1:]
+        failed |= tested & (np.linalg.norm(mean, axis=1) > 1)
         failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
-        carried = np.exp((state.previous.timestamp - frame.timestamp) / MEMORY_S)
-        failures = failed.astype(np.float64)
-        if self._failures is not None:
-            failures[flow.valid] += carried * self._failures[cell_index(flow.xy[flow.valid], CELL // 2, shape)[0]]
-        cell, grid = cell_index(xy, CELL // 2, shape)
-        total, count = (neighbourhood_sum(v, cell, grid, (3, 3)) for v in (failures, np.ones(len(xy))))
-        self._failures = total / np.maximum(count, 1)
+        failures = failed + np.exp(-dt / MEMORY_S) * before[:, 0]
+        self._memory = np.column_stack([failures, mean])
         keep = ~failed & (failures <= MAX_FAILURES)
         return self.verdict(keep, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
 
-    def _fails(self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _fails(
+        self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], Array]:
+        """Which tested points fail in this frame, and their residuals as shares of what slow motion is allowed."""
         assert state.flow is not None and state.previous is not None
         moved, expected = rigid_flow(frame, state, tested)
-        distance = np.linalg.norm(expected - state.camera.undistort_points(state.flow.xy[tested]), axis=1)
-        explained = np.linalg.norm(expected - frame.xy[tested], axis=1)
-        limit_px = self.settings.threshold_px + THRESHOLD_SHARE * explained
+        residual = expected - state.camera.undistort_points(state.flow.xy[tested])
+        distance = np.linalg.norm(residual, axis=1)
+        allowed = THRESHOLD_SHARE * np.linalg.norm(expected - frame.xy[tested], axis=1)
         measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
         limit = self.settings.threshold_sigma * np.sqrt(2) * depth_sigma(moved[:, 2])
         off_depth = (measured > 0) & (np.abs(measured - moved[:, 2]) > limit)
-        return np.asarray(~(distance <= limit_px) | off_depth)
+        failed = ~(distance <= self.settings.threshold_px + allowed) | off_depth
+        return failed, residual / (SLOW_PX + allowed)[:, None]
+
+
+@kernel
+def nearby_mean(xy: Array, z: Array, values: Array, at: Array, at_z: Array) -> Array:
+    """Mean value of the points around each pixel whose depth is similar, so that an object's edge is not averaged away.
+
+    Args:
+        xy: Raw pixels of the points ``[N, 2]``.
+        z: Their depths ``[N]``, metres, 0 missing.
+        values: ``[N, K]``.
+        at: Raw pixels ``[M, 2]``.
+        at_z: Depths there ``[M]``, metres; where 0, points of any depth count.
+
+    Returns:
+        Means ``[M, K]``; 0 where there is no such point.
+    """
+    order = np.argsort(xy[:, 1])
+    rows = xy[order, 1]
+    means = np.zeros((len(at), values.shape[1]))
+    for i in range(len(at)):
+        total, count = means[i], 0
+        for k in range(np.searchsorted(rows, at[i, 1] - NEARBY_PX), len(order)):
+            j = order[k]
+            if rows[k] > at[i, 1] + NEARBY_PX:
+                break
+            similar = at_z[i] <= 0 or abs(z[j] - at_z[i]) <= SIMILAR_DEPTH * at_z[i]
+            if similar and abs(xy[j, 0] - at[i, 0]) <= NEARBY_PX:
+                total += values[j]
+                count += 1
+        if count:
+            total /= count
+    return means
 
 
 def nearest_depth(

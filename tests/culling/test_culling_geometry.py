@@ -118,22 +118,28 @@ def test_what_moved_for_some_frames_stays_culled_after_it_stopped(moving_frames:
     rule = RigidMotionFilter(RigidMotionSettings())
     for _ in range(moving_frames):
         assert not rule.apply(made.frame, made.state).keep[made.moving].any()
-    middle, far = on_rectangle(still, 230, 130, 300, 350), ~on_rectangle(still, 140, 40, 390, 440)
+    middle, far = made.moving & on_rectangle(still, 230, 130, 300, 350), ~on_rectangle(still, 140, 40, 390, 440)
     culled = [~rule.apply(still.frame, still.state).keep for _ in range(150)]
     held = int(held_s * 30)
     assert all(keypoints[middle].all() and not keypoints[far].any() for keypoints in culled[:held])
     assert not culled[-1].any() and (held or not culled[0].any())
 
 
-def far_wall_and_walker(n_static: int, n_moving: int) -> Scene:
-    """A camera at rest, a wall 3 m away, of one depth within the sensor's noise, and a person at 1 m with 1 m/s."""
+def test_slow_steady_motion_fails_after_some_frames_and_noise_does_not() -> None:
+    slow, rule = far_wall_and_walker(250, 300, step_m=0.004), RigidMotionFilter(RigidMotionSettings())  # 2 px a frame
+    first, *_, last = (rule.apply(slow.frame, slow.state).keep for _ in range(20))
+    assert first.all() and not last[slow.moving].any() and last[~slow.moving].mean() > 0.97
+
+
+def far_wall_and_walker(n_static: int, n_moving: int, step_m: float = 0.03) -> Scene:
+    """A camera at rest, a wall 3 m away, of one depth within the sensor's noise, and a person at 1 m."""
     made = scene(np.eye(4), n_static=n_static, n_moving=n_moving, seed=3)
     rng = np.random.default_rng(3)
     z = np.where(made.moving, rng.uniform(0.9, 1.1, len(made.frame)), rng.uniform(2.9, 3.1, len(made.frame)))
     made.frame.z[:] = z
     made.state.previous.depth[:] = 0.0  # the flow alone decides
     before = CAMERA.unproject(made.frame.xy, z)
-    before[made.moving] -= (0.03, 0.0, 0.0)
+    before[made.moving] -= (step_m, 0.0, 0.0)
     made.state.flow.xy[:] = CAMERA.project(before) + rng.normal(0, 0.3, (len(z), 2))
     return made
 
