@@ -232,7 +232,9 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
             origin = np.where(flow.valid[:, None], flow.xy, xy)
             before = nearby_mean(state.previous.keypoints.xy, state.previous.z, self._memory, origin, frame.z)
         carried = np.exp(-dt / MEAN_S)
-        mean = (1 - carried) * residual + carried * before[:, 1:]
+        step = (1 - carried) * residual
+        step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1)  # one frame alone does not exceed the limit
+        mean = step + carried * before[:, 1:]
         failed |= tested & (np.linalg.norm(mean, axis=1) > 1)
         failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
         failures = failed + np.exp(-dt / MEMORY_S) * before[:, 0]

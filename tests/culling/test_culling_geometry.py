@@ -136,7 +136,7 @@ def far_wall_and_walker(n_static: int, n_moving: int, step_m: float = 0.03) -> S
     made = scene(np.eye(4), n_static=n_static, n_moving=n_moving, seed=3)
     rng = np.random.default_rng(3)
     z = np.where(made.moving, rng.uniform(0.9, 1.1, len(made.frame)), rng.uniform(2.9, 3.1, len(made.frame)))
-    made.frame.z[:] = z
+    made.frame.z[:] = made.state.previous.z[:] = z
     made.state.previous.depth[:] = 0.0  # the flow alone decides
     before = CAMERA.unproject(made.frame.xy, z)
     before[made.moving] -= (step_m, 0.0, 0.0)
