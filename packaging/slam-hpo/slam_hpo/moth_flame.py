@@ -1,0 +1,1 @@
+../../../dynslam_bench/flow/moth_flame.py

@@ -1,0 +1,100 @@
+"""The benchmark as a problem of OptunaHub: minimise the error, over the default's, on the sequences of a split."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+import optuna
+import optunahub
+from numpy.typing import NDArray
+from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
+
+from slam_hpo.real import run
+from slam_hpo.spaces import FRAMES, SEQUENCES, SPLITS, STARTS, defaults
+from slam_hpo.table import METRICS, SlamHpoError, load, natural
+
+Source = Literal["surrogate", "run"]
+MIN_COVERAGE = 0.95
+
+
+class Problem(optunahub.benchmarks.BaseProblem):
+    """Settings of a SLAM system; values are mean log ratios to the default configuration, so that 0 is the default.
+
+    Args:
+        system: ``mask-rcnn`` or ``emfoa-oft?masks=none``.
+        split: ``tune`` or ``test``.
+        frames: Frames of a run: 20, 40 or 60.
+        metrics: ``ate_m``, ``processor_s``, or both.
+        source: ``surrogate``, or ``run`` for real runs, which need dynslam-bench.
+        noise: Add noise of the size that two starts of a run differ by, drawn anew at each evaluation.
+        seed: Of the noise.
+
+    Raises:
+        SlamHpoError: The system, the split or a metric is unknown.
+    """
+
+    def __init__(
+        self,
+        system: str = "mask-rcnn",
+        *,
+        split: str = "tune",
+        frames: int = 60,
+        metrics: Sequence[str] = ("ate_m",),
+        source: Source = "surrogate",
+        noise: bool = False,
+        seed: int | None = None,
+    ) -> None:
+        if frames not in FRAMES:
+            raise SlamHpoError(f"frames {frames} is not in the benchmark, which has {', '.join(map(str, FRAMES))}")
+        if split not in SPLITS:
+            raise SlamHpoError(f"no split {split!r}; there are {', '.join(SPLITS)}")
+        unknown = [name for name in metrics if name not in ("ate_m", "processor_s")]
+        if unknown:
+            raise SlamHpoError(f"no metric {unknown[0]!r}; there are ate_m, processor_s")
+        self._bench, self._split, self._frames, self._source = load(system), split, frames, source
+        self.metric_names = [*metrics]
+        self._noise = self._bench.noise(frames) / np.sqrt(len(SPLITS[split]) * len(STARTS)) if noise else 0.0
+        self.reseed(seed)
+        self._default = self._measured(defaults(system))
+
+    def reseed(self, seed: int | None = None) -> None:
+        """Draw the noise from another stream."""
+        self._rng = np.random.default_rng(seed)
+
+    @property
+    def search_space(self) -> dict[str, BaseDistribution]:
+        """The settings' ranges."""
+        return {
+            name: IntDistribution(int(setting.low), int(setting.high), log=setting.log)
+            if setting.whole
+            else FloatDistribution(setting.low, setting.high, log=setting.log)
+            for name, setting in self._bench.space.items()
+        }
+
+    @property
+    def directions(self) -> list[optuna.study.StudyDirection]:
+        """Every metric is minimised."""
+        return [optuna.study.StudyDirection.MINIMIZE] * len(self.metric_names)
+
+    def evaluate(self, params: dict[str, Any]) -> float | Sequence[float]:
+        """Mean over sequences and starts of the log ratio to the default, one for each metric."""
+        ratios = np.log(self._measured(params) / self._default).mean(axis=0)
+        columns = [METRICS.index(name) for name in self.metric_names]
+        values = [float(ratios[column] + self._noise * self._rng.standard_normal()) for column in columns]
+        return values[0] if len(values) == 1 else values
+
+    def evaluate_constraints(self, params: dict[str, Any]) -> dict[str, float]:
+        """How much of the frames is missing to 95 % coverage."""
+        return {"coverage": MIN_COVERAGE - float(self._measured(params)[:, 1].mean())}
+
+    def _measured(self, params: dict[str, Any]) -> NDArray[np.float64]:
+        """ATE, coverage and processor time of every instance, ``[instances, 3]``."""
+        if self._source == "run":
+            instances = [(sequence, start) for sequence in SPLITS[self._split] for start in STARTS]
+            runs = [run(self._bench.system, params, *instance, frames=self._frames) for instance in instances]
+            return np.array([one[:3] for one in runs])
+        sequences = [SEQUENCES.index(sequence) for sequence in SPLITS[self._split]]
+        mean, _ = self._bench.surrogate.predict(self._bench.units(params)[None])
+        return natural(mean[0, sequences, :, FRAMES.index(self._frames)].reshape(-1, 3))

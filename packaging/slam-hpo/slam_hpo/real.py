@@ -1,0 +1,55 @@
+"""Real runs with the interface of the table; they need dynslam-bench."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from slam_hpo.spaces import STRIDE
+from slam_hpo.table import Evaluation
+
+if TYPE_CHECKING:
+    from dynslam_bench.runs import RunRecord, RunStore
+
+PROTOCOL = "tum-rgbd/v1"
+
+
+def run(
+    system: str,
+    settings: Mapping[str, Any],
+    sequence: str,
+    start: int = 0,
+    *,
+    frames: int = 60,
+    results: str | Path = "results",
+) -> Evaluation:
+    """Run a system; a run that is stored in `results` is not made again. Arguments as for `Benchmark.measured`."""
+    import dynslam_bench as db
+
+    window = (start, start + STRIDE * frames)
+    made = db.run(system, sequence, settings=settings, frames=window, stride=STRIDE, cache=True, results=results)
+    return evaluated(made.store, made.record, frames)
+
+
+def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
+    """The first frames of a stored run; without a tracked frame it has the error of a camera that does not move."""
+    from dynslam_bench.contracts import Trajectory
+    from dynslam_bench.evaluation import evaluate
+    from dynslam_bench.runs import load_frames
+    from dynslam_bench.tuning.objectives import held_protocol
+
+    part = load_frames(record, store).head(frames)
+    stamps, truth = part["timestamp"].to_numpy(), store.ground_truth(record.sequence.part)
+    estimate, tracked = store.trajectory(record.run_id), int((part["state"] == "ok").sum())
+    assert truth is not None  # every sequence is rendered
+    if estimate is not None and tracked > 1:
+        begun = Trajectory(estimate.timestamps[:tracked], estimate.T_world_cam[:tracked])
+        error = evaluate(begun, truth, held_protocol(PROTOCOL), input_timestamps=stamps).metrics["ate_rmse_m"]
+    else:
+        positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+        error = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
+    processor = float(part["processor_s"].iloc[2:].mean())  # the first two load networks and kernels
+    return Evaluation(error, tracked / len(part), processor, record.status)

@@ -1,0 +1,211 @@
+"""The measured runs of a system, and the surrogate between them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from functools import cached_property, lru_cache
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from slam_hpo.spaces import FRAMES, SEQUENCES, SPACES, STARTS, Value, defaults
+
+METRICS = ("ate_m", "coverage", "processor_s")
+KNOWN = (("sequence", SEQUENCES), ("start", STARTS), ("frames", FRAMES))
+
+
+class SlamHpoError(ValueError):
+    """What was asked for is not in the benchmark."""
+
+
+class Evaluation(NamedTuple):
+    """What a configuration has on an instance.
+
+    Attributes:
+        ate_m: Online ATE RMSE in metres after rigid alignment; lost frames are held at the last pose.
+        coverage: Share of the frames that were tracked.
+        processor_s: Mean processor seconds a frame; varies with the machine's load by a quarter.
+        status: How the run ended: ``ok``, ``lost``, ``crashed``, ``timeout``, ``out-of-memory``.
+        log_ate_std: Standard deviation of log ATE as the surrogate knows it; 0 where it was measured.
+    """
+
+    ate_m: float
+    coverage: float
+    processor_s: float
+    status: str = "ok"
+    log_ate_std: float = 0.0
+
+
+class Benchmark:
+    """A system's table: every configuration on all sequences, starts and numbers of frames.
+
+    Attributes:
+        system: Tracker of dynslam-bench.
+        space: Its settings.
+        configurations: One row a configuration, the default first.
+        values: float64 ``[configurations, sequences, starts, fidelities, 3]``, see `METRICS`.
+        status: object, likewise without the last axis.
+    """
+
+    def __init__(self, system: str, rows: pd.DataFrame) -> None:
+        self.system, self.space = system, SPACES[system]
+        names = [*self.space]
+        keys = rows[names].round(6)
+        unique = keys.drop_duplicates()
+        first = (unique == pd.Series(defaults(system))).all(axis=1)
+        self.configurations = pd.concat([unique[first], unique[~first]], ignore_index=True)
+        self._index = {row: index for index, row in enumerate(self.configurations.itertuples(index=False, name=None))}
+        at = [
+            np.array([self._index[row] for row in keys.itertuples(index=False, name=None)]),
+            *(pd.Categorical(rows[column], categories=known).codes for column, known in KNOWN),
+        ]
+        shape = (len(unique), len(SEQUENCES), len(STARTS), len(FRAMES))
+        self.values = np.full((*shape, len(METRICS)), np.nan)
+        self.values[tuple(at)] = rows[[*METRICS]]
+        self.status = np.full(shape, "", dtype=object)
+        self.status[tuple(at)] = rows["status"]
+
+    def configuration(self, index: int) -> dict[str, Value]:
+        """A measured configuration."""
+        row = self.configurations.iloc[index]
+        return {name: (int if self.space[name].whole else float)(row[name]) for name in self.space}
+
+    def units(self, settings: Mapping[str, Any]) -> NDArray[np.float64]:
+        """A configuration as a point of the unit cube, settings in the order of `space`.
+
+        Raises:
+            SlamHpoError: A setting is missing, unknown or out of its range.
+        """
+        if settings.keys() != self.space.keys():
+            wrong = ", ".join(sorted(settings.keys() ^ self.space.keys()))
+            raise SlamHpoError(f"{self.system} has the settings {', '.join(self.space)}; missing or unknown: {wrong}")
+        for name, value in settings.items():
+            low, high = self.space[name][:2]
+            if not low <= value <= high:
+                raise SlamHpoError(f"{name} = {value} is outside {low} to {high}")
+        return np.array([setting.unit(settings[name]) for name, setting in self.space.items()])
+
+    def measured(self, settings: Mapping[str, Any], sequence: str, *, start: int = 0, frames: int = 60) -> Evaluation:
+        """What a run of the table has.
+
+        Args:
+            settings: Every setting, by dotted name.
+            sequence: One of `SEQUENCES`.
+            start: One of `STARTS`.
+            frames: One of `FRAMES`.
+
+        Raises:
+            SlamHpoError: It is not in the table; the message names the nearest configuration.
+        """
+        where = _place(sequence, start, frames)
+        unit = self.units(settings)
+        index = self._index.get(tuple(round(settings[name], 6) for name in self.space))
+        if index is None:
+            nearest = int(np.abs(self._units - unit).sum(axis=1).argmin())
+            raise SlamHpoError(
+                f"no run has these settings; the nearest is configuration({nearest}), or use `predicted`"
+            )
+        ate, coverage, processor = self.values[(index, *where)].tolist()
+        return Evaluation(ate, coverage, processor, self.status[(index, *where)])
+
+    def predicted(self, settings: Mapping[str, Any], sequence: str, *, start: int = 0, frames: int = 60) -> Evaluation:
+        """What the surrogate expects of any configuration; arguments as for `measured`.
+
+        Raises:
+            SlamHpoError: A setting, sequence, start or number of frames is not of the benchmark.
+        """
+        where = _place(sequence, start, frames)
+        mean, std = (part[(0, *where)] for part in self.surrogate.predict(self.units(settings)[None]))
+        ate, coverage, processor = natural(mean).tolist()
+        return Evaluation(ate, coverage, processor, log_ate_std=float(std[0]))
+
+    def noise(self, frames: int = 60) -> float:
+        """Standard deviation of log ATE between starts, on the same sequence with the same settings."""
+        log_ate = np.log(self.values[:, :, :, FRAMES.index(frames), 0])
+        between = log_ate[:, :, 0] - log_ate[:, :, 1]
+        return float(np.sqrt(np.mean((between - between.mean(axis=0)) ** 2) / 2))
+
+    @cached_property
+    def _units(self) -> NDArray[np.float64]:
+        return np.stack([self.space[name].unit(self.configurations[name]) for name in self.space], axis=1)
+
+    @cached_property
+    def surrogate(self) -> Surrogate:
+        """Fitted on first use, in some seconds."""
+        return Surrogate(self._units, self.values)
+
+    def hpob(self) -> dict[str, Any]:
+        """The table in HPO-B's form: ``{system: {instance: {"X": [[...]], "y": [[...]]}}}``; y is ATE in metres."""
+        points = self._units.tolist()
+        return {
+            self.system: {
+                f"{sequence}, start {start}": {"X": points, "y": self.values[:, s, k, -1, :1].tolist()}
+                for s, sequence in enumerate(SEQUENCES)
+                for k, start in enumerate(STARTS)
+            }
+        }
+
+
+class Surrogate:
+    """A Gaussian process for every instance: Matern-5/2 kernel, one length a setting, shared by all instances.
+
+    Args:
+        units: float64 ``[N, D]``, configurations in the unit cube.
+        values: See `Benchmark.values`.
+    """
+
+    def __init__(self, units: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+        from sklearn.exceptions import ConvergenceWarning
+        from sklearn.gaussian_process import GaussianProcessRegressor
+        from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
+        self._shape = values.shape[1:]
+        targets = transformed(values).reshape(len(values), -1)
+        lengths = [1.0] * units.shape[1]
+        kernel = ConstantKernel() * Matern(lengths, (0.05, 50.0), nu=2.5) + WhiteKernel(0.2, (1e-3, 2.0))
+        self.process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0)
+        with warnings.catch_warnings():  # a setting without effect has the longest length
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            self.process.fit(units, targets)
+
+    def predict(self, units: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Means and standard deviations ``[N, sequences, starts, fidelities, 3]``, see `transformed`."""
+        mean, std = self.process.predict(units, return_std=True)
+        return mean.reshape(len(units), *self._shape), std.reshape(len(units), *self._shape)
+
+
+def transformed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Metrics as the surrogate has them: logarithms of error and time."""
+    found = values.copy()
+    found[..., [0, 2]] = np.log(found[..., [0, 2]])
+    return found
+
+
+def natural(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse of `transformed`; coverage is clipped to its range."""
+    ate, coverage, processor = np.moveaxis(values, -1, 0)
+    return np.stack([np.exp(ate), np.clip(coverage, 0, 1), np.exp(processor)], axis=-1)
+
+
+def _place(sequence: str, start: int, frames: int) -> tuple[int, int, int]:
+    for (name, known), value in zip(KNOWN, (sequence, start, frames), strict=True):
+        if value not in known:
+            raise SlamHpoError(f"{name} {value!r} is not in the benchmark, which has {', '.join(map(str, known))}")
+    return SEQUENCES.index(sequence), STARTS.index(start), FRAMES.index(frames)
+
+
+@lru_cache
+def load(system: str) -> Benchmark:
+    """The benchmark of a system.
+
+    Raises:
+        SlamHpoError: There is none.
+    """
+    if system not in SPACES:
+        raise SlamHpoError(f"no system {system!r}; there are {', '.join(SPACES)}")
+    with files("slam_hpo").joinpath("data", f"{system.partition('?')[0]}.parquet").open("rb") as file:
+        return Benchmark(system, pd.read_parquet(file))

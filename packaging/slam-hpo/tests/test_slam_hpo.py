@@ -1,0 +1,160 @@
+"""The table, its surrogate, and its interfaces to OptunaHub and CARP-S."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+import slam_hpo
+from optuna.testing.pytest_samplers import BasicSamplerTestCase, RelativeSamplerTestCase, SingleOnlySamplerTestCase
+from slam_hpo.moth_flame_sampler import MothFlameSampler
+from slam_hpo.problem import Problem
+
+optuna.logging.set_verbosity(optuna.logging.WARNING)
+XYZ = slam_hpo.SEQUENCES[0]
+
+
+@pytest.fixture(params=slam_hpo.SPACES)
+def bench(request):
+    return slam_hpo.load(request.param)
+
+
+def test_every_run_is_there_and_the_default_is_first(bench):
+    assert np.isfinite(bench.values).all() and (bench.status != "").all()
+    assert bench.configuration(0) == slam_hpo.defaults(bench.system)
+    assert len(bench.configurations) == len(bench.configurations.drop_duplicates())
+    ate, coverage, processor = np.moveaxis(bench.values, -1, 0)
+    assert (ate > 0).all() and (coverage >= 0).all() and (coverage <= 1).all() and (processor > 0).all()
+
+
+def test_a_measured_configuration_is_found(bench):
+    last = len(bench.configurations) - 1
+    found = bench.measured(bench.configuration(last), slam_hpo.SEQUENCES[3], start=4, frames=40)
+    assert found[:3] == tuple(bench.values[last, 3, 1, 1]) and found.log_ate_std == 0
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"features.n_features": 301}, "no run has these settings; the nearest is configuration("),
+        ({"features.n_features": 30}, "features.n_features = 30 is outside 300 to 3000"),
+        ({"flow.wrong": 1}, "missing or unknown: flow.wrong"),
+    ],
+)
+def test_a_wrong_configuration_is_refused(bench, change, message):
+    with pytest.raises(slam_hpo.SlamHpoError) as refused:
+        bench.measured(bench.configuration(0) | change, XYZ)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("where", [{"sequence": "kitti/00"}, {"start": 1}, {"frames": 61}])
+def test_a_wrong_instance_is_refused_with_those_that_there_are(bench, where):
+    name, value = next(iter(where.items()))
+    with pytest.raises(slam_hpo.SlamHpoError, match=f"{name} {value!r} is not in the benchmark, which has"):
+        bench.predicted(bench.configuration(0), **({"sequence": XYZ} | where))
+    with pytest.raises(slam_hpo.SlamHpoError, match="no system 'orb'; there are mask-rcnn"):
+        slam_hpo.load("orb")
+
+
+def test_the_surrogate_is_close_to_what_was_measured_and_says_how_sure_it_is(bench):
+    measured = np.log(bench.values[:, :, :, -1, 0])
+    units = np.stack([bench.units(bench.configuration(index)) for index in range(len(measured))])
+    mean, std = (part[:, :, :, -1, 0] for part in bench.surrogate.predict(units))
+    assert np.sqrt(np.mean((mean - measured) ** 2)) < measured.std()
+    assert (std > 0).all()
+    corner = bench.predicted({name: setting.high for name, setting in bench.space.items()}, XYZ)
+    assert corner.log_ate_std > std[:, 0, 0].mean()
+
+
+def test_the_form_of_hpo_b(bench):
+    data = json.loads(json.dumps(bench.hpob()))[bench.system]
+    assert len(data) == len(slam_hpo.SEQUENCES) * len(slam_hpo.STARTS)
+    one = data[f"{XYZ}, start 0"]
+    assert len(one["X"]) == len(one["y"]) and one["y"][0] == [bench.values[0, 0, 0, -1, 0]]
+
+
+def test_optuna_minimises_the_problem(bench):
+    problem = Problem(bench.system)
+    assert problem.evaluate(slam_hpo.defaults(bench.system)) == 0
+    study = optuna.create_study(directions=problem.directions, sampler=optuna.samplers.RandomSampler(seed=0))
+    study.optimize(problem, n_trials=20)
+    assert all(trial.constraints["coverage"] <= 0.95 for trial in study.trials)
+    assert study.best_value == problem.evaluate(study.best_params)
+
+
+def test_noise_is_drawn_from_its_seed_and_two_metrics_are_two_values():
+    noisy, params = Problem(noise=True, seed=3), slam_hpo.defaults("mask-rcnn")
+    first = [noisy.evaluate(params) for _ in range(3)]
+    noisy.reseed(3)
+    assert first == [noisy.evaluate(params) for _ in range(3)] and len(set(first)) == 3
+    both = Problem(metrics=("ate_m", "processor_s"))
+    assert len(both.evaluate(params)) == len(both.directions) == 2 and both.metric_names == ["ate_m", "processor_s"]
+
+
+@pytest.mark.parametrize("wrong", [{"split": "train"}, {"metrics": ("rpe",)}, {"frames": 61}])
+def test_a_wrong_problem_is_refused(wrong):
+    with pytest.raises(slam_hpo.SlamHpoError, match=r"there are|which has"):
+        Problem(**wrong)
+
+
+def test_carps(bench):
+    trials = pytest.importorskip("carps.utils.trials")
+    from slam_hpo.carps import SlamHpo
+
+    objective = SlamHpo(bench.system)
+    config = objective.configspace.get_default_configuration()
+    found = objective.evaluate(trials.TrialInfo(config=config, instance=2, seed=1, budget=20))
+    expected = bench.predicted(dict(config), slam_hpo.SEQUENCES[2], start=4, frames=20)
+    assert found.cost == expected.ate_m and found.status == trials.StatusType.SUCCESS
+    with pytest.raises(slam_hpo.SlamHpoError, match="instance 99 is not in the benchmark"):
+        objective.evaluate(trials.TrialInfo(config=config, instance=99))
+
+
+def test_neither_torch_nor_opencv_is_imported():
+    code = "import slam_hpo, slam_hpo.problem, sys; print({'torch', 'cv2'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+class TestMothFlameSampler(BasicSamplerTestCase, RelativeSamplerTestCase, SingleOnlySamplerTestCase):
+    """Optuna's own tests of samplers."""
+
+    @pytest.fixture(params=[True, False])
+    def sampler(self, request):
+        return lambda: MothFlameSampler(elite=request.param)
+
+
+@pytest.mark.parametrize("elite", [True, False])
+def test_moths_find_a_bowl_where_random_draws_do_not(elite):
+    def bowl(trial):
+        return sum((trial.suggest_float(name, -5, 5) - 1) ** 2 for name in "abcd")
+
+    def best(sampler):
+        study = optuna.create_study(sampler=sampler)
+        study.optimize(bowl, n_trials=100)
+        return study.best_value
+
+    moths = np.median([best(MothFlameSampler(elite=elite, seed=seed)) for seed in range(5)])
+    assert moths < np.median([best(optuna.samplers.RandomSampler(seed=seed)) for seed in range(5)]) / 2
+
+
+def test_a_seed_gives_the_same_trials():
+    def values(seed):
+        study = optuna.create_study(sampler=MothFlameSampler(seed=seed, n_trials=30))
+        study.optimize(lambda trial: trial.suggest_float("x", 0, 1) + trial.suggest_int("n", 1, 9), n_trials=30)
+        return [trial.value for trial in study.trials]
+
+    assert values(1) == values(1) != values(2)
+
+
+def test_optunahub_loads_both_packages():
+    import optunahub
+
+    registry = Path(__file__).parents[2] / "optunahub" / "package"
+    problem = optunahub.load_local_module("benchmarks/slam_hpo", registry_root=str(registry)).Problem("mask-rcnn")
+    sampler = optunahub.load_local_module("samplers/moth_flame", registry_root=str(registry)).MothFlameSampler(seed=0)
+    study = optuna.create_study(directions=problem.directions, sampler=sampler)
+    study.optimize(problem, n_trials=10)
+    assert np.isfinite(study.best_value)
