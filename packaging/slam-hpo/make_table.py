@@ -52,7 +52,8 @@ def table(system: str, *folders: str) -> str:
                 same |= {"sequence": sequence, "start": record.offset}
                 found += [same | {"frames": length} | evaluated(store, record, length)._asdict() for length in FRAMES]
     data = pd.DataFrame(found).drop(columns="log_ate_std").astype({"sequence": "category", "status": "category"})
-    data = data.sort_values([*SPACES[system], "sequence", "start", "frames"], ignore_index=True)
+    key = [*SPACES[system], "sequence", "start", "frames"]
+    data = data.drop_duplicates(key).sort_values(key, ignore_index=True)  # the default may be there several times
     data = data.astype({name: "float32" for name in ("ate_m", "coverage", "processor_s")})
     data.to_parquet(DATA / f"{system.partition('?')[0]}.parquet", compression="zstd", index=False)
     return f"{len(data)} rows\n"
