@@ -14,6 +14,7 @@ from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
 
 MIN_POINTS = 12
 NEAR_M = 0.05
@@ -259,7 +260,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
 
 
 @kernel
-def nearby_mean(xy: Array, z: Array, values: Array, at: Array, at_z: Array) -> Array:
+def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) -> Array:
     """Mean value of the points around each pixel whose depth is similar, so that an object's edge is not averaged away.
 
     Args:
