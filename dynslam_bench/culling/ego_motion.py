@@ -33,8 +33,8 @@ CORRELATION = 100.0
 
 THRESHOLD_SHARE = 0.05
 """Added to the pixel threshold, as a share of the flow that the camera's motion explains (rolling shutter)."""
-SLOW_PX, MEAN_S = 1.2, 0.1
-"""Threshold of the mean residual, which finds slow steady motion, and the mean's time constant."""
+MEAN_S = 0.07
+"""Time constant of the mean residual, which finds slow steady motion."""
 MEMORY_S = 1.65
 """Time constant with which the count of a point's failures decays."""
 NEARBY_PX, SIMILAR_DEPTH = 24.0, 0.1
@@ -217,7 +217,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget the previous sequence."""
-        self._memory: Array | None = None
+        self._memory: Array | None = None  # [N, 3] of the previous points: failures, mean residual over its limit
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the points that have flow and depth."""
@@ -227,14 +227,16 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
             return self.verdict(np.ones(len(xy), dtype=bool))
         tested = flow.valid & (frame.z > 0)
         failed, residual = np.zeros(len(xy), dtype=bool), np.zeros((len(xy), 2))
-        failed[tested], residual[tested] = self._fails(frame, state, tested)
+        failed[tested], residual[tested], allowed = self._fails(frame, state, tested)
         before, dt = np.zeros((len(xy), 3)), frame.timestamp - state.previous.timestamp
         if self._memory is not None:
             origin = np.where(flow.valid[:, None], flow.xy, xy)
             before = nearby_mean(state.previous.keypoints.xy, state.previous.z, self._memory, origin, frame.z)
         carried = np.exp(-dt / MEAN_S)
+        noise = np.sqrt((1 - carried) / (1 + carried))  # of the mean, as a share of one residual's
         step = (1 - carried) * residual
-        step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1)  # one frame alone does not exceed the limit
+        step[tested] /= (noise * self.settings.threshold_px + allowed)[:, None]
+        step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1)  # after one bad frame the mean passes
         mean = step + carried * before[:, 1:]
         failed |= tested & (np.linalg.norm(mean, axis=1) > 1)
         failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
@@ -245,8 +247,8 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
 
     def _fails(
         self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.bool_], Array]:
-        """Which tested points fail in this frame, and their residuals as shares of what slow motion is allowed."""
+    ) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which of K tested points fail now, residuals ``[K, 2]`` and what is added to a threshold ``[K]``, pixels."""
         assert state.flow is not None and state.previous is not None
         moved, expected = rigid_flow(frame, state, tested)
         residual = expected - state.camera.undistort_points(state.flow.xy[tested])
@@ -255,8 +257,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
         limit = self.settings.threshold_sigma * np.sqrt(2) * depth_sigma(moved[:, 2])
         off_depth = (measured > 0) & (np.abs(measured - moved[:, 2]) > limit)
-        failed = ~(distance <= self.settings.threshold_px + allowed) | off_depth
-        return failed, residual / (SLOW_PX + allowed)[:, None]
+        return ~(distance <= self.settings.threshold_px + allowed) | off_depth, residual, allowed
 
 
 @kernel

@@ -32,12 +32,12 @@ def cell_mean(
     return np.where(count > 0, total / np.maximum(count, 1), empty)
 
 
-def neighbourhood_sum(
-    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int], size: tuple[int, int]
+def _neighbourhood_sum(
+    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Sum of values ``[N]`` in the cells around each cell of a grid; `size` in cells, odd; cells as in `cell_index`."""
+    """Sum of values ``[N]`` in the neighbourhood of each cell of a grid; cells as in `cell_index`."""
     total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1]).reshape(grid)
-    summed = cv2.boxFilter(total, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    summed = cv2.boxFilter(total, -1, NEIGHBOURHOOD, normalize=False, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(summed, dtype=np.float64).ravel()
 
 
@@ -63,7 +63,5 @@ def failing_regions(
     if share <= 0 or not failing.any():
         return failing
     index, grid = cell_index(xy, CELL, size)
-    failures, tests = (
-        neighbourhood_sum(flags, index, grid, NEIGHBOURHOOD)[index] for flags in (failing & tested, tested)
-    )
+    failures, tests = (_neighbourhood_sum(flags, index, grid)[index] for flags in (failing & tested, tested))
     return np.asarray(failing & (failures >= MIN_FAILING) & (failures >= share * tests))
