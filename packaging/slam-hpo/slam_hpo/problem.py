@@ -28,7 +28,7 @@ class Problem(optunahub.benchmarks.BaseProblem):
         frames: Frames of a run: 20, 40 or 60.
         metrics: ``ate_m``, ``processor_s``, or both.
         source: ``surrogate``, or ``run`` for real runs, which need dynslam-bench.
-        noise: Add noise of the size that two starts of a run differ by, drawn anew at each evaluation.
+        noise: Add noise of the size that two starts of a run differ by, drawn again at each evaluation.
         seed: Of the noise.
 
     Raises:
