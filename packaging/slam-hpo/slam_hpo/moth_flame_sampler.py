@@ -21,7 +21,7 @@ CAUCHY_SHARE = 0.05
 class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
     """Trial n is the flight of moth n mod N around its flame, which is one of the best finished trials.
 
-    The first population is drawn uniformly; of EMFOA, its second half are elite opposites of the first (Eq. 19-22).
+    The first population is drawn uniformly; of EMFOA, its second half are opposites of the first (Eq. 19-22).
     Then a moth flies a logarithmic spiral from its last position around its flame (Eq. 8-10); of EMFOA with a Cauchy
     step in the first half of the budget (Eq. 13-16), and the pull of the best flame in the second (Eq. 17-18). The
     number of flames falls over the budget (Eq. 11). Moths move in the unit cube. Pruned trials are worse than complete.
@@ -85,9 +85,11 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
 
     def _first_population(self, members: NDArray[np.float64]) -> NDArray[np.float64]:
         unit = self._rng.random(members.shape[1])
-        if self._rules.opposition and len(members) >= self._population // 2:
-            low, high = members.min(axis=0), members.max(axis=0)  # dynamic bounds, Eq. 20
-            unit = opposites(members[0], low, high, low, high, self._rng.random)
+        half = self._population // 2
+        if self._rules.opposition and len(members) >= half:
+            drawn = members[:half]
+            least, greatest = drawn.min(axis=0), drawn.max(axis=0)  # dynamic bounds, Eq. 20
+            unit = opposites(members[len(members) - half], least, greatest, 0.0, 1.0, self._rng.random)
         return np.asarray(unit)
 
 
