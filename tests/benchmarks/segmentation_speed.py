@@ -1,6 +1,6 @@
 """Time of every segmenter on one 640x480 frame, and of carrying masks; prints a Markdown table.
 
-Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--threads 2] [--repeats 7]``. Wall times are
+Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--threads 2] [--repeats 7] [--device cuda:0]``. Wall times are
 medians; user CPU time stands beside them, because wall times of a busy machine mean little.
 """
 
@@ -44,18 +44,18 @@ def measure(work: Callable[[], object], repeats: int) -> tuple[float, float]:
     return statistics.median(wall), statistics.median(cpu)
 
 
-def untrained(config: NetworkConfig, side: int, threads: int, objects: int) -> MaskRCNNSegmenter:
+def untrained(config: NetworkConfig, side: int, threads: int, objects: int, device: str) -> MaskRCNNSegmenter:
     """A network with random weights that gives `objects` detections, so that the mask branch has its usual work."""
     torch.manual_seed(0)
     network = MaskRCNN(config.model_copy(update={"max_detections": objects, "classes": ("person",) * 90}))
     network.roi_heads.config = network.config
     network.set_input(side)
-    return MaskRCNNSegmenter(network, SegmentationSettings(), threads=threads, floor=0.0)
+    return MaskRCNNSegmenter(network, SegmentationSettings(), device=device, threads=threads, floor=0.0)
 
 
 def main() -> None:
     """Print the table."""
-    parser = parser_of(None, threads=2, repeats=7, objects=3)
+    parser = parser_of(None, threads=2, repeats=7, objects=3, device="cpu")
     arguments = parser.parse_args()
     cv2.setNumThreads(arguments.threads)
     sequence = open_sequence("synthetic/walking_xyz?scene=120&frames=60")
@@ -68,14 +68,16 @@ def main() -> None:
         rows.append((label, lambda: segmenter.segment(frame)))  # type: ignore[attr-defined]
 
     for side in (480, 800):
-        network = untrained(NetworkConfig(), side, arguments.threads, arguments.objects)
+        network = untrained(NetworkConfig(), side, arguments.threads, arguments.objects, arguments.device)
         add(f"Mask R-CNN, ResNet-50, CFPN, shorter side {side}", network)
-    network = untrained(RESNET18, 480, arguments.threads, arguments.objects)
+    network = untrained(RESNET18, 480, arguments.threads, arguments.objects, arguments.device)
     add("Mask R-CNN, ResNet-18, CFPN, shorter side 480", network)
     if embedded_weights() is not None:
         add(
             "embedded (half-width ResNet-18, CFPN, 320x240)",
-            build_segmenter(SegmentationSettings(source="embedded"), threads=arguments.threads),
+            build_segmenter(
+                SegmentationSettings(source="embedded"), device=arguments.device, threads=arguments.threads
+            ),
         )
     for name in ("yolov8n-seg_480x640_fp32", "deeplabv3_mnv2_voc_481x641"):
         if (WEIGHTS / f"{name}.onnx").is_file():
