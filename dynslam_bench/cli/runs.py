@@ -130,7 +130,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Show everything about a run."""
-    store = stored.RunStore(results)
+    store = stored.open_store(results)
     record = store.read(run)
     metrics = store.score(record, protocol)
     lines = [fields(run_facts(store, record))]

@@ -35,6 +35,7 @@ from dynslam_bench.runs import (
     RunEvent,
     RunSpec,
     RunStore,
+    export_run,
     import_trajectory,
     merge,
     open_store,
@@ -573,6 +574,10 @@ def test_a_shard_is_merged_and_read_as_one_file(suite: Path, tmp_path: Path) -> 
     assert len(load_frame(files)) == 5
     with pytest.raises(RunError, match=r"shard1.tgz is an archive.*-o"):
         report(files)
+    one = parts[0].ids()[0]
+    with pytest.raises(RunError, match=r"shard1.tgz is an archive.*-o"):
+        export_run(one, "tum", results=files[0])
+    assert (export_run(one, "tum", tmp_path / "tum", results=files[0]).folder / "provenance.json").is_file()
     contradicted = files[1].rename(tmp_path / "other.zip")
     trajectory = target.folder(parts[1].ids()[0]) / "trajectory_online.txt"
     trajectory.write_text("")

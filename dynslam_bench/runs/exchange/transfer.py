@@ -32,7 +32,7 @@ from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo
 from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.runs.store import RunStore, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 from dynslam_bench.sequences.tags import motion_tags
 from dynslam_bench.sequences.view import Part, part_of
@@ -88,7 +88,7 @@ def export_run(
         run: A record, or the run's id, its first digits or ``latest``.
         form: A name of `FORMATS`.
         folder: Where; what it held is replaced. By default ``exports/<run id>/<format>`` of the results folder.
-        results: The results folder, or a store.
+        results: The results folder, an archive of one, or a store.
         which: Which trajectory; by default the final one, else the online one.
         data_root: Folder of the recorded sequences, for formats that need images or the camera (COLMAP, rerun).
         camera: Camera of a folder that does not say its own, likewise.
@@ -100,7 +100,9 @@ def export_run(
     """
     if form not in FORMATS:
         raise RunError(f"there is no format '{form}'", did_you_mean(form, FORMATS))
-    store = results if isinstance(results, RunStore) else RunStore(results)
+    if folder is None and not isinstance(results, RunStore) and Path(results).is_file():
+        raise RunError(f"{results} is an archive, which gets no exports", "name a folder, with -o")
+    store = results if isinstance(results, RunStore) else open_store(results)
     record = store.read(run) if isinstance(run, str) else run
     chosen, trajectory = _trajectory(store, record, which)
     target = store.root / "exports" / record.run_id / form if folder is None else Path(folder).expanduser().absolute()
