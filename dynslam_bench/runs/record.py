@@ -213,7 +213,7 @@ class RunRecord(Record):
     n_lost: int = 0
     n_initialising: int = 0
     n_dropped: int = 0
-    coverage: float | None = 0.0
+    coverage: float | None = Field(default=0.0, ge=0, le=1)
     keyframes: int | None = None
     map_points: int | None = None
     maps: int | None = None

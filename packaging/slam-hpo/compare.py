@@ -1,10 +1,12 @@
-"""Compare samplers on the surrogate: regret after every trial, means over studies with 95 % intervals, as Markdown.
+"""Compare samplers and pruners on the surrogate: regret over the budget, means over studies with 95 % intervals.
 
-    python compare.py SYSTEM
+    python compare.py SYSTEM [CURVES.html]
 
-A study minimises the noisy error on the `tune` sequences. Its regret is the error of the configuration that it has
-found, without noise, over the best that any study found. The last column has the same on the `test` sequences: the
-found configuration's error over the default's, where less than 0 is a gain. Both are geometric means, minus 1.
+prints a Markdown table, and draws the regret over the whole budget if a file is named. A study minimises the noisy
+error on the `tune` sequences with a budget of frames, counted in trials of full length; pruned trials are shorter. Its
+regret is the error of the configuration that it has found, without noise, over the best that any study found. The last
+column has the same on the `test` sequences: the found configuration's error over the default's, where less than 0 is a
+gain. Both are geometric means, minus 1.
 """
 
 import sys
@@ -13,12 +15,15 @@ from collections.abc import Callable
 
 import numpy as np
 import optuna
+from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import BaseSampler, CmaEsSampler, GPSampler, NSGAIISampler, RandomSampler, TPESampler
+from slam_hpo import FRAMES
 from slam_hpo.moth_flame_sampler import MothFlameSampler
 from slam_hpo.problem import Problem
 
 STUDIES, TRIALS = 30, 50
 AT = (10, 25, 50)
+FULL = max(FRAMES)
 SAMPLERS: dict[str, Callable[[int], BaseSampler]] = {
     "random": lambda seed: RandomSampler(seed=seed),
     "TPE": lambda seed: TPESampler(seed=seed),
@@ -28,44 +33,86 @@ SAMPLERS: dict[str, Callable[[int], BaseSampler]] = {
     "moth-flame": lambda seed: MothFlameSampler(elite=False, seed=seed, n_trials=TRIALS),
     "EMFOA": lambda seed: MothFlameSampler(seed=seed, n_trials=TRIALS),
 }
+ARMS: dict[str, tuple[Callable[[int], BaseSampler], BasePruner]] = {
+    **{name: (build, NopPruner()) for name, build in SAMPLERS.items()},
+    "TPE, median pruner": (SAMPLERS["TPE"], MedianPruner()),
+    "TPE, Hyperband": (SAMPLERS["TPE"], HyperbandPruner(min(FRAMES), FULL)),
+}
 
 
-def incumbents(system: str, sampler: BaseSampler, seed: int) -> np.ndarray:
-    """Noise-free values on both splits of the best trial so far, after every trial: ``[trials, 2]``."""
-    noisy, true, test = Problem(system, noise=True, seed=seed), Problem(system), Problem(system, split="test")
-    study = optuna.create_study(sampler=sampler)
-    study.optimize(noisy, n_trials=TRIALS)
-    rows: list[tuple[float, float]] = []
-    best = np.inf
-    for trial in study.trials:
-        if trial.value is not None and trial.value < best:
-            best = trial.value
-            row = (float(true.evaluate(trial.params)), float(test.evaluate(trial.params)))
-        rows.append(row)
-    return np.array(rows)
+def incumbents(system: str, sampler: BaseSampler, pruner: BasePruner, seed: int) -> np.ndarray:
+    """Noise-free values on both splits of the best full trial, by the budget spent so far: ``[TRIALS, 2]``.
+
+    Before the first full trial it is the default configuration, whose values are 0.
+    """
+    rungs = FRAMES[-1:] if isinstance(pruner, NopPruner) else FRAMES
+    noisy = {frames: Problem(system, frames=frames, noise=True, seed=seed) for frames in rungs}
+    true, test = Problem(system), Problem(system, split="test")
+    study = optuna.create_study(sampler=sampler, pruner=pruner)
+    rows, best, spent = np.zeros((TRIALS, 2)), np.inf, 0
+    while spent < TRIALS * FULL:
+        trial = study.ask(true.search_space)
+        start = spent
+        for frames, problem in noisy.items():
+            value, spent = float(problem.evaluate(trial.params)), start + frames
+            trial.report(value, frames)
+            if frames < FULL and trial.should_prune():
+                study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+                break
+        else:
+            study.tell(trial, value)
+            if value < best and spent <= TRIALS * FULL:
+                best = value
+                rows[-(-spent // FULL) - 1 :] = true.evaluate(trial.params), test.evaluate(trial.params)
+    return rows
 
 
-def interval(values: np.ndarray) -> str:
-    """Geometric mean of ratios, given as logarithms, minus 1 with its 95 % bootstrap interval, in percent."""
-    draws = np.random.default_rng(0).choice(values, (2000, len(values))).mean(axis=1)
-    mean, low, high = 100 * np.expm1([values.mean(), *np.percentile(draws, [2.5, 97.5])])
+def mean_interval(values: np.ndarray) -> np.ndarray:
+    """Geometric mean of ratios ``[studies, ...]``, given as logarithms, minus 1 and its 95 % bootstrap interval, %."""
+    draws = values[np.random.default_rng(0).integers(len(values), size=(2000, len(values)))].mean(axis=1)
+    return np.asarray(100 * np.expm1([values.mean(axis=0), *np.percentile(draws, [2.5, 97.5], axis=0)]))
+
+
+def cell(values: np.ndarray) -> str:
+    """The mean and its interval as text."""
+    mean, low, high = mean_interval(values)
     return f"{mean:.1f} [{low:.1f}, {high:.1f}]"
 
 
-def main(system: str) -> None:
+def draw(regret: dict[str, np.ndarray], path: str) -> None:
+    """Draw the mean regret of every arm over the budget, with its interval, as a page."""
+    import plotly.graph_objects as go
+    from plotly.colors import qualitative
+
+    figure, x = go.Figure(), np.arange(1, TRIALS + 1)
+    for colour, (name, values) in zip(qualitative.Safe, regret.items(), strict=False):
+        mean, low, high = mean_interval(values)
+        band = dict(legendgroup=name, line_color=colour, mode="lines")
+        figure.add_scatter(
+            x=[*x, *x[::-1]], y=[*high, *low[::-1]], fill="toself", opacity=0.25, **band, showlegend=False
+        )
+        figure.add_scatter(x=x, y=mean, name=name, **band)
+    figure.update_layout(xaxis_title="budget in full trials", yaxis_title="regret, %", yaxis_type="log")
+    figure.write_html(path)
+
+
+def main(system: str, curves: str | None = None) -> None:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+    warnings.simplefilter("ignore")  # experimental samplers; CMA-ES has no use for the constraint
     found = {
-        name: np.stack([incumbents(system, build(seed), seed) for seed in range(STUDIES)])
-        for name, build in SAMPLERS.items()
+        name: np.stack([incumbents(system, build(seed), pruner, seed) for seed in range(STUDIES)])
+        for name, (build, pruner) in ARMS.items()
     }
     best = min(rows[..., 0].min() for rows in found.values())
+    regret = {name: rows[..., 0] - best for name, rows in found.items()}
     lines = [["sampler", *(f"regret after {after}, %" for after in AT), "test error over the default's, %"]]
     for name, rows in found.items():
-        lines.append([name, *(interval(rows[:, after - 1, 0] - best) for after in AT), interval(rows[:, -1, 1])])
+        lines.append([name, *(cell(regret[name][:, after - 1]) for after in AT), cell(rows[:, -1, 1])])
     lines.insert(1, ["---"] * len(lines[0]))
     sys.stdout.write("".join(f"| {' | '.join(line)} |\n" for line in lines))
+    if curves:
+        draw(regret, curves)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -3,10 +3,11 @@
     python tests/benchmarks/ate_table.py --trackers orb-slam2 'emfoa-oft segmentation.source=oracle' \\
         --sequences ./excerpts/rgbd_bonn_crowd 'synthetic/walking_xyz?scene=100' --offsets 0 3 --cell mean
 
-A tracker may be followed by settings. With one ``--show`` a row is a tracker and a column a sequence; with several a
-row is a tracker on a sequence. A cell holds the values of all runs (one for each start offset and seed), or their mean
-with the standard deviation, or their median with the range. Errors are those of tracked frames unless ``hold`` is
-shown; the least coverage follows in brackets where it is below 95 %. Runs are kept in ``--results`` and made once.
+A tracker may be followed by settings; with ``--scenes`` the runs of all those scenes of a sequence are one cell. With
+one ``--show`` a row is a tracker and a column a sequence; with several a row is a tracker on a sequence. A cell holds
+the values of all runs (one for each start offset and seed), or their mean with the standard deviation, or their
+median with the range. Errors are those of tracked frames unless ``hold`` is shown; the least coverage follows in
+brackets where it is below 95 %. Runs are kept in ``--results`` and made once.
 """
 
 import itertools
@@ -78,6 +79,7 @@ def main() -> None:
     parser = parser_of(
         __doc__, offsets=[0], seeds=[0], stride=1, protocol="tum-rgbd/v1", jobs=1, results="results/tables"
     )
+    parser.add_argument("--scenes", nargs="+", type=int, default=[])
     parser.add_argument("--trackers", nargs="+", required=True, metavar="'TRACKER [NAME=VALUE ...]'")
     parser.add_argument("--sequences", nargs="+", required=True)
     parser.add_argument("--show", nargs="+", default=["ate"], choices=COLUMNS)
@@ -88,8 +90,9 @@ def main() -> None:
     for text, sequence in itertools.product(chosen.trackers, chosen.sequences):
         tracker, *assignments = text.split()
         new = make_specs(
-            tracker, [sequence], settings=parse_assignments(assignments), seeds=chosen.seeds, offsets=chosen.offsets,
-            frames=chosen.frames, stride=chosen.stride,
+            tracker, [f"{sequence}?scene={scene}" for scene in chosen.scenes] or [sequence],
+            settings=parse_assignments(assignments), seeds=chosen.seeds,
+            offsets=chosen.offsets, frames=chosen.frames, stride=chosen.stride,
         )  # fmt: skip
         specs += new
         keys += [(text, sequence)] * len(new)

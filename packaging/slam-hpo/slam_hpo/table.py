@@ -153,6 +153,8 @@ class Benchmark:
 class Surrogate:
     """A Gaussian process for every instance: Matern-5/2 kernel, one length a setting, shared by all instances.
 
+    Standard deviations are scaled per instance and metric so that they fit the leave-one-out residuals.
+
     Args:
         units: float64 ``[N, D]``, configurations in the unit cube.
         values: See `Benchmark.values`.
@@ -171,11 +173,13 @@ class Surrogate:
         with warnings.catch_warnings():  # a setting without effect has the longest length
             warnings.simplefilter("ignore", ConvergenceWarning)
             self.process.fit(units, targets)
+        precision = np.diag(np.linalg.inv(self.process.L_ @ self.process.L_.T))
+        self._calibration = np.sqrt(np.mean(self.process.alpha_**2 / precision[:, None], axis=0))
 
     def predict(self, units: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Means and standard deviations ``[N, sequences, starts, fidelities, 3]``, see `transformed`."""
         mean, std = self.process.predict(units, return_std=True)
-        return mean.reshape(len(units), *self._shape), std.reshape(len(units), *self._shape)
+        return mean.reshape(len(units), *self._shape), (std * self._calibration).reshape(len(units), *self._shape)
 
 
 def transformed(values: NDArray[np.float64]) -> NDArray[np.float64]:
