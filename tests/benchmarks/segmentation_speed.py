@@ -1,7 +1,7 @@
 """Time of every segmenter on one 640x480 frame, and of carrying masks; prints a Markdown table.
 
-Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--threads 2] [--device cuda:0]``. Wall times are medians;
-user CPU time stands beside them, because wall times of a busy machine mean little.
+Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--threads 2] [--device cuda:0]``. Wall times are
+medians; user CPU time stands beside them, because wall times of a busy machine mean little.
 """
 
 import statistics
