@@ -313,11 +313,13 @@ class ConfiguredSegmenter:
         """The objects of the frame that count: see `postprocess.select`.
 
         Raises:
-            SegmentationError: The segmenter gave masks of another size than the frame.
+            SegmentationError: The segmenter gave no `Instances`, or masks of another size than the frame.
         """
         from dynslam_bench.segmentation.postprocess import select  # needs OpenCV, which the registry does not
 
         instances = self.inner.segment(frame)
+        if not isinstance(instances, Instances):
+            raise SegmentationError(f"{self.source} gave {type(instances).__name__} instead of Instances")
         if instances.masks.shape[1:] != frame.rgb.shape[:2] or len(instances.masks) != len(instances.class_names):
             raise SegmentationError(
                 f"{self.source} gave {len(instances)} objects with masks of shape {instances.masks.shape}, the frame "

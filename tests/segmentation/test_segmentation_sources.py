@@ -251,6 +251,9 @@ def test_plugins():
     assert len(built.segment(frame())) == 2
     with pytest.raises(SegmentationError, match=r"masks of shape \(0, 12, 16\), the frame is 32x24"):
         build_segmenter(source("SMALL")).segment(frame())
+    built.inner.segment = lambda frame: None
+    with pytest.raises(SegmentationError, match="gave NoneType instead of Instances"):
+        built.segment(frame())
     with pytest.raises(SegmentationError, match="gave a bool, not a Segmenter"):
         build_segmenter(source("BROKEN"))
     with pytest.raises(PluginError, match=r"unknown segmenter 'oracel'.*'oracle'"):
