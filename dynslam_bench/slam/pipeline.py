@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -320,9 +321,9 @@ class SlamPipeline:
             if isinstance(part, Reconfigurable) and hasattr(settings, group):
                 yield group, part.configure
         if hasattr(settings, "guard"):
-            yield "guard", lambda guard: setattr(self, "_guard", guard)
+            yield "guard", partial(setattr, self, "_guard")  # a deep copy of it configures the copy, unlike a closure
         if self._segmentation is not None:
-            yield "segmentation", lambda segmentation: setattr(self, "_segmentation", segmentation)
+            yield "segmentation", partial(setattr, self, "_segmentation")
 
     def _started(self) -> RgbdBackend:
         if not hasattr(self, "_camera"):

@@ -19,6 +19,7 @@ import dynslam_bench.envs  # noqa: F401
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.core.settings import online_parameters
 from dynslam_bench.envs import (
     GENERIC_ID,
     KEYPOINT_LAYOUT,
@@ -41,6 +42,7 @@ from dynslam_bench.envs.episode import metric_names
 from dynslam_bench.envs.spaces import MAX_DEPTH_M
 from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.testing import CornerSequence
+from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
 PARTS = ["stats", "rgb", "depth", "gray", "keypoints", "privileged"]
 
@@ -115,6 +117,25 @@ def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
     following = env.reset()[0].tobytes()
     env.restore_state(state)
     assert rest(env) == first and env.reset()[0].tobytes() == following, "random numbers are restored, too"
+
+
+@pytest.mark.parametrize("tracker", ["mask-rcnn", "emfoa-oft", "dynaslam", "ds-slam"])
+def test_a_restored_tracker_takes_every_online_setting(tracker: str) -> None:
+    settings = {"segmentation.source": "oracle"}
+    online = online_parameters(resolve_settings(TRACKERS.get(tracker), settings))
+    arguments = {"settings": settings, "control": [parameter.name for parameter in online]}
+    env = SlamEnv("synthetic/walking_xyz?scene=0&frames=8", tracker, **arguments)
+    env.reset(seed=0)
+    state = env.clone_state()
+    for value in (-1.0, 0.5):
+        action = np.full(env.action_space.shape, value, np.float32)
+        fresh = SlamEnv("synthetic/walking_xyz?scene=0&frames=8", tracker, **arguments)
+        fresh.reset(seed=0)
+        expected = rest(fresh, action)
+        env.restore_state(state)
+        assert rest(env, action) == expected
+        env.reset(seed=0)
+        assert rest(env, action) == expected
 
 
 def test_networks_are_shared_by_copies() -> None:
