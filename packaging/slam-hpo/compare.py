@@ -4,9 +4,9 @@
 
 prints a Markdown table, and draws the regret over the whole budget if a file is named. A study minimises the noisy
 error on the `tune` sequences with a budget of frames, counted in trials of full length; pruned trials are shorter. Its
-regret is the error of the configuration that it has found, without noise, over the best that any study found. The last
-column has the same on the `test` sequences: the found configuration's error over the default's, where less than 0 is a
-gain. Both are geometric means, minus 1.
+regret is the error of the configuration that it has found, without noise, over the best that any study found. Then
+follow its error over that of the random search with the same seed, and its error on the `test` sequences over the
+default's; less than 0 is a gain. All are geometric means, minus 1; intervals are those of the seeds alone.
 """
 
 import sys
@@ -105,9 +105,10 @@ def main(system: str, curves: str | None = None) -> None:
     }
     best = min(rows[..., 0].min() for rows in found.values())
     regret = {name: rows[..., 0] - best for name, rows in found.items()}
-    lines = [["sampler", *(f"regret after {after}, %" for after in AT), "test error over the default's, %"]]
+    lines = [["sampler", *(f"regret after {after}, %" for after in AT), "over random's, %", "test over default's, %"]]
     for name, rows in found.items():
-        lines.append([name, *(cell(regret[name][:, after - 1]) for after in AT), cell(rows[:, -1, 1])])
+        regrets = [cell(regret[name][:, after - 1]) for after in AT]
+        lines.append([name, *regrets, cell(rows[:, -1, 0] - found["random"][:, -1, 0]), cell(rows[:, -1, 1])])
     lines.insert(1, ["---"] * len(lines[0]))
     sys.stdout.write("".join(f"| {' | '.join(line)} |\n" for line in lines))
     if curves:

@@ -11,8 +11,6 @@ from ConfigSpace import ConfigurationSpace, Float, Integer
 from slam_hpo.spaces import FRAMES, SEQUENCES, STARTS
 from slam_hpo.table import SlamHpoError, load
 
-_STATUS = {"timeout": StatusType.TIMEOUT, "out-of-memory": StatusType.MEMORYOUT, "crashed": StatusType.CRASHED}
-
 
 class SlamHpo(ObjectiveFunction):
     """ATE in metres of a SLAM system on one instance.
@@ -43,10 +41,9 @@ class SlamHpo(ObjectiveFunction):
 
     def _evaluate(self, trial_info: TrialInfo) -> TrialValue:
         instance = trial_info.instance or 0
-        if not 0 <= instance < len(SEQUENCES):
+        if instance not in range(len(SEQUENCES)):
             raise SlamHpoError(f"instance {instance} is not in the benchmark, which has 0 to {len(SEQUENCES) - 1}")
-        frames = FRAMES[-1] if trial_info.budget is None else int(trial_info.budget)
+        frames = FRAMES[-1] if trial_info.budget is None else trial_info.budget
         start = STARTS[(trial_info.seed or 0) % len(STARTS)]
-        found = self._bench.predicted(dict(trial_info.config), SEQUENCES[instance], start=start, frames=frames)
-        status = _STATUS.get(found.status, StatusType.SUCCESS)
-        return TrialValue(cost=found.ate_m, time=found.processor_s * frames, status=status)
+        found = self._bench.predicted(dict(trial_info.config), SEQUENCES[int(instance)], start=start, frames=frames)
+        return TrialValue(cost=found.ate_m, time=found.processor_s * frames, status=StatusType.SUCCESS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import numpy as np
@@ -39,12 +40,12 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
     def __init__(
         self, *, elite: bool = True, seed: int | None = None, n_trials: int = 100, population: int = 8
     ) -> None:
-        if n_trials < 1 or population < 2:
-            raise ValueError(f"n_trials must be >= 1 and population >= 2, got {n_trials=}, {population=}")
         super().__init__(seed=seed)
         self._rules = EMFOA if elite else MFO
         self._rng = np.random.default_rng(seed)
-        self._n_trials, self._population = n_trials, population
+        self._n_trials, self._population = operator.index(n_trials), operator.index(population)
+        if self._n_trials < 1 or self._population < 2:
+            raise ValueError(f"n_trials must be >= 1 and population >= 2, got {n_trials=}, {population=}")
 
     def reseed_rng(self) -> None:
         """Draw a new seed, for parallel workers."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import optuna
@@ -48,6 +48,8 @@ class Problem(optunahub.benchmarks.BaseProblem):
     ) -> None:
         if frames not in FRAMES:
             raise SlamHpoError(f"frames {frames} is not in the benchmark, which has {', '.join(map(str, FRAMES))}")
+        if source not in get_args(Source):
+            raise SlamHpoError(f"no source {source!r}; there are {', '.join(get_args(Source))}")
         if split not in SPLITS:
             raise SlamHpoError(f"no split {split!r}; there are {', '.join(SPLITS)}")
         unknown = [name for name in metrics if name not in ("ate_m", "processor_s")]
@@ -55,7 +57,8 @@ class Problem(optunahub.benchmarks.BaseProblem):
             raise SlamHpoError(f"no metric {unknown[0]!r}; there are ate_m, processor_s")
         self._bench, self._split, self._frames, self._source = load(system), split, frames, source
         self.metric_names = [*metrics]
-        self._noise = self._bench.noise(frames) / np.sqrt(len(SPLITS[split]) * len(STARTS)) if noise else 0.0
+        one = np.array([self._bench.noise(frames, metric) for metric in metrics]) if noise else np.zeros(len(metrics))
+        self._noise = one / np.sqrt(len(SPLITS[split]) * len(STARTS))
         self.reseed(seed)
         self._default = self._measured(defaults(system))
 
@@ -81,8 +84,10 @@ class Problem(optunahub.benchmarks.BaseProblem):
     def evaluate(self, params: dict[str, Any]) -> float | Sequence[float]:
         """Mean over sequences and starts of the log ratio to the default, one for each metric."""
         ratios = np.log(self._measured(params) / self._default).mean(axis=0)
-        columns = [METRICS.index(name) for name in self.metric_names]
-        values = [float(ratios[column] + self._noise * self._rng.standard_normal()) for column in columns]
+        noises = self._noise * self._rng.standard_normal(len(self._noise))
+        values = [
+            float(ratios[METRICS.index(name)] + noise) for name, noise in zip(self.metric_names, noises, strict=True)
+        ]
         return values[0] if len(values) == 1 else values
 
     def evaluate_constraints(self, params: dict[str, Any]) -> dict[str, float]:

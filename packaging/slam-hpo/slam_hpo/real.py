@@ -39,11 +39,13 @@ def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
     from dynslam_bench.contracts import Trajectory
     from dynslam_bench.evaluation import evaluate
     from dynslam_bench.runs import load_frames
+    from dynslam_bench.runs.running import judge_coverage
     from dynslam_bench.tuning.objectives import held_protocol
 
     part = load_frames(record, store).head(frames)
     stamps, truth = part["timestamp"].to_numpy(), store.ground_truth(record.sequence.part)
-    estimate, tracked = store.trajectory(record.run_id), int((part["state"] == "ok").sum())
+    ok = (part["state"] == "ok").to_numpy()
+    estimate, tracked = store.trajectory(record.run_id), int(ok.sum())
     assert truth is not None  # every sequence is rendered
     if estimate is not None and tracked > 1:
         begun = Trajectory(estimate.timestamps[:tracked], estimate.T_world_cam[:tracked])
@@ -52,4 +54,6 @@ def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
         positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
         error = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
     processor = float(part["processor_s"].iloc[2:].mean())  # the first two load networks and kernels
-    return Evaluation(error, tracked / len(part), processor, record.status)
+    lost_at_end = int(ok[::-1].argmax()) if tracked else len(ok)
+    status = record.status if record.failed else judge_coverage(tracked, len(ok), lost_at_end, len(ok))[0]
+    return Evaluation(error, tracked / len(ok), processor, status)

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping
 from functools import cached_property, lru_cache
 from importlib.resources import files
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from slam_hpo.spaces import FRAMES, SEQUENCES, SPACES, STARTS, Value, defaults
 
 METRICS = ("ate_m", "coverage", "processor_s")
+LOST_COVERAGE = 0.5
+"""A run that tracks less than this share of its frames is lost."""
 KNOWN = (("sequence", SEQUENCES), ("start", STARTS), ("frames", FRAMES))
 
 
@@ -85,6 +88,8 @@ class Benchmark:
             raise SlamHpoError(f"{self.system} has the settings {', '.join(self.space)}; missing or unknown: {wrong}")
         for name, value in settings.items():
             low, high = self.space[name][:2]
+            if not isinstance(value, Real) or (self.space[name].whole and value % 1):
+                raise SlamHpoError(f"{name} = {value!r} is no {'whole ' * self.space[name].whole}number")
             if not low <= value <= high:
                 raise SlamHpoError(f"{name} = {value} is outside {low} to {high}")
         return np.array([setting.unit(settings[name]) for name, setting in self.space.items()])
@@ -121,12 +126,13 @@ class Benchmark:
         where = _place(sequence, start, frames)
         mean, std = (part[(0, *where)] for part in self.surrogate.predict(self.units(settings)[None]))
         ate, coverage, processor = natural(mean).tolist()
-        return Evaluation(ate, coverage, processor, log_ate_std=float(std[0]))
+        status = "ok" if coverage >= LOST_COVERAGE else "lost"
+        return Evaluation(ate, coverage, processor, status, log_ate_std=float(std[0]))
 
-    def noise(self, frames: int = 60) -> float:
-        """Standard deviation of log ATE between starts, on the same sequence with the same settings."""
-        log_ate = np.log(self.values[:, :, :, FRAMES.index(frames), 0])
-        between = log_ate[:, :, 0] - log_ate[:, :, 1]
+    def noise(self, frames: int = 60, metric: str = "ate_m") -> float:
+        """Standard deviation of a metric's logarithm between starts, on the same sequence with the same settings."""
+        logarithm = np.log(self.values[:, :, :, FRAMES.index(frames), METRICS.index(metric)])
+        between = logarithm[:, :, 0] - logarithm[:, :, 1]
         return float(np.sqrt(np.mean((between - between.mean(axis=0)) ** 2) / 2))
 
     @cached_property
@@ -139,11 +145,14 @@ class Benchmark:
         return Surrogate(self._units, self.values)
 
     def hpob(self) -> dict[str, Any]:
-        """The table in HPO-B's form: ``{system: {instance: {"X": [[...]], "y": [[...]]}}}``; y is ATE in metres."""
+        """The table in HPO-B's form: ``{system: {instance: {"X": [[...]], "y": [[...]]}}}``.
+
+        y is the negative ATE in metres, as HPO-B maximises.
+        """
         points = self._units.tolist()
         return {
             self.system: {
-                f"{sequence}, start {start}": {"X": points, "y": self.values[:, s, k, -1, :1].tolist()}
+                f"{sequence}, start {start}": {"X": points, "y": (-self.values[:, s, k, -1, :1]).tolist()}
                 for s, sequence in enumerate(SEQUENCES)
                 for k, start in enumerate(STARTS)
             }

@@ -41,6 +41,8 @@ def test_a_measured_configuration_is_found(bench):
     [
         ({"features.n_features": 301}, "no run has these settings; the nearest is configuration("),
         ({"features.n_features": 30}, "features.n_features = 30 is outside 300 to 3000"),
+        ({"features.n_features": 800.5}, "features.n_features = 800.5 is no whole number"),
+        ({"features.n_features": "800"}, "features.n_features = '800' is no whole number"),
         ({"flow.wrong": 1}, "missing or unknown: flow.wrong"),
     ],
 )
@@ -69,11 +71,17 @@ def test_the_surrogate_is_close_to_what_was_measured_and_says_how_sure_it_is(ben
     assert corner.log_ate_std > std[:, 0, 0].mean()
 
 
+def test_a_run_that_lost_the_camera_says_so_from_that_length_on():
+    bench = slam_hpo.load("mask-rcnn")
+    lost, coverage = bench.status == "lost", bench.values[..., 1]
+    assert lost.any() and (coverage[lost] < 0.9).all() and (lost | (coverage >= 0.5)).all()
+
+
 def test_the_form_of_hpo_b(bench):
     data = json.loads(json.dumps(bench.hpob()))[bench.system]
     assert len(data) == len(slam_hpo.SEQUENCES) * len(slam_hpo.STARTS)
     one = data[f"{XYZ}, start 0"]
-    assert len(one["X"]) == len(one["y"]) and one["y"][0] == [bench.values[0, 0, 0, -1, 0]]
+    assert len(one["X"]) == len(one["y"]) and one["y"][0] == [-bench.values[0, 0, 0, -1, 0]], "HPO-B maximises"
 
 
 def test_optuna_minimises_the_problem(bench):
@@ -90,11 +98,13 @@ def test_noise_is_drawn_from_its_seed_and_two_metrics_are_two_values():
     first = [noisy.evaluate(params) for _ in range(3)]
     noisy.reseed(3)
     assert first == [noisy.evaluate(params) for _ in range(3)] and len(set(first)) == 3
-    both = Problem(metrics=("ate_m", "processor_s"))
+    both = Problem(metrics=("ate_m", "processor_s"), noise=True, seed=0)
+    spread = np.std([both.evaluate(params) for _ in range(200)], axis=0)
+    assert spread[1] < 0.3 * spread[0], "starts differ less in time than in error"
     assert len(both.evaluate(params)) == len(both.directions) == 2 and both.metric_names == ["ate_m", "processor_s"]
 
 
-@pytest.mark.parametrize("wrong", [{"split": "train"}, {"metrics": ("rpe",)}, {"frames": 61}])
+@pytest.mark.parametrize("wrong", [{"split": "train"}, {"metrics": ("rpe",)}, {"frames": 61}, {"source": "rn"}])
 def test_a_wrong_problem_is_refused(wrong):
     with pytest.raises(slam_hpo.SlamHpoError, match=r"there are|which has"):
         Problem(**wrong)
@@ -109,8 +119,9 @@ def test_carps(bench):
     found = objective.evaluate(trials.TrialInfo(config=config, instance=2, seed=1, budget=20))
     expected = bench.predicted(dict(config), slam_hpo.SEQUENCES[2], start=4, frames=20)
     assert found.cost == expected.ate_m and found.status == trials.StatusType.SUCCESS
-    with pytest.raises(slam_hpo.SlamHpoError, match="instance 99 is not in the benchmark"):
-        objective.evaluate(trials.TrialInfo(config=config, instance=99))
+    for wrong, message in ({"instance": 99}, "instance 99"), ({"budget": 20.9}, "frames 20.9"):
+        with pytest.raises(slam_hpo.SlamHpoError, match=f"{message} is not in the benchmark"):
+            objective.evaluate(trials.TrialInfo(config=config, **wrong))
 
 
 def test_neither_torch_nor_opencv_is_imported():
