@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
@@ -67,13 +67,13 @@ class ControlBenchmark:
         splits = {"train": self.train, "test": self.test, "recordings": self.recordings}
         if split not in splits:
             raise SettingsError(f"'{self.id}' has no split '{split}'", f"choose {', '.join(splits)}")
-        count = len(splits[split])
-        chosen = range(count) if index is None else [index] if isinstance(index, int) else index
-        if not all(0 <= number < count for number in chosen):
-            raise SettingsError(f"the split {split} of '{self.id}' has no sequence {index}", f"give 0 to {count - 1}")
-        sequences = [splits[split][number] for number in chosen]
+        every = range(len(splits[split]))
+        chosen = list(every if index is None else index if isinstance(index, Iterable) else [index])
+        if not chosen or not all(number in every for number in chosen):
+            raise SettingsError(f"the split {split} of '{self.id}' has no sequence {index!r}", f"give 0 to {every[-1]}")
+        sequences = [splits[split][int(number)] for number in chosen]
         given: dict[str, Any] = {
-            "settings": self.settings,
+            "settings": dict(self.settings),
             "control": self.control,
             "reward": self.reward,
             "frames": self.frames,
@@ -84,7 +84,7 @@ class ControlBenchmark:
         }
         env: gym.Env[Any, Any] = SlamEnv(sequences[0], self.tracker, **(given | arguments))
         if self.actions:
-            env = DiscreteActions(env, self.actions)
+            env = DiscreteActions(env, [dict(values) for values in self.actions])
         return env if len(sequences) == 1 else SequenceSampler(env, sequences, mode="random")
 
 

@@ -357,7 +357,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """Go back to a copied episode; the steps that follow are equal to the bit to those that followed the copy.
 
         Raises:
-            DynslamError: The state is of another sequence, tracker, control, settings or version.
+            DynslamError: The state is of another sequence, tracker, control, settings, reward or version.
         """
         origin = self._origin()
         for name, value in state.origin.items():
@@ -379,6 +379,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             "tracker": f"'{self.tracker_spec.id}'",
             "control": str(list(self._control)),
             "settings": digest(self.settings.model_dump(mode="json")),
+            "reward": getattr(self._reward, "__qualname__", repr(self._reward)),
             "version": dynslam_bench.__version__,
         }
 

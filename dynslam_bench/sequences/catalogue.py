@@ -2,7 +2,7 @@
 
 import fnmatch
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as PySequence
 from functools import cache
 from itertools import groupby
@@ -282,7 +282,8 @@ def parse_frames(frames: PySequence[int | None] | str | None) -> tuple[int, int 
     if frames is None:
         return 0, None
     if not isinstance(frames, str):
-        frames = ":".join("" if end is None else str(end) for end in frames)
+        ends = frames if isinstance(frames, Iterable) else [frames]
+        frames = ":".join("" if end is None else str(end) for end in ends)
     match = re.fullmatch(r"\s*([0-9]{0,12})\s*:\s*([0-9]{0,12})\s*", frames, re.ASCII)
     if match is None:
         raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B")

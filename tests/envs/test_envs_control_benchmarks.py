@@ -1,6 +1,8 @@
 """The benchmarks of control: what they are made of, and that their scenes change within an episode."""
 
+import copy
 import dataclasses
+import pickle
 import warnings
 from typing import Any
 
@@ -64,7 +66,8 @@ def test_it_is_made_again_from_its_json(id: str) -> None:
     duplicate = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert duplicate.unwrapped.sequence.id.startswith(control_benchmark(id).test[3])
     assert duplicate.action_space == env.action_space
-    assert played(duplicate, 1) == played(env, 1)
+    pickled, copied = pickle.loads(pickle.dumps(env)), copy.deepcopy(env)
+    assert played(duplicate, 1) == played(env, 1) == played(pickled, 1) == played(copied, 1)
 
 
 @pytest.mark.parametrize("id", BENCHMARKS)
@@ -104,6 +107,8 @@ def test_a_call_of_the_network_and_keypoints_cost_their_weight() -> None:
         (lambda: control_benchmark("mask-v0"), r"unknown control benchmark 'mask-v0'.*masks-v0, features-v0"),
         (lambda: gym.make("dynslam/masks-v0", split="tset"), "no split 'tset'.*train, test, recordings"),
         (lambda: control_benchmark("masks-v0").make("test", 12), "no sequence 12.*0 to 11"),
+        (lambda: control_benchmark("masks-v0").make("test", []), "no sequence .*0 to 11"),
+        (lambda: control_benchmark("masks-v0").make("test", "3"), "no sequence '3'.*0 to 11"),
     ],
 )
 def test_what_is_not_there(call: Any, words: str) -> None:

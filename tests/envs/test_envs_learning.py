@@ -80,7 +80,7 @@ def test_random_windows_have_their_length_and_follow_the_seed() -> None:
     assert 0 <= min(windows(1))[0] and max(windows(1))[1] <= 30
 
 
-@pytest.mark.parametrize("window", [(5, 13), "5:13", (3, 4), (12, 14), (4, 2)])
+@pytest.mark.parametrize("window", [(5, 13), "5:13", (3, 4), (12, 14), (4, 2), 5])
 def test_a_window_that_is_no_part_of_the_sequence(window: Any) -> None:
     env = SlamEnv(ToySequence(12), TARGET)
     with pytest.raises(SequenceError, match=r"12 frames here|no range"):
@@ -174,6 +174,7 @@ def test_a_state_of_another_sequence_tracker_settings_or_version_is_refused(
         (SlamEnv(ToySequence(9), "never-move"), "of tracker 'toy'"),
         (SlamEnv(ToySequence(9), TARGET, control=["noise.clip"]), "of control"),
         (SlamEnv(ToySequence(9), TARGET, settings={"noise.passes": 3}), "of settings"),
+        (SlamEnv(ToySequence(9), TARGET, reward="neg_pose_error"), "of reward neg_rpe"),
         (SlamEnv(ToySequence(9), TARGET), "of version 0.0.1"),
     ):
         if "version" in words:
