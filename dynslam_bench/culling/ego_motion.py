@@ -23,6 +23,10 @@ TURN_PX = (12.0, 6.0, 4.0)
 """Scale of the redescending kernel in the first Gauss-Newton steps, which change the rotation only."""
 KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
 """The same in the later steps; narrow, since the flow is exact and moving points must not influence the fit."""
+NEAR_FAR = (0.1, 0.9)
+"""Quantiles of the depths whose geometric mean separates near points from distant ones."""
+NOISE_PX = (0.2, 1.0)
+"""Least and greatest scale of the kernel that the residuals of distant points ask for."""
 ROLLING_SHUTTER_SHARE = 0.05
 """Added to the scale, as a share of a point's flow: a rolling shutter distorts fast motion."""
 CELL = 32
@@ -94,7 +98,9 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     redescending (Geman-McClure) kernel. It starts at the motion model's prediction, which is also the prior (maximum a
     posteriori). Without the prior a person nearby would bias the estimate even where most points are static: a far
     background of one depth hardly separates rotation from sideways translation, so that near points determine the
-    translation. For the same reason the first steps, with a wide kernel, change the rotation only.
+    translation. For the same reason the first steps, with a wide kernel, change the rotation only. An object nearby
+    that begins to move takes this estimate along all the same, and then the prior. A second one therefore begins with
+    the distant points alone, without the prior. The one that more points agree with is taken.
 
     Args:
         frame: The current frame.
@@ -116,7 +122,28 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
         start = se3.inverse(state.T_world_prev) @ state.T_world_pred
         prior = prior_information(state, start)
     T_prev_cur = _align(points, before, state.camera, start, share, prior)
-    return state.T_world_pred if T_prev_cur is None else state.T_world_prev @ T_prev_cur
+    if T_prev_cur is None:
+        return state.T_world_pred
+    return state.T_world_prev @ _compared(T_prev_cur, points, before, state.camera, start, share)
+
+
+def _compared(T_prev_cur: Array, points: Array, pixels: Array, camera: Camera, start: Array, weight: Array) -> Array:
+    """The given motion, or that of the distant points if more points agree with it; arguments as of `_align`."""
+    far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
+    other = _align(points[far], pixels[far], camera, start, weight[far], None)
+    if other is None:
+        return T_prev_cur
+    noise = np.median(np.linalg.norm(camera.project(se3.transform(other, points[far])) - pixels[far], axis=1))
+    scale = float(np.clip(3 * noise, *NOISE_PX))
+    other = _align(points, pixels, camera, other, weight, None, (scale, scale))
+    if other is None:
+        return T_prev_cur
+
+    def cost(pose: Array) -> float:
+        squared = np.square(camera.project(se3.transform(pose, points)) - pixels).sum(axis=1)
+        return float((weight * squared / (squared + scale**2)).sum())
+
+    return other if cost(other) < cost(T_prev_cur) else T_prev_cur
 
 
 def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -146,20 +173,23 @@ def _align(
     start: NDArray[np.float64],
     prior_weight: NDArray[np.float64],
     information: NDArray[np.float64] | None,
+    scales: tuple[float, ...] = (),
 ) -> NDArray[np.float64] | None:
     """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``; None if too few points agree.
 
-    `information` ``[6, 6]`` is that of the prior, the start pose.
+    `information` ``[6, 6]`` is that of the prior, the start pose. With `scales`, these are the kernel's, and no step
+    changes the rotation only.
     """
     shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
     lens = camera.fx, camera.fy, camera.cx, camera.cy
     pose, total, inverse_start = start, 0.0, se3.inverse(start)
-    for number, scale in enumerate(TURN_PX + KERNEL_PX):
+    turns = 0 if scales else len(TURN_PX)
+    for number, scale in enumerate(scales or TURN_PX + KERNEL_PX):
         hessian, gradient, total = _linearise(pose, points, pixels, prior_weight, shutter, scale**2, *lens)
         if information is not None:
             hessian += information
             gradient += information @ se3.log(pose @ inverse_start)
-        if number < len(TURN_PX):
+        if number < turns:
             hessian[:3], hessian[:, :3], gradient[:3] = 0.0, 0.0, 0.0
             hessian[:3, :3] = np.trace(hessian) * np.eye(3)
         try:

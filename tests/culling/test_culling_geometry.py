@@ -160,6 +160,17 @@ def test_a_walker_before_a_far_wall_does_not_bias_the_camera(n_static: int, n_mo
     assert not keep[made.moving].any() and keep[~made.moving].mean() > 0.97
 
 
+def test_a_box_that_is_lifted_before_the_camera_does_not_take_it_along() -> None:
+    made = far_wall_and_walker(600, 200, step_m=0.01)  # 5 px a frame
+    static, z = ~made.moving, made.frame.z
+    z[static] = np.random.default_rng(5).uniform(1.8, 3.5, static.sum())
+    still = CAMERA.project(CAMERA.unproject(made.frame.xy[static], z[static]))
+    made.state.flow.xy[static] = still + np.random.default_rng(6).normal(0, 0.1, still.shape)
+    made.state.T_world_pred = se3.exp(np.array([0.008, 0.0, 0.0, 0.0, -0.003, 0.0]))  # as if the box were at rest
+    made.state.motion_covariance = CERTAIN
+    assert np.linalg.norm(refine_prediction(made.frame, made.state)[:3, 3]) < 1e-3
+
+
 def test_the_motion_model_does_not_hold_back_a_camera_that_accelerates() -> None:
     jerk = se3.exp(np.array([0.004, -0.003, 0.002, 0.01, -0.02, 0.005]))
     made = scene(jerk)
