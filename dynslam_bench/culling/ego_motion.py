@@ -25,6 +25,8 @@ KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
 """The same in the later steps; narrow, since the flow is exact and moving points must not influence the fit."""
 NEAR_FAR = (0.1, 0.9)
 """Quantiles of the depths whose geometric mean separates near points from distant ones."""
+LOWER_COST = 0.95
+"""The motion of the distant points is taken if it costs less than this share of the other one's."""
 NOISE_PX = (0.2, 1.0)
 """Least and greatest scale of the kernel that the residuals of distant points ask for."""
 ROLLING_SHUTTER_SHARE = 0.05
@@ -100,7 +102,7 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     background of one depth hardly separates rotation from sideways translation, so that near points determine the
     translation. For the same reason the first steps, with a wide kernel, change the rotation only. An object nearby
     that begins to move takes this estimate along all the same, and then the prior. A second one therefore begins with
-    the distant points alone, without the prior. The one that more points agree with is taken.
+    the distant points alone, without the prior. It is taken if clearly more points agree with it.
 
     Args:
         frame: The current frame.
@@ -128,7 +130,7 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
 
 
 def _compared(T_prev_cur: Array, points: Array, pixels: Array, camera: Camera, start: Array, weight: Array) -> Array:
-    """The given motion, or that of the distant points if more points agree with it; arguments as of `_align`."""
+    """The given motion, or that of the distant points if clearly more agree with it; arguments as of `_align`."""
     far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
     other = _align(points[far], pixels[far], camera, start, weight[far], None)
     if other is None:
@@ -143,7 +145,7 @@ def _compared(T_prev_cur: Array, points: Array, pixels: Array, camera: Camera, s
         squared = np.square(camera.project(se3.transform(pose, points)) - pixels).sum(axis=1)
         return float((weight * squared / (squared + scale**2)).sum())
 
-    return other if cost(other) < cost(T_prev_cur) else T_prev_cur
+    return other if cost(other) < LOWER_COST * cost(T_prev_cur) else T_prev_cur
 
 
 def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64] | None:
