@@ -160,7 +160,7 @@ def build_report(
         )  # fmt: skip
     on_progress(0, None, "putting the tables and figures together")
     pageless = _pageless(len(paged), len(board.rows))
-    again = command or _command([store.root for store in stores], output, board, most_pages, trials=trials)
+    again = command or _command([store.source for store in stores], output, board, most_pages, trials=trials)
     none_failed = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
     boards = category_boards(board)
     sections = {

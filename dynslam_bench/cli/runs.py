@@ -145,7 +145,7 @@ def show(
             values = table(("metric", "value"), sorted(evaluation.metrics.items()))
             lines += ["", f"{which}: {evaluation.summary()}", values, *evaluation.diagnostics]
     lines += [f"hint: {line}" for line in metrics.hints]
-    present({"record": record, "metrics": metrics, "folder": store.folder(record.run_id)}, *lines)
+    present({"record": record, "metrics": metrics, "folder": store.place(record.run_id)}, *lines)
 
 
 @app.command()
@@ -229,7 +229,7 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
     """The facts of a run by name; empty values are not shown."""
     return {
         "run": record.run_id,
-        "folder": store.folder(record.run_id),
+        "folder": store.place(record.run_id),
         "identity": "" if record.verified else "unverified: its id does not tell the contents of data and code",
         "status": record.status,
         "reason": record.reason,
@@ -278,7 +278,7 @@ def show_runs(
 def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: str) -> None:
     """The same for rows that `list_runs` gave; the table has the columns in which a run has a value."""
     if json_mode():
-        present([row | {"protocol": protocol, "folder": store.folder(row["run_id"])} for row in rows])
+        present([row | {"protocol": protocol, "folder": store.place(row["run_id"])} for row in rows])
         return
     columns = {
         title: name

@@ -4,6 +4,7 @@ Each message is one line: what was found (with the measured numbers), what was e
 """
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -44,8 +45,12 @@ LONGEST = 1000
 """Characters of the longest message, and of the longest hint."""
 
 
+_UNPACKED = re.compile(r"/[^\s'\"]*/\.dynslam-private\.[0-9a-f]{12}\.tmp/unpacked/")
+"""Where archives are unpacked, each below its own name: a message names the archive, not the temporary folder."""
+
+
 def _one_line(text: str) -> str:
-    text = without_passwords(" ".join(text.splitlines()))
+    text = _UNPACKED.sub("", without_passwords(" ".join(text.splitlines())))
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
 
 

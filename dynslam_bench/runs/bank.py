@@ -188,8 +188,7 @@ def verify(bank: str | Path) -> list[str]:
             faults.append(f"runs/{record.run_id}: the stamps of its sequence are missing")
             continue
         try:
-            store.timestamps(record.sequence.part), store.ground_truth(record.sequence.part)
-            store.trajectory(record.run_id, "online"), store.trajectory(record.run_id, "final")
+            store.check(record)
         except DynslamError as error:
             faults.append(f"runs/{record.run_id}: {error}")
     return faults

@@ -228,12 +228,13 @@ class RunStore:
 
     Attributes:
         root: The same, absolute.
+        source: What messages call it: the same, or the archive that it was unpacked from.
         runs: Folder of the runs.
         index: What was computed from the runs.
     """
 
     def __init__(self, root: str | Path = "results") -> None:
-        self.root = Path(root).expanduser().absolute()
+        self.root = self.source = Path(root).expanduser().absolute()
         self.runs = self.root / "runs"
         self.index = RunIndex(self.root)
         self._swept = False
@@ -245,6 +246,10 @@ class RunStore:
             RunError: It is no run's id, which is 16 hexadecimal digits: anything else could lead out of the store.
         """
         return self.runs / _checked(run_id, "a run's id")
+
+    def place(self, run_id: str) -> Path:
+        """The same for messages: below the archive that the store was unpacked from."""
+        return self.source / "runs" / run_id
 
     def _part(self, part: str) -> Path:
         """Folder of the stamps and the ground truth of a sequence's part."""
@@ -428,7 +433,7 @@ class RunStore:
             try:
                 started.append((self.read_whole(run_id).started, run_id))
             except DynslamError as error:
-                unreadable.append(Unreadable(self.folder(run_id), str(error)))
+                unreadable.append(Unreadable(self.place(run_id), str(error)))
         return Records(self, [run_id for _, run_id in sorted(started)]), unreadable
 
     def find(self, prefix: str) -> str:
@@ -445,7 +450,7 @@ class RunStore:
             return matching[0]
         if matching:
             raise RunError(f"{len(matching)} runs begin with '{prefix}'", ", ".join(matching[:5]))
-        hint = did_you_mean(prefix, run_ids) if run_ids else f"there are no runs in {self.root}"
+        hint = did_you_mean(prefix, run_ids) if run_ids else f"there are no runs in {self.source}"
         raise RunError(f"there is no run '{prefix}'", hint)
 
     def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
@@ -470,6 +475,15 @@ class RunStore:
         path = self._part(part) / "timestamps.txt"
         check_plain(path.parent, self.root)
         return _read_stamps(path, file_stamp(path))
+
+    def check(self, record: RunRecord) -> None:
+        """Read the trajectories of a run, and the stamps and the ground truth of its part of a sequence.
+
+        Raises:
+            DynslamError: One is damaged, or the stamps are missing.
+        """
+        self.timestamps(record.sequence.part), self.ground_truth(record.sequence.part)
+        self.trajectory(record.run_id, "online"), self.trajectory(record.run_id, "final")
 
     # -- scores ----------------------------------------------------------------------------------------------------
 
@@ -610,15 +624,16 @@ def open_store(results: str | Path) -> RunStore:
 
         with raising(InfrastructureError, f"cannot unpack {results}", "check the free space"):
             temporary = TemporaryFolder()
-            unpacked = temporary.path / store.root.name  # so that messages name the archive
-            unpacked.mkdir()
+            unpacked = temporary.path / "unpacked" / store.root.name  # so that errors name the archive
+            unpacked.mkdir(parents=True)
             extract(store.root, unpacked)
         roots = [path.parent for path in unpacked.rglob("runs") if path.is_dir()]
         depth = min((len(root.parts) for root in roots), default=0)  # below it, e.g. a study's own runs
         roots = [root for root in roots if len(root.parts) == depth]
         if len(roots) > 1:
             raise RunError(f"{results} holds {len(roots)} results folders", "pack each into an archive of its own")
-        store = RunStore(roots[0] if roots else unpacked)
+        archive, store = store.root, RunStore(roots[0] if roots else unpacked)
+        store.source = archive
         weakref.finalize(store, temporary.close)
     if not store.runs.is_dir():
         raise RunError(f"there are no runs in {results}", "name a folder that holds runs")
@@ -703,7 +718,7 @@ def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) 
             if record.trial_of and not trials:
                 continue
             if reason := _why_left_out(source, record, store):
-                merged.left_out.append(Unreadable(source.folder(record.run_id), reason))
+                merged.left_out.append(Unreadable(source.place(record.run_id), reason))
             elif store.get(record.run_id) is not None:
                 merged.stored.append(record.run_id)
             else:
@@ -720,12 +735,12 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
     except RunError as error:
         return str(error)
     if not (part / "timestamps.txt").is_file():
-        return f"{source.root} has lost the stamps of its sequence"
+        return f"{source.source} has lost the stamps of its sequence"
     if (there / "timestamps.txt").is_file() and not _equal(part, there, ("timestamps.txt", "groundtruth.txt")):
-        return f"{store.root} holds other stamps or truth of its sequence"
+        return f"{store.source} holds other stamps or truth of its sequence"
     earlier, folders = store.get(record.run_id), (source.folder(record.run_id), store.folder(record.run_id))
     if earlier is not None and (earlier.status != record.status or not _equal(*folders, (ONLINE, FINAL))):
-        return f"{store.root} holds another result of this run"
+        return f"{store.source} holds another result of this run"
     return ""
 
 
@@ -764,7 +779,7 @@ def list_runs(
             rows[run_id] = run_row(record, None if record.status == "stopped" else store.score(record, protocol))
             entries.append((run_id, state, json.dumps(list(rows[run_id].values()))))
         except DynslamError as error:
-            unreadable.append(Unreadable(store.folder(run_id), str(error)))
+            unreadable.append(Unreadable(store.place(run_id), str(error)))
     store.index.write(name, version, entries)
     return sorted(rows.values(), key=lambda row: (row["started"], row["run_id"])), unreadable
 
@@ -786,7 +801,7 @@ class Rescored:
         protocol: Id of the protocol.
         runs: Runs that were scored.
         changed: Ids of those whose stored metrics had other values.
-        unreadable: Folders without a valid record, with reasons.
+        unreadable: Folders without a valid record, or with a damaged trajectory, with reasons; they are not scored.
     """
 
     protocol: str
@@ -809,8 +824,14 @@ def rescore(
         What has changed, by protocol.
     """
     records, unreadable = store.all()
-    ended = Records(store, [record.run_id for record in records if record.status != "stopped"])
-    reasons = tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)
+    readable = []
+    for record in records:
+        try:
+            store.check(record)
+            readable += [] if record.status == "stopped" else [record.run_id]
+        except DynslamError as error:
+            unreadable.append(Unreadable(store.place(record.run_id), str(error)))
+    ended, reasons = Records(store, readable), tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)
     names = store.index.names()
     chosen = [option for option in PROTOCOLS.values() if option.id == DEFAULT_PROTOCOL or _metrics_of(option) in names]
     chosen = chosen if protocol is None else [get_protocol(protocol)]

@@ -140,7 +140,7 @@ def _score_runs(store: RunStore, protocol: Protocol, run_ids: Sequence[str]) -> 
             record, state = store.read_with_state(run_id)
             rows.append((make_row(store, record, protocol), state))
         except DynslamError as error:
-            unreadable.append(f"{store.folder(run_id)}: {error}")
+            unreadable.append(f"{store.place(run_id)}: {error}")
     return rows, unreadable
 
 
@@ -222,7 +222,7 @@ def load_runs(
     if not newest and loaded.trials:
         raise ReportError(f"all {trial_words(loaded.trials)}")
     if not newest:
-        places = ", ".join(str(store.root) for store in stores)
+        places = ", ".join(str(store.source) for store in stores)
         raise ReportError(f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'"))
     return loaded
 

@@ -29,7 +29,7 @@ from dynslam_bench.evaluation.online import OnlineSample
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.reports import build_report
-from dynslam_bench.runs import RunRecord, RunSpec, RunStore, load_frames, resolve, run_one, score
+from dynslam_bench.runs import RunRecord, RunSpec, RunStore, load_frames, open_store, resolve, run_one, score
 from dynslam_bench.runs import store as store_module
 from dynslam_bench.runs.artifacts import PICTURE, SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
@@ -612,6 +612,17 @@ def test_a_damaged_trajectory_is_the_reason_why_there_is_no_error(
     scored = score(two_runs, two_runs.read(BAD), again=True)
     assert scored.online is None and "is not a text file" in scored.reasons["online"]
     assert build_report(str(two_runs.root), tmp_path / "report").html.is_file()
+    (outcome,) = rescore(two_runs)  # one line names the run and the fault; a shared truth is that of both runs
+    assert outcome.runs == 2 - len(outcome.unreadable) == int("online" in file)
+    assert f"{two_runs.folder(BAD)}: {scored.reasons['online']}" in outcome.unreadable
+
+
+def test_faults_in_an_archive_name_the_archive(two_runs: RunStore, tmp_path: Path) -> None:
+    (two_runs.folder(BAD) / "trajectory_online.txt").write_bytes(b"\xff\xfe")
+    (two_runs.folder(GOOD) / "run.json").write_bytes(b"\xff\xfe")
+    store = open_store(shutil.make_archive(str(tmp_path / "packed"), "zip", two_runs.root.parent))
+    lines = [*rescore(store)[0].unreadable, store.score(store.read(BAD)).reasons["online"]]
+    assert all("packed.zip" in line and "dynslam-private" not in line for line in lines), lines
 
 
 def test_a_store_that_can_only_be_read_is_scored(two_runs: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
