@@ -186,21 +186,6 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
     assert facts("runs", "list") == []
 
 
-def test_failed_runs_exit_with_3_and_the_others_go_on(cli, facts, walk, tmp_path):
-    (tmp_path / "raises.py").write_text(
-        "from dynslam_bench.trackers import TrackerSpec\n"
-        "class Raises:\n"
-        "    def __init__(self, settings): pass\n"
-        "    def reset(self, camera, *, rng): self.broken = rng.integers(2**62) % 2\n"
-        "    def track(self, frame): raise ValueError('a wall')\n"
-        "SPEC = TrackerSpec('raises', f'{__file__}:Raises', 'Raises')\n"
-    )
-    (row,) = facts("run", "raises.py:SPEC", walk, code=3)
-    assert row["status"] == "crashed" and "ValueError: a wall" in row["reason"]
-    code, out, _ = cli("runs", "rm", "--failed")
-    assert code == 0 and out.strip() == row["run_id"]
-
-
 def test_damaged_sequences_never_become_runs(cli, walk, tmp_path):
     """One line, exit code 1, and nothing half written."""
     code, _, err = cli("run", "never-move", walk, "--frames", "0:1")
@@ -227,8 +212,6 @@ def test_eval_and_protocols(cli, facts, walk, tmp_path):
     assert found["protocol_id"] == "evo-default" and found["metrics"]["ate_rmse_m"] < 1e-9
     code, out, _ = cli("protocols", "list")
     assert code == 0 and "kitti" in out
-    code, out, _ = cli("protocols", "compare", truth, truth)
-    assert code == 0 and out.splitlines()[0].split()[:2] == ["metric", "protocol"]
 
 
 def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
@@ -261,9 +244,8 @@ def test_cache(cli, facts, monkeypatch, tmp_path):
         assert cli("cache", "clear", "--yes")[0] == 0
 
 
-def test_bench(cli, facts, walk, tmp_path):
+def test_a_scheduler_that_is_not_there_is_one_line(cli, walk, tmp_path):
     (tmp_path / "mine.toml").write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n")
-    assert {row["tracker"] for row in facts("bench", "mine.toml")} == {"never-move", "constant-velocity"}
     code, _, err = cli("bench", "mine.toml", "--scheduler", "tcp://127.0.0.1:9")
     assert code == 1 and ("distributed" in err or "no Dask scheduler answers" in err)
 

@@ -192,6 +192,7 @@ def test_runs_are_filtered_sorted_and_coloured(cli, facts, walk, monkeypatch):
     assert crashed["run_id"] not in out and crashed["run_id"][:8] in out
     monkeypatch.setenv("NO_COLOR", "1")
     assert "\033" not in cli("runs", "list")[1]
+    assert cli("runs", "rm", "--failed") == (0, f"{crashed['run_id']}\n", "")
 
 
 def test_a_monocular_tracker_is_scored_with_its_scale_unless_told_otherwise(cli, facts, walk):

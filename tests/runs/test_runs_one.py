@@ -306,9 +306,8 @@ def test_stamps_a_fifth_of_a_microsecond_apart_are_refused_before_tracking(
     lines = (folder / name).read_text().splitlines()
     lines.insert(3, f"{format_ns(START + 2 * STEP + 200)} {lines[2].partition(' ')[2]}")
     (folder / name).write_text("\n".join(lines) + "\n")
-    with pytest.raises(DynslamError, match=rf"{name}.*200 ns apart") as caught:
+    with pytest.raises(DynslamError, match=rf"{name}.*200 ns apart"):
         resolve(RunSpec(tracker=TARGET, sequence=str(folder)))
-    assert "\n" not in str(caught.value)
     told: list[str] = []
     specs = [RunSpec(tracker=TARGET, sequence=str(place)) for place in (good, folder, good)]
     records = run_many(specs, results=store, on_fault=lambda spec, error: told.append(str(error)))
@@ -329,7 +328,12 @@ def test_a_data_set_of_the_users_may_state_its_nanoseconds() -> None:
 
 @pytest.fixture
 def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with no network, no weights, and masks of a third of the frames."""
+    """A folder with no network, no weights, and masks of a third of the frames; nothing can be fetched."""
+
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise OSError("network is unreachable")
+
+    monkeypatch.setattr("urllib.request.OpenerDirector.open", refuse)
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights"))
     (tmp_path / "garbage.onnx").write_bytes(b"no network at all" * 20)
     (tmp_path / "masks").mkdir()
@@ -348,7 +352,7 @@ def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("recorded:{}/none", r"recorded masks .*none does not exist"),
         ("recorded:{}/masks", r"has none for 40 of 60 frames of '.*', the first is frame 20"),
         ("oracle", r"has no exact masks"),
-        ("auto", r"no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH"),
+        ("auto", r"^(?!.*segmentation\.source=none)no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH.*masks=none"),
         ("plugin:mine", r"unknown segmenter 'mine'"),
     ],
 )
@@ -360,33 +364,17 @@ def test_masks_that_cannot_be_had(store: RunStore, toy_folder: str, odd_masks: P
         lambda: run_many([RunSpec(tracker="never-move", sequence=toy_folder), spec], results=store),
         lambda: SlamEnv(toy_folder, "mask-rcnn", settings=settings),
     ):
-        with pytest.raises(DynslamError, match=words) as caught:
+        with pytest.raises(DynslamError, match=words):
             attempt()
-        assert "\n" not in str(caught.value)
     assert store.ids() == []
 
 
-def test_coco_without_a_network(store: RunStore, toy_folder: str, monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights"))
-
-    def refuse(*args: object, **kwargs: object) -> None:
-        raise OSError("network is unreachable")
-
-    monkeypatch.setattr("urllib.request.OpenerDirector.open", refuse)
+@pytest.mark.usefixtures("odd_masks")
+def test_coco_without_a_network(store: RunStore, toy_folder: str) -> None:
     spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings={"segmentation.source": "coco"})
     with pytest.raises(DynslamError, match=r"cannot fetch the checkpoint 'coco': .*network is unreachable \(put"):
         run_one(spec, store)
     assert store.ids() == []
-
-
-def test_the_hint_of_auto_is_one_that_the_system_takes(store: RunStore, toy_folder: str, odd_masks) -> None:
-    def hint(tracker: str) -> str:
-        spec = RunSpec(tracker=tracker, sequence=toy_folder, settings={"segmentation.source": "auto"})
-        with pytest.raises(DynslamError) as caught:
-            run_one(spec, store)
-        return caught.value.options[-1]
-
-    assert "segmentation.source=none" not in hint("mask-rcnn") and "emfoa-oft?masks=none" in hint("mask-rcnn")
 
 
 def test_what_only_the_run_can_find_out_is_refused_likewise(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
@@ -446,9 +434,9 @@ def test_an_image_that_cannot_be_used_is_the_datas_fault(store: RunStore, damage
     spoil, words = FAULTS[fault]
     sound = image.read_bytes()
     spoil(image)
-    with pytest.raises(RunError, match=rf"frame {AT} of '.*' cannot be read: .*{image.name} .*({words})") as caught:
+    with pytest.raises(RunError, match=rf"frame {AT} of '.*' cannot be read: .*{image.name} .*({words})"):
         run_one(RunSpec(tracker="never-move", sequence=folder), store)
-    assert "\n" not in str(caught.value) and store.ids() == []
+    assert store.ids() == []
     image.write_bytes(sound)
     assert run_one(RunSpec(tracker="never-move", sequence=folder), store).status == "ok"
 
@@ -463,11 +451,6 @@ def test_a_recorded_mask_that_cannot_be_decoded_is_the_datas_fault(store: RunSto
     with pytest.raises(RunError, match=rf"frame {AT} of {FRAMES}: .*{AT:06d}\.png is truncated"):
         run_one(RunSpec(tracker="mask-rcnn", sequence=damaged[0], settings=settings), store)
     assert store.ids() == []
-
-
-def test_what_a_tracker_raises_itself_stays_its_outcome(store: RunStore, damaged) -> None:
-    record = run_one(RunSpec(tracker=TARGET, sequence=damaged[0], settings={"mode": "raise"}), store)
-    assert (record.status, store.ids()) == ("crashed", [record.run_id])
 
 
 def test_one_bad_sequence_stops_no_other(store: RunStore, damaged, tmp_path: Path) -> None:
@@ -543,18 +526,10 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
 
 
 def test_a_map_that_does_not_fit_is_refused_before_the_run(store: RunStore, tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="which is no file"):
-        run_many([begun(tmp_path / "none.npz")], results=store)
     (tmp_path / "odd.npz").write_bytes(b"no archive")
     with pytest.raises(SettingsError, match="holds no arrays"):
         run_many([begun(tmp_path / "odd.npz")], results=store)
     assert not store.ids()
-
-
-def test_a_tracker_without_a_map_says_why_there_is_no_file(store: RunStore) -> None:
-    (record,) = run_many([PLAIN.model_copy(update={"tracker": "never-move"})], results=store)
-    assert record.status == "ok" and record.maps is None
-    assert record.notes == [f"no {MAP_FILE}: tracker 'never-move' cannot save its map"]
 
 
 def test_maps_that_never_met_are_said(tmp_path: Path) -> None:

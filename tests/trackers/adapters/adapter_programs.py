@@ -1,9 +1,5 @@
 """Small programs that speak the protocol, and what tests of them share."""
 
-import os
-import time
-from pathlib import Path
-
 import numpy as np
 
 from dynslam_bench.contracts.sequence import Frame
@@ -47,17 +43,3 @@ def frame(index, seed=0):
 def reset(tracker, seed=0):
     tracker.reset(CAMERA, rng=np.random.default_rng(seed))
     return tracker
-
-
-def gone(pid):
-    """Whether a process has ended (or is a zombie of somebody else's)."""
-    for _ in range(100):
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return True
-        status = Path(f"/proc/{pid}/stat")
-        if status.exists() and status.read_text().rsplit(")", 1)[1].split()[0] == "Z":
-            return True
-        time.sleep(0.02)
-    return False

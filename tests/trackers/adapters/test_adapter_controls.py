@@ -421,9 +421,8 @@ class Fisheye(Camera):
     ],
 )
 def test_cameras_it_cannot_take(camera, expected):
-    with pytest.raises(TrackerError, match=expected) as caught:
+    with pytest.raises(TrackerError, match=expected):
         check_camera(camera, OrbSlam3Settings())
-    assert "\n" not in str(caught.value)
 
 
 def test_cameras_it_can_take():
@@ -474,10 +473,8 @@ def test_damaged_vocabularies(tmp_path, content, expected):
         (tmp_path / "v.txt.xz", lzma.compress(content.encode())),
     ):
         path.write_bytes(data)
-        with pytest.raises(TrackerError, match=expected) as caught:
+        with pytest.raises(TrackerError, match=rf"v\.txt.*{expected}.*DYNSLAM_BENCH_ORB_VOCABULARY"):
             find_vocabulary(str(path))
-        message = str(caught.value)
-        assert "\n" not in message and "v.txt" in message and "DYNSLAM_BENCH_ORB_VOCABULARY" in message
 
 
 def test_vocabularies_that_are_not_there(tmp_path):
