@@ -7,7 +7,6 @@ from typing import Annotated, Optional
 import typer
 
 from dynslam_bench.cli import (
-    bank,
     demo,
     interrupted,
     leave_interrupted,
@@ -42,7 +41,7 @@ app.add_typer(trackers.app, name="trackers", rich_help_panel=START)
 for verb in (running.run, running.bench):
     app.command(rich_help_panel=MEASURE, cls=ShortHelp)(verb)
 app.add_typer(runs.app, name="runs", rich_help_panel=MEASURE)
-app.add_typer(bank.app, name="bank", rich_help_panel=MEASURE)
+app.add_typer(runs.banks, name="bank", rich_help_panel=MEASURE)
 app.command("eval", rich_help_panel=MEASURE)(trajectories.evaluate)
 app.add_typer(trajectories.protocols, name="protocols", rich_help_panel=MEASURE)
 app.command("import", rich_help_panel=MEASURE)(trajectories.import_)

@@ -60,6 +60,7 @@ _TABLE = (
     "CREATE TABLE IF NOT EXISTS computed "
     "(name TEXT, run_id TEXT, version TEXT, state TEXT, value TEXT, PRIMARY KEY (name, run_id))"
 )
+_VALUES = "SELECT run_id, state, value FROM computed WHERE name = ? AND version = ?"
 _LOCKED_S = 10.0
 Row = dict[str, Any]
 
@@ -92,7 +93,7 @@ class RunIndex:
 
     def get(self, name: str, version: str, run_id: str) -> str | None:
         """The value of one run, as `read` gives it."""
-        rows = self._select("name = ? AND version = ? AND run_id = ?", (name, version, run_id))
+        rows = self._query(f"{_VALUES} AND run_id = ?", name, version, run_id)
         return next((value for _, state, value in rows if self._holds(run_id, state, value)), None)
 
     def read(self, name: str, version: str, run_ids: Iterable[str], *, check_links: bool = False) -> dict[str, str]:
@@ -107,16 +108,14 @@ class RunIndex:
         stored = set(run_ids)
         return {
             run_id: value
-            for run_id, state, value in self._select("name = ? AND version = ?", (name, version))
+            for run_id, state, value in self._query(_VALUES, name, version)
             if run_id in stored and self._holds(run_id, state, value)
             if not check_links or self._is_plain(run_id, state)
         }
 
-    def _select(self, condition: str, arguments: tuple[str, ...]) -> list[tuple[Any, Any, Any]]:
+    def _query(self, command: str, *arguments: str) -> list[tuple[Any, ...]]:
         with contextlib.suppress(sqlite3.Error), self._opened(create=False) as connection:
-            return connection.execute(
-                f"SELECT run_id, state, value FROM computed WHERE {condition}", arguments
-            ).fetchall()
+            return connection.execute(command, arguments).fetchall()
         return []
 
     def _holds(self, run_id: str, state: Any, value: Any) -> bool:
@@ -143,9 +142,7 @@ class RunIndex:
 
     def names(self) -> set[str]:
         """Names of the values that are kept."""
-        with contextlib.suppress(sqlite3.Error), self._opened(create=False) as connection:
-            return {str(name) for (name,) in connection.execute("SELECT DISTINCT name FROM computed")}
-        return set()
+        return {str(name) for (name,) in self._query("SELECT DISTINCT name FROM computed")}
 
     def _change(self, command: str, rows: Sequence[tuple[str, ...]]) -> None:
         for _ in range(2):

@@ -131,11 +131,11 @@ class _SentReport(ConformanceReport):
 
 def work(job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]) -> dict[str, Any]:
     """The child's work: the checks whose outcome is not known yet."""
-    from dynslam_bench.testing.tracker import run_tracker_checks
+    from dynslam_bench.testing.tracker import tracker_report
 
     report = _SentReport([Check(**check) for check in job["known"]], send)
     try:
-        run_tracker_checks(report, job["tracker"], job["settings"], frames=job["frames"], seed=job["seed"])
+        tracker_report(job["tracker"], settings=job["settings"], frames=job["frames"], seed=job["seed"], report=report)
     except DynslamError as error:
         return {"type": "failed", "status": "crashed", "reason": str(error), "error": type(error).__name__}
     return {"type": "done", "subject": report.subject}

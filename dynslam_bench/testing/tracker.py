@@ -57,31 +57,14 @@ def tracker_report(
     sequence: Sequence | None = None,
     frames: int = 6,
     seed: int = 0,
+    report: ConformanceReport | None = None,
 ) -> ConformanceReport:
-    """Run all checks of `check_tracker` and report each.
+    """Run all checks of `check_tracker` and report each, in a report that names the tracker then; a new one by default.
 
     Raises:
         PluginError: There is no such tracker.
     """
-    report = ConformanceReport("")
-    run_tracker_checks(report, subject, settings, sequence, frames=frames, seed=seed)
-    return report
-
-
-def run_tracker_checks(
-    report: ConformanceReport,
-    subject: Subject,
-    settings: Settings | Mapping[str, Any] | None = None,
-    sequence: Sequence | None = None,
-    *,
-    frames: int,
-    seed: int,
-) -> None:
-    """Run all checks of `check_tracker` in a report, which names the tracker then; the arguments are those there.
-
-    Raises:
-        PluginError: There is no such tracker.
-    """
+    report = ConformanceReport("") if report is None else report
     spec = TRACKERS.get(subject) if isinstance(subject, str) else subject if isinstance(subject, TrackerSpec) else None
     report.subject = f"tracker {spec.id!r}" if spec else ConformanceReport.of("tracker", subject).subject
     scene, turning = sequence if sequence is not None else CornerSequence(frames), TurningSequence()
@@ -89,7 +72,7 @@ def run_tracker_checks(
         report.run("spec", lambda: _spec(spec, settings))
     run = _Runner(report, spec or subject, settings, scene, frames, seed)
     if not (report.run("construction", lambda: _construction(run)) and report.run("results", lambda: _results(run))):
-        return
+        return report
     deterministic = spec is None or spec.deterministic
     turning_run = _Runner(report, spec or subject, settings, turning, len(turning), seed)
     report.run_all(
@@ -106,6 +89,7 @@ def run_tracker_checks(
             "closing": lambda: _closing(run),
         }
     )
+    return report
 
 
 class _Runner:

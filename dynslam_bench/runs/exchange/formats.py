@@ -57,9 +57,6 @@ def _stamps_by_name(path: Path) -> dict[str, float]:
     )
 
 
-EUROC_HEADING = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
-
-
 def is_pose_table(path: Path) -> bool:
     """Whether a file begins with the heading of such a table.
 
@@ -70,32 +67,31 @@ def is_pose_table(path: Path) -> bool:
     return "," in first and ("timestamp" in first or "(ns)" in first)
 
 
-def write_euroc(path: Path, trajectory: Trajectory) -> None:
-    """Write poses as EuRoC's ground truth is written.
+POSE_TABLES = {
+    "euroc": (
+        "data.csv",
+        "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
+        [0, 1, 2, 6, 3, 4, 5],
+    ),
+    "vslam-lab": ("00000_KeyFrameTrajectory.csv", ",".join(POSE), [0, 1, 2, 3, 4, 5, 6]),
+}
+"""Tables of poses as EuRoC's ground truth and VSLAM-LAB's systems write them: their file, their heading, and their
+columns behind the stamp, of ``tx ty tz qx qy qz qw``."""
+
+
+def write_pose_table(folder: Path, form: str, trajectory: Trajectory) -> None:
+    """Write poses as a table of `POSE_TABLES`.
 
     Raises:
         DynslamError: The file cannot be written.
     """
-    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
-    _write(path, EUROC_HEADING, trajectory, [[*p, q[3], *q[:3]] for p, q in zip(position, quaternion, strict=True)])
-
-
-def write_vslam_lab(path: Path, trajectory: Trajectory) -> None:
-    """Write poses as VSLAM-LAB's systems write theirs.
-
-    Raises:
-        DynslamError: The file cannot be written.
-    """
-    position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
-    _write(path, ",".join(POSE), trajectory, [[*p, *q] for p, q in zip(position, quaternion, strict=True)])
-
-
-def _write(path: Path, heading: str, trajectory: Trajectory, rows: list[list[float]]) -> None:
+    name, heading, columns = POSE_TABLES[form]
+    rows = np.concatenate(se3.to_quaternion(trajectory.T_world_cam), axis=1)[:, columns].tolist()
     lines = [
         f"{ns}," + ",".join(f"{value:.9f}" for value in row)
         for ns, row in zip(trajectory.timestamps_ns.tolist(), rows, strict=True)
     ]
-    write_atomic(path, "\n".join([heading, *lines]) + "\n")
+    write_atomic(folder / name, "\n".join([heading, *lines]) + "\n")
 
 
 IMAGES = "images.txt"

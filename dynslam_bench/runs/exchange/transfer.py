@@ -27,7 +27,7 @@ from dynslam_bench.geometry import (
     write_kitti,
     write_tum,
 )
-from dynslam_bench.runs.exchange.formats import read_trajectory, write_bag, write_colmap, write_euroc, write_vslam_lab
+from dynslam_bench.runs.exchange.formats import read_trajectory, write_bag, write_colmap, write_pose_table
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo
 from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
@@ -140,12 +140,12 @@ def _kitti(job: _Job, work: Path) -> list[str]:
 
 
 def _euroc(job: _Job, work: Path) -> list[str]:
-    write_euroc(work / "data.csv", job.trajectory)
+    write_pose_table(work, "euroc", job.trajectory)
     return ["the poses are the camera's, not a body's"]
 
 
 def _vslam_lab(job: _Job, work: Path) -> list[str]:
-    write_vslam_lab(work / "00000_KeyFrameTrajectory.csv", job.trajectory)
+    write_pose_table(work, "vslam-lab", job.trajectory)
     return []
 
 
