@@ -333,7 +333,7 @@ def test_output_to_a_closed_pipe_is_no_error():
     assert done.stderr == "" and done.stdout.startswith("7-Scenes"), "the first data set"
 
 
-# `eval` takes every format that it names, and never stamps that are no seconds.
+# `eval` takes every format that it names.
 
 
 @pytest.fixture
@@ -346,15 +346,6 @@ def pair(tmp_path):
     for name, trajectory in trajectories.items():
         write_tum(tmp_path / f"{name}.txt", trajectory)
     return trajectories
-
-
-def test_stamps_that_are_no_seconds_are_refused(cli, pair, tmp_path):
-    for name in pair:
-        lines = [line.split() for line in (tmp_path / f"{name}.txt").read_text().splitlines() if line[0] != "#"]
-        text = "".join(" ".join([stamp.replace(".", ""), *rest]) + "\n" for stamp, *rest in lines)
-        (tmp_path / f"{name}.txt").write_text(text)
-    code, _, err = cli("eval", "estimate.txt", "truth.txt")
-    assert code == 1 and "which are no seconds" in one_line(err)
 
 
 def test_hints_are_shown_of_files_runs_and_boards(cli, tmp_path):

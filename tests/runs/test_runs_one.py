@@ -394,33 +394,6 @@ def test_what_only_the_run_can_find_out_is_refused_likewise(store: RunStore, toy
 AT = 5
 
 
-def truncate(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:300])
-
-
-def truncate_jpeg(path: Path) -> None:
-    """A JPEG under a PNG's name, as decoders go by the content, cut off in the middle of the image."""
-    whole = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
-    path.write_bytes(whole[: len(whole) // 2])
-
-
-def shrink(path: Path) -> None:
-    cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[::2, ::2])
-
-
-def deepen(path: Path) -> None:
-    cv2.imwrite(str(path), cv2.imread(str(path)).astype(np.uint16) * 256)
-
-
-FAULTS = {
-    "truncated": (truncate, r"is truncated \(300 bytes\)"),
-    "truncated jpeg": (truncate_jpeg, r"is truncated \(\d+ bytes\)"),
-    "text": (lambda path: path.write_text("no image"), r"cannot be decoded \(8 bytes\)"),
-    "another size": (shrink, r"is 80x60, but the camera"),
-    "16 bits": (deepen, r"has 16 bits a channel, expected 8"),
-}
-
-
 @pytest.fixture
 def damaged(tmp_path: Path) -> tuple[str, Path]:
     """A sequence, and its colour image of frame `AT`."""
@@ -428,29 +401,24 @@ def damaged(tmp_path: Path) -> tuple[str, Path]:
     return str(folder), folder / (folder / "rgb.txt").read_text().split()[2 * AT + 1]
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_an_image_that_cannot_be_used_is_the_datas_fault(store: RunStore, damaged, fault: str) -> None:
+@pytest.mark.parametrize("spoilt", ["image", "mask"])
+def test_what_cannot_be_read_is_the_datas_fault(store: RunStore, damaged, tmp_path: Path, spoilt: str) -> None:
     folder, image = damaged
-    spoil, words = FAULTS[fault]
-    sound = image.read_bytes()
-    spoil(image)
-    with pytest.raises(RunError, match=rf"frame {AT} of '.*' cannot be read: .*{image.name} .*({words})"):
-        run_one(RunSpec(tracker="never-move", sequence=folder), store)
-    assert store.ids() == []
-    image.write_bytes(sound)
-    assert run_one(RunSpec(tracker="never-move", sequence=folder), store).status == "ok"
-
-
-def test_a_recorded_mask_that_cannot_be_decoded_is_the_datas_fault(store: RunStore, damaged, tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     masks.mkdir()
     for index in range(FRAMES):
         cv2.imwrite(str(masks / f"{index:06d}.png"), np.zeros((120, 160), np.uint8))
-    (masks / f"{AT:06d}.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    file = image if spoilt == "image" else masks / f"{AT:06d}.png"
+    sound = file.read_bytes()
+    jpeg = cv2.imencode(".jpg", cv2.imread(str(file)))[1].tobytes()  # decoders go by the content, not by the name
+    file.write_bytes(jpeg[: len(jpeg) // 2])
     settings = {"segmentation.source": f"recorded:{masks}"}
-    with pytest.raises(RunError, match=rf"frame {AT} of {FRAMES}: .*{AT:06d}\.png is truncated"):
-        run_one(RunSpec(tracker="mask-rcnn", sequence=damaged[0], settings=settings), store)
+    spec = RunSpec(tracker="mask-rcnn", sequence=folder, settings=settings)
+    with pytest.raises(RunError, match=rf"frame {AT} of .*{file.name} is truncated"):
+        run_one(spec, store)
     assert store.ids() == []
+    file.write_bytes(sound)
+    assert run_one(spec, store).status in ("ok", "lost")
 
 
 def test_one_bad_sequence_stops_no_other(store: RunStore, damaged, tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ import pytest
 from quick_dense import quick
 from steering_scene import FRAMES, SmallScene, construct, difference, play, settings_for
 
-from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import DynslamError, SegmentationError, SequenceError, SettingsError, TrackerError
@@ -282,17 +281,6 @@ def test_depth_is_never_read(plain_scene, tracker):
     else:
         assert sum(result.stats["culled"] for result in true) > 100
     assert difference(true, play(construct(spec, wild, **few), wild)) == ""
-
-
-def test_sequences_without_depth_are_for_monocular_trackers_alone(plain_scene):
-    plain_scene.has_depth = False
-    try:
-        check_sensors(TRACKERS.get("emfoa-oft-mono"), plain_scene)
-        with pytest.raises(TrackerError, match=r"'emfoa-oft' needs depth, and .*walking_xyz\?scene=103.* colour"):
-            check_sensors(TRACKERS.get("emfoa-oft"), plain_scene)
-    finally:
-        del plain_scene.has_depth
-    check_sensors(TRACKERS.get("emfoa-oft"), plain_scene)
 
 
 CACHED = 4
