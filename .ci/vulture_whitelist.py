@@ -31,6 +31,7 @@ ConstantVelocity  # trackers.adapters.specs
 NeverMove  # trackers.adapters.specs
 Open3dOdometry  # trackers.adapters.specs
 OpenCvOdometry  # trackers.adapters.specs
+unavailable  # trackers.adapters.specs: whether it can be had
 OrbSlam3  # trackers.adapters.specs
 OrbSlam3Monocular  # trackers.adapters.specs
 Svo  # trackers.adapters.specs
