@@ -208,7 +208,7 @@ def pull(source: str, bank: str | Path) -> Merged:
     with ExitStack() as stack:
         folder = Path(source)
         if _ARCHIVE.fullmatch(source):
-            archive = stack.enter_context(closing(TemporaryFolder())).path / "archive"
+            archive = stack.enter_context(closing(TemporaryFolder())).path / Path(source.partition("?")[0]).name
             download(source, archive)
             unpacked = open_store(archive)
             folder = unpacked.root
@@ -278,8 +278,9 @@ def _is_repository(place: str) -> bool:
 def _cloned(repository: str) -> Iterator[Path]:
     with closing(TemporaryFolder()) as folder:
         origin = repository if _ADDRESS.fullmatch(repository) else str(Path(repository).absolute())
-        _git(folder.path, "clone", "--quiet", "--config", "core.autocrlf=false", "--", origin, "bank")
-        yield folder.path / "bank"
+        clone = folder.path / "unpacked" / Path(repository).name  # so that errors name the repository
+        _git(folder.path, "clone", "--quiet", "--config", "core.autocrlf=false", "--", origin, str(clone))
+        yield clone
 
 
 def _git(folder: Path, verb: str, *words: str) -> None:

@@ -536,6 +536,9 @@ def test_an_archive_is_pulled_from_its_address(made, tmp_path, monkeypatch):
 
     monkeypatch.setattr(bank, "download", download)
     assert len(bank.pull("https://example.org/bank.zip", tmp_path / "pulled").added) == 2
+    altered(made)
+    with pytest.raises(RunError, match=r"^bank\.zip/bank-main has faults"):
+        bank.pull("https://example.org/bank.zip", tmp_path / "pulled")
 
 
 def walk(folder, drift=0.0):
