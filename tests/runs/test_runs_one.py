@@ -298,23 +298,6 @@ def test_a_part_of_a_sequence_has_the_stamps_of_its_frames(folder: Path) -> None
     assert [format_ns(ns) for ns in env.online_trajectory().timestamps_ns.tolist()] == stamps()[1:5:2]
 
 
-@pytest.mark.parametrize("name", ["groundtruth.txt", "rgb.txt"])
-def test_stamps_a_fifth_of_a_microsecond_apart_are_refused_before_tracking(
-    store: RunStore, folder: Path, name: str, tmp_path: Path
-) -> None:
-    good = write_folder(tmp_path / "good", FRAMES)
-    lines = (folder / name).read_text().splitlines()
-    lines.insert(3, f"{format_ns(START + 2 * STEP + 200)} {lines[2].partition(' ')[2]}")
-    (folder / name).write_text("\n".join(lines) + "\n")
-    with pytest.raises(DynslamError, match=rf"{name}.*200 ns apart"):
-        resolve(RunSpec(tracker=TARGET, sequence=str(folder)))
-    told: list[str] = []
-    specs = [RunSpec(tracker=TARGET, sequence=str(place)) for place in (good, folder, good)]
-    records = run_many(specs, results=store, on_fault=lambda spec, error: told.append(str(error)))
-    assert [record.status for record in records] == ["ok", "ok"] and len(told) == 1
-    assert store.ids() == [records[0].run_id]
-
-
 def test_a_data_set_of_the_users_may_state_its_nanoseconds() -> None:
     sequence = ToySequence(6)
     sequence.timestamps_ns = from_seconds(sequence.timestamps.tolist()) + 3
