@@ -917,19 +917,21 @@ _DEPTH_FOR_LEVER = 0.5
 
 
 def _described(name: str, fit: Fit, size: float, sigma: float, errors: str, camera: Camera) -> Finding:
-    value = fit.value[_GROUPS[name][0]]
-    factor, facts = float(np.exp(value[0])), {"sigma": sigma, "percent": 100 * sigma, "errors": errors}
-    if name == "focal":
-        return fault("camera-focal-length", factor, fx=camera.fx * factor, fy=camera.fy * factor, **facts)
-    if name == "centre":
-        dx, dy = float(fit.value["cx"][0]), float(fit.value["cy"][0])
-        return fault("camera-principal-point", size, dx=dx, dy=dy, cx=camera.cx + dx, cy=camera.cy + dy, **facts)
-    if name == "scale":
-        return fault("depth-factor", factor, new=camera.depth_factor / factor, old=camera.depth_factor, **facts)
-    if name == "turn":
-        turn = se3.exp(np.concatenate([np.zeros(3), value]))[:3, :3]
-        return fault("truth-axes/fit", float(np.degrees(size)), matrix=_turn(turn), **facts)
-    return fault("truth-lever-arm", size, lever=", ".join(f"{metres:+.3f}" for metres in value), **facts)
+    """The finding of a group of `_GROUPS`; each takes what it needs of all values."""
+    focal, dx, dy, scale = (float(fit.value[part][0]) for part in ("focal", "cx", "cy", "scale"))
+    by, depth, turn = np.exp(focal), np.exp(scale), se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
+    case, value = {
+        "focal": ("camera-focal-length", by),
+        "centre": ("camera-principal-point", size),
+        "scale": ("depth-factor", depth),
+        "turn": ("truth-axes/fit", np.degrees(size)),
+        "lever": ("truth-lever-arm", size),
+    }[name]
+    return fault(
+        case, value, sigma=sigma, percent=100 * sigma, errors=errors, fx=camera.fx * by, fy=camera.fy * by,
+        dx=dx, dy=dy, cx=camera.cx + dx, cy=camera.cy + dy, new=camera.depth_factor / depth, old=camera.depth_factor,
+        matrix=_turn(turn), lever=", ".join(f"{metres:+.3f}" for metres in fit.value["lever"]),
+    )  # fmt: skip
 
 
 # Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.

@@ -836,7 +836,7 @@ def _attacked(name: str, damaged: tuple[str, ...]) -> Target:
         for file, content in _files(name).items():
             at(folder, file, content)
         at(folder, damaged[first % GONE % len(damaged)], None if data is None or first >= GONE else data[1:])
-        contents = layout_of(name).read(folder)
+        contents = layout_of(name).read(folder, None)
         camera = Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0)
         sequence = RecordedSequence(folder, contents, camera, id="fuzz", any_depth_size=True)
         for index in range(min(len(sequence), 3)):

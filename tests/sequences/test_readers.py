@@ -171,7 +171,7 @@ def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, at):
     else:
         (tmp_path / "s" / file).write_text(content)
     with pytest.raises(DynslamError, match=words) as caught:
-        layout_of(name).read(tmp_path / "s")
+        layout_of(name).read(tmp_path / "s", None)
         sequence = open_sequence(tmp_path / "s")
         [sequence[i] for i in range(len(sequence))]
     assert "\n" not in str(caught.value) and str(tmp_path / "s") in str(caught.value)
