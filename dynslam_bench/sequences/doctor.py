@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
@@ -499,7 +498,7 @@ def _correlation(colour: Map, depth: Map) -> Map:
     return np.fft.irfft2(spectrum, s=colour.shape[1:]).astype(np.float32)
 
 
-def _by_delay(streams: Streams, delays: PySequence[int]) -> tuple[Map, NDArray[np.intp]]:
+def _by_delay(streams: Streams, delays: range) -> tuple[Map, NDArray[np.intp]]:
     """Correlation of every second colour image with the depth so many frames later.
 
     Returns:
@@ -659,7 +658,7 @@ def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
 
 
 def _shifted(streams: Streams) -> Finding | None:
-    sums, pairs = _by_delay(streams, (-1, 0, 1))
+    sums, pairs = _by_delay(streams, range(-1, 2))
     middle = sums / np.maximum(pairs, 1)[:, None, None]
     peaks = [(*_peak(surface, 30), surface) for surface in middle]
     clear, (row, column), surface = max(peaks, key=lambda peak: float(peak[2][peak[1]]))
@@ -715,9 +714,7 @@ _MISREAD = {
 }
 
 
-def truth_findings(
-    stamps: Array, truth: Trajectory | None, camera: Camera, pairs: PySequence[RgbdPair]
-) -> list[Finding]:
+def truth_findings(stamps: Array, truth: Trajectory | None, camera: Camera, pairs: list[RgbdPair]) -> list[Finding]:
     """What the truth of a recording does not share with its images, then what camera and depth do not.
 
     Args:
@@ -845,7 +842,7 @@ def _turn(R_body_cam: Array) -> str:
 
 
 def _measured(
-    motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: PySequence[RgbdPair]
+    motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: list[RgbdPair]
 ) -> list[Finding]:
     """Of a truth whose rotations are the camera's: units, positions' axes, then camera, depth and lever arm."""
     first, relative, turns, valid = truth.between(motions.start + stated.shift_s, motions.end + stated.shift_s)
@@ -887,7 +884,7 @@ def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Ma
     return []
 
 
-def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> list[Finding]:
+def _fitted(pairs: list[RgbdPair], relative: Array, camera: Camera) -> list[Finding]:
     """The one of focal length, principal point, depth scale, axes and lever arm that explains the errors best."""
     before = fit_camera(pairs, relative, camera, ())
     fits = {name: fit_camera(pairs, relative, camera, names) for name, names in _GROUPS.items()}
@@ -988,7 +985,7 @@ def _reprojection_errors(
     return np.asarray(moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre - second)
 
 
-def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, free: PySequence[str]) -> Fit:
+def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tuple[str, ...]) -> Fit:
     """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
 
     Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.

@@ -3,8 +3,7 @@
 The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
 """
 
-from collections.abc import Iterable, Iterator
-from collections.abc import Sequence as PySequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -166,7 +165,7 @@ class Motions:
     depth_m: float
 
 
-def motions_of(pairs: PySequence[RgbdPair], stamps: Array) -> Motions:
+def motions_of(pairs: Sequence[RgbdPair], stamps: Array) -> Motions:
     """The motions of pairs that have one."""
     poses = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
     first, second = [pair.first for pair in pairs], [pair.second for pair in pairs]
