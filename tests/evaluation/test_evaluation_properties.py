@@ -131,21 +131,21 @@ def test_motion_on_a_line_is_aligned_to_the_minimum_and_the_roll_comes_from_the_
 # -- holes, coverage, policies
 
 
-def test_a_hole_in_the_ground_truth_is_measured_and_named():
-    truth = walk(n=300)
-    result = evaluate(noisy(truth), truth.select(np.r_[0:100, 160:300]))
-    assert result.n_pairs == 240
-    assert (result.association.in_holes, result.association.outside, result.association.taken) == (60, 0, 0)
-    assert result.association.largest_hole_s == pytest.approx(61 / 30, abs=1e-5)
-    assert any("60 of 300 poses" in line for line in result.diagnostics)
-
-
-def test_poses_outside_and_doubly_claimed_are_told_apart():
-    truth = walk(n=100)
-    assert evaluate(noisy(truth), truth.select(slice(0, 80))).association.outside == 20
-    claimed = evaluate(noisy(truth), truth.select(slice(0, None, 2)), Protocol(id="x", max_dt=0.05))
-    assert claimed.n_pairs == 50
-    assert claimed.association.taken == 50
+@pytest.mark.parametrize(
+    ("frames", "max_dt", "dropped", "hole"),
+    [
+        (np.r_[0:100, 160:200], 0.02, (60, 0, 0), 61),
+        (np.r_[0:180], 0.02, (0, 20, 0), 20),
+        (np.r_[0:200:2], 0.05, (0, 0, 100), 2),
+    ],
+    ids=["in a hole", "outside", "doubly claimed"],
+)
+def test_poses_without_a_true_one_are_told_apart_and_named(frames, max_dt, dropped, hole):
+    result = evaluate(ESTIMATE, TRUTH.select(frames), Protocol(id="x", max_dt=max_dt))
+    record, lost = result.association, sum(dropped)
+    assert (record.in_holes, record.outside, record.taken) == dropped and result.n_pairs == 200 - lost
+    assert record.largest_hole_s == pytest.approx(hole / 30, abs=1e-5)
+    assert any(f"{lost} of 200 poses" in line for line in result.diagnostics)
 
 
 @pytest.mark.parametrize("strict", [True, False])

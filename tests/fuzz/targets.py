@@ -34,7 +34,6 @@ from dynslam_bench.core import (
     settings,
     toml,
 )
-from dynslam_bench.core.records import Record
 from dynslam_bench.core.stage_cache import StageCache  # what of the cache reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.geometry import Camera, load_tum, read_kitti
@@ -199,17 +198,7 @@ def _read_entry(data: bytes | None, folder: Path) -> None:
     assert found is None or found.cost_s == 0.1
 
 
-def _summary(cls: type[Record], seed: str) -> dict[str, Any]:
-    return {
-        "read": lambda data, folder: cls.read(at(folder, "record.json", data)),
-        "seeds": lambda: [_stored(seed)],
-        "mutation": mutate_json,
-    }
-
-
-def _receipt_seeds() -> list[bytes]:
-    made = fetch.Receipt(id="tum/x", url="https://host/x.tgz", sha256="0" * 64, size_bytes=1, checked=True, files=3)
-    return [made.to_json().encode()]
+RECEIPT = fetch.Receipt(id="tum/x", url="https://host/x.tgz", sha256="0" * 64, size_bytes=1, checked=True, files=3)
 
 
 def _snapshot_seeds() -> list[bytes]:
@@ -242,13 +231,18 @@ RECORDS = [
         lambda: [_stored(f"runs/{RUN}/frames.csv")],
     ),
     Target("packed run", lambda data, folder: running.unpack(data or b"", RunStore(folder)), _packed_seeds, mutate_zip),
-    Target("study's summary", **_summary(StudySummary, "studies/small/summary.json")),
+    Target(
+        "study's summary",
+        lambda data, folder: StudySummary.read(at(folder, "record.json", data)),
+        lambda: [_stored("studies/small/summary.json")],
+        mutate_json,
+    ),
     Target("stored study", _read_study, _study_seeds, mutate_json),
     Target("journal of a study", _read_journal, lambda: [_stored("studies/small/journal.log")], mutate_lines),
     Target(
         "receipt of a fetch",
         lambda data, folder: fetch.Receipt.read(at(folder, "fetched.json", data)),
-        _receipt_seeds,
+        lambda: [RECEIPT.to_json().encode()],
         mutate_json,
     ),
     Target(
@@ -303,10 +297,6 @@ def _of_text(read: Callable[[str], object]) -> Callable[[bytes | None, Path], ob
     return lambda data, _: read(_text_of(data))
 
 
-def _read_kitti(data: bytes | None, folder: Path) -> None:
-    read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n"))
-
-
 def _read_folder(data: bytes | None, folder: Path) -> None:
     """A list names files: none of them may lie outside, whatever it says; pairs and poses are told by their start."""
     if data and data.startswith(PAIRS[:8]):
@@ -356,15 +346,6 @@ def _read_answer(text: str) -> None:
     subprocess_tracker.read_final_answer(answer, "program at finalize")
 
 
-def _override(text: str) -> None:
-    assigned = settings.parse_assignments(text.split("\n"))
-    settings.apply_overrides(FewSettings(), assigned)
-
-
-def _read_settings(data: bytes | None, folder: Path) -> None:
-    settings.apply_overrides(FewSettings(), toml.read_settings(at(folder, "s.toml", data)))
-
-
 def _harmless(text: str) -> None:
     """Whatever a record says, the terminal gets no escape, the file no half character, the path no way out."""
     assert not set(sanitise.printable(text)) & {chr(code) for code in (*range(9), *range(14, 32), 0x9B, 0x202E)}
@@ -404,7 +385,7 @@ TEXTS = [
     ),
     Target(
         "KITTI trajectory",
-        _read_kitti,
+        lambda data, folder: read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n")),
         lambda: [
             *(b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3" + b"\n" * ends for ends in (1, 2)),
             *(b"# none\n\n", b"1 0 0 0 0 1 0 0 0 0 1 x\n", b"1 2 3\n", b"2 0 0 0 0 2 0 0 0 0 2 0\n"),
@@ -435,7 +416,7 @@ TEXTS = [
     ),
     Target(
         "settings file",
-        _read_settings,
+        lambda data, folder: settings.apply_overrides(FewSettings(), toml.read_settings(at(folder, "s.toml", data))),
         lambda: [
             b"[settings]\n[settings.tracking]\nradius_px = 15\n",
             *(b"a.b = 1\n", b"settings = 3\n", b'tracking.radius_px = "' + b"a" * 300 + b'"\n'),
@@ -444,7 +425,7 @@ TEXTS = [
     ),
     Target(
         "--set",
-        _of_text(_override),
+        _of_text(lambda text: settings.apply_overrides(FewSettings(), settings.parse_assignments(text.split("\n")))),
         lambda: [
             b"tracking.radius_px=15\ntracking.local_map=all",
             *(b"x=1", b"tracking=1", b"tracking.radius_px.x=1", b"a.b.c=1", b"tracking.x=1"),
@@ -715,10 +696,6 @@ def _read_prepared(data: bytes | None, folder: Path) -> None:
     labelled_images.PreparedImages(folder, ("person",))
 
 
-def _read_vocabulary(data: bytes | None, folder: Path) -> None:
-    orbslam3._check(orbslam3._unpack(data or b""), folder / "voc.txt")
-
-
 def _vocabularies() -> list[bytes]:
     node = " ".join(["0", "1", *["7"] * 32, "0.5"])
     texts = (f"10 1 0 0\n{node}\n{node}\n\n", f"10 1 0 0\n{node}\nx\n", f"10 1 0 0\n{node.replace('1', '0', 1)}\n",
@@ -761,7 +738,7 @@ BINARIES = [
     Target("prepared images", _read_prepared, lambda: [PREPARED, PREPARED + b"x"]),
     Target(
         "vocabulary",
-        _read_vocabulary,
+        lambda data, folder: orbslam3._check(orbslam3._unpack(data or b""), folder / "voc.txt"),
         _vocabularies,
         _repressed,
         allowed=(orbslam3.TrackerError, lzma.LZMAError, EOFError, ValueError),

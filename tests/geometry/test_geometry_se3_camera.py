@@ -138,19 +138,21 @@ def test_distortion_does_not_depend_on_the_resolution():
 
 
 @pytest.mark.parametrize(
-    ("stamps", "broken", "named"),
+    ("stamps", "exact", "broken", "named"),
     [
-        ([0.0, 1.0], 0.0, "2 stamps but 3 poses"),
-        ([0.0, 1.0, 1.0], 0.0, r"not strictly increasing: 1\.0+ then 1\.0+"),
-        ([0.0, 1.0, np.nan], 0.0, "not finite"),
-        ([0.0, 1.0, 2.0], np.inf, "not finite"),
+        ([0.0, 1.0], None, 0.0, "2 stamps but 3 poses"),
+        ([0.0, 1.0, 1.0], None, 0.0, r"not strictly increasing: 1\.0+ then 1\.0+"),
+        ([0.0, 1.0, 1.0 + 4e-10], None, 0.0, r"increasing in nanoseconds: 1\.000000000 then 1\.000000000"),
+        ([0.0, 1.0, np.nan], None, 0.0, "not finite"),
+        ([0.0, 1.0, 2.0], None, np.inf, "not finite"),
+        ([0.0, 1.0, 2.0], [10**9], 0.0, "3 stamps but 1 in ns"),
     ],
 )
-def test_trajectory_refuses_what_is_none(stamps, broken, named):
+def test_trajectory_refuses_what_is_none(stamps, exact, broken, named):
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[1, 0, 3] = broken
     with pytest.raises(TrajectoryError, match=named):
-        Trajectory(np.array(stamps), poses)
+        Trajectory(np.array(stamps), poses, exact)
 
 
 def test_trajectory_views():

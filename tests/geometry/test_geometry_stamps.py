@@ -119,11 +119,6 @@ def test_a_tolerance_is_met_or_missed_as_in_tums_script() -> None:
     assert 0 < len(expected) < 300 and found.tolist() == expected
 
 
-def test_nanoseconds_and_poses_are_as_many() -> None:
-    with pytest.raises(TrajectoryError, match="2 stamps but 1 in ns"):
-        Trajectory(np.array([1.0, 2.0]), np.tile(np.eye(4), (2, 1, 1)), np.array([10**9]))
-
-
 # The greedy associator against a slow transcription of the published rule.
 
 
@@ -266,17 +261,10 @@ def test_tum_missing_folder_and_binary_files(tmp_path):
             read_tum(tmp_path / name)
 
 
-def test_stamps_that_no_file_tells_apart_make_no_trajectory():
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    with pytest.raises(
-        TrajectoryError, match=r"not strictly increasing in nanoseconds: 1\.000000000 then 1\.000000000"
-    ):
-        Trajectory(np.array([1.0, 1.0 + 4e-10]), poses)
-    assert Trajectory(np.array([1.0, 1.0 + 2e-9]), poses).timestamps_ns.tolist() == [1_000_000_000, 1_000_000_002]
-
-
-def test_empty_trajectory_formats_to_its_header():
-    assert format_tum(Trajectory(np.zeros(0), np.zeros((0, 4, 4)))) == "# timestamp tx ty tz qx qy qz qw\n"
+def test_stamps_that_a_file_tells_apart_make_a_trajectory_also_none():
+    close = Trajectory(np.array([1.0, 1.0 + 2e-9]), np.tile(np.eye(4), (2, 1, 1)))
+    assert close.timestamps_ns.tolist() == [1_000_000_000, 1_000_000_002]
+    assert format_tum(close.select(slice(0, 0))) == "# timestamp tx ty tz qx qy qz qw\n"
 
 
 def test_kitti_round_trip_and_evo(tmp_path):
