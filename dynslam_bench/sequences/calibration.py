@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise, product
 from typing import Any
 
 import cv2
@@ -414,16 +415,13 @@ def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, 
     free = allowed.copy()
     for x, y in taken:
         cv2.circle(free, (int(x), int(y)), 12, 0, -1)
-    rows, columns = 4, 5
-    per_cell = int(np.ceil(1.5 * count / (rows * columns)))
+    rows, columns = np.linspace(0, height, 5).astype(int).tolist(), np.linspace(0, width, 6).astype(int).tolist()
     pixels = [np.zeros((0, 2), np.float32)]
-    for r in range(rows):
-        for c in range(columns):
-            ys = slice(r * height // rows, (r + 1) * height // rows)
-            xs = slice(c * width // columns, (c + 1) * width // columns)
-            in_cell = cv2.goodFeaturesToTrack(image[ys, xs], per_cell, 0.02, 12, mask=free[ys, xs])
-            if in_cell is not None:
-                pixels.append(np.asarray(in_cell.reshape(-1, 2) + np.array([xs.start, ys.start]), np.float32))
+    for (top, bottom), (left, right) in product(pairwise(rows), pairwise(columns)):
+        cell = np.s_[top:bottom, left:right]
+        in_cell = cv2.goodFeaturesToTrack(image[cell], int(np.ceil(1.5 * count / 20)), 0.02, 12, mask=free[cell])
+        if in_cell is not None:
+            pixels.append(np.asarray(in_cell.reshape(-1, 2) + np.array([left, top]), np.float32))
     return np.concatenate(pixels)
 
 

@@ -464,23 +464,20 @@ class Streams:
 
     def add(self, stretch: list[Frame]) -> None:
         """Add consecutive frames of one size."""
-        colour_maps, depth_maps = [], []
-        self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
+        grays = [np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for frame in stretch]
+        depths = [frame.depth for frame in stretch]
+        measured = [depth[::4, ::4][depth[::4, ::4] > 0] for depth in depths]
+        deep = [len(values) >= 100 for values in measured]
+        self.dark += sum(bool(gray.std() < 1.0) for gray in grays)
+        self.empty += deep.count(False)
+        self.medians += [float(np.median(values)) for values, enough in zip(measured, deep, strict=True) if enough]
+        self.rough += [_roughness(depths[i], self.depth_factor) for i in range(0, len(stretch), 5) if deep[i]]
         self.colour_run = max(self.colour_run, _longest_run([frame.rgb for frame in stretch]))
-        self.depth_run = max(self.depth_run, _longest_run([frame.depth for frame in stretch]))
-        for number, frame in enumerate(stretch):
-            gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-            valid = frame.depth[::4, ::4]
-            valid = valid[valid > 0]
-            self.dark += bool(gray.std() < 1.0)
-            self.empty += bool(len(valid) < 100)
-            if len(valid) >= 100:
-                self.medians.append(float(np.median(valid)))
-                if number % 5 == 0:
-                    self.rough.append(_roughness(frame.depth, self.depth_factor))
-            colour_maps.append(_standardised(_colour_contours(gray, self.cell_px)))
-            depth_maps.append(_standardised(_depth_contours(frame.depth, self.cell_px)))
-        self.contours.append((np.stack(colour_maps), np.stack(depth_maps)))
+        self.depth_run = max(self.depth_run, _longest_run(depths))
+        self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
+        colour_maps = np.stack([_standardised(_colour_contours(gray, self.cell_px)) for gray in grays])
+        depth_maps = np.stack([_standardised(_depth_contours(depth, self.cell_px)) for depth in depths])
+        self.contours.append((colour_maps, depth_maps))
 
 
 def _longest_run(images: list[NDArray[Any]]) -> int:
