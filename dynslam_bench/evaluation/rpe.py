@@ -117,10 +117,8 @@ def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
     if spec.unit == "s":
         return stamps
     steps = se3.inverse(poses[:-1]) @ poses[1:]
-    if spec.unit == "m":
-        step = np.asarray(np.linalg.norm(steps[:, :3, 3], axis=1), dtype=np.float64)
-    else:
-        step = se3.rotation_angle(steps) * _ANGLES[spec.unit]
+    by_metres = spec.unit == "m"
+    step = np.linalg.norm(steps[:, :3, 3], axis=1) if by_metres else se3.rotation_angle(steps) * _ANGLES[spec.unit]
     return np.asarray(np.concatenate([np.zeros(1), np.cumsum(step)]), dtype=np.float64)
 
 

@@ -136,8 +136,9 @@ def load_tum(path: str | Path) -> TumFile:
         back_s=float(-np.diff(ns).min(initial=0)) / 1e9,
     )
     every_line = RepeatedStamps(to_seconds(exact), se3.from_quaternion(lines[:, 1:4], lines[:, 4:8]), exact)
-    last = np.flatnonzero(last_of_stamp)
-    trajectory = Trajectory(every_line.timestamps[last], every_line.T_world_cam[last], exact[last])
+    trajectory = Trajectory(
+        every_line.timestamps[last_of_stamp], every_line.T_world_cam[last_of_stamp], exact[last_of_stamp]
+    )
     return TumFile(trajectory, notes, every_line if notes.duplicates else None)
 
 
@@ -160,10 +161,9 @@ def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
     stamps = [format_ns(ns) for ns in trajectory.timestamps_ns.tolist()]
     position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
     rows = np.concatenate([position, quaternion], axis=1).tolist()
-    lines = [f"# {line}" for line in comment.splitlines()] + [f"# {_COLUMNS}"]
-    for stamp, row in zip(stamps, rows, strict=True):
-        lines.append(f"{stamp} " + " ".join(f"{value:.9f}" for value in row))
-    return "\n".join(lines) + "\n"
+    heading = [f"# {line}" for line in (*comment.splitlines(), _COLUMNS)]
+    lines = [" ".join([stamp, *map("{:.9f}".format, row)]) for stamp, row in zip(stamps, rows, strict=True)]
+    return "\n".join([*heading, *lines]) + "\n"
 
 
 def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
