@@ -75,8 +75,8 @@ class Evaluation(Record):
 
     def summary(self) -> str:
         """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""
-        known = self.coverage is not None
-        covered = f", {100 * self.coverage:.1f} % of {self.n_input} frames tracked" if known else ""
+        share = self.coverage
+        covered = "" if share is None else f", {100 * share:.1f} % of {self.n_input} frames tracked"
         return (
             f"ATE (rmse) {self.metrics['ate_rmse_m']:.4f} m over {self.n_pairs} poses{covered} "
             f"[{self.protocol_id} {self.protocol_digest}]"

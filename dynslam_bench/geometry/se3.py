@@ -54,7 +54,7 @@ def inverse(pose: Array) -> Array:
     return from_matrix(-(rotation_t @ pose[..., :3, 3:])[..., 0], rotation_t)
 
 
-def from_matrix(translation: Array, rotation: Array) -> Array:
+def from_matrix(translation: NDArray[np.integer | np.floating], rotation: NDArray[np.integer | np.floating]) -> Array:
     """Poses ``[..., 4, 4]`` of translations ``[..., 3]`` and rotation matrices ``[..., 3, 3]``."""
     pose = np.zeros((*rotation.shape[:-2], 4, 4))
     pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, translation, 1.0
