@@ -84,13 +84,10 @@ def test_hits_lie_on_their_surfaces(walking) -> None:
     world = points @ view.pose[:3, :3].T + view.pose[:3, 3]
     local = np.einsum("nji,nj->ni", view.rotation[prims], world - view.origin[prims]) / scene.scale[prims]
     shape, kind = scene.shape[prims], scene.kind[prims]
-    box = kind != 1
-    axis = faces[box] >> 1
-    expected = np.where(kind[box] == 2, 0.0, shape[box, axis])
-    assert np.abs(np.abs(local[box, axis]) - expected).max() < 1e-9
-    cone = ~box
-    h, r1, r2 = shape[cone].T
-    p = local[cone]
+    box, cone, axis = kind != 1, kind == 1, faces >> 1
+    expected = np.where(kind[box] == 2, 0.0, shape[box, axis[box]])
+    assert np.abs(np.abs(local[box, axis[box]]) - expected).max() < 1e-9
+    (h, r1, r2), p = shape[cone].T, local[cone]
     radial = np.hypot(p[:, 0], p[:, 1])
     # Signed distance of a round cone: the nearest point of its axis, in the slanted metric of its side.
     sine = np.where(h > 0, (r1 - r2) / np.where(h > 0, h, 1), 0)
@@ -199,11 +196,9 @@ OTHERWISE = {"sin", "cos", "tan", "arcsin", "arccos", "arctan", "arctan2", "atan
 def fingerprint(id: str, index: int, threads: int = 1) -> str:
     """A hash of a frame's colours, depth, masks and flow, and of all poses."""
     sequence = open_synthetic(id, None, threads=threads)
-    frame, total = sequence[index], hashlib.sha256()
-    flow, poses = sequence.flow(index, index - 1), sequence.ground_truth.T_world_cam
-    for part in (frame.rgb, frame.depth, sequence.masks[index].instances, flow, poses):
-        total.update(part.tobytes())
-    return total.hexdigest()[:16]
+    frame, flow, poses = sequence[index], sequence.flow(index, index - 1), sequence.ground_truth.T_world_cam
+    parts = (frame.rgb, frame.depth, sequence.masks[index].instances, flow, poses)
+    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()[:16]
 
 
 @pytest.mark.parametrize(("id", "index", "renderer", "family", "expected"), KEPT)
