@@ -417,9 +417,11 @@ def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, 
         cv2.circle(free, (int(x), int(y)), 12, 0, -1)
     rows, columns = np.linspace(0, height, 5).astype(int).tolist(), np.linspace(0, width, 6).astype(int).tolist()
     pixels = [np.zeros((0, 2), np.float32)]
-    for (top, bottom), (left, right) in product(pairwise(rows), pairwise(columns)):
+    cells = list(product(pairwise(rows), pairwise(columns)))
+    per_cell = int(np.ceil(1.5 * count / len(cells)))
+    for (top, bottom), (left, right) in cells:
         cell = np.s_[top:bottom, left:right]
-        in_cell = cv2.goodFeaturesToTrack(image[cell], int(np.ceil(1.5 * count / 20)), 0.02, 12, mask=free[cell])
+        in_cell = cv2.goodFeaturesToTrack(image[cell], per_cell, 0.02, 12, mask=free[cell])
         if in_cell is not None:
             pixels.append(np.asarray(in_cell.reshape(-1, 2) + np.array([left, top]), np.float32))
     return np.concatenate(pixels)
