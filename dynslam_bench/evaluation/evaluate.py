@@ -75,9 +75,8 @@ class Evaluation(Record):
 
     def summary(self) -> str:
         """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""
-        covered = ""
-        if self.coverage is not None:
-            covered = f", {100 * self.coverage:.1f} % of {self.n_input} frames tracked"
+        share = self.coverage
+        covered = "" if share is None else f", {100 * share:.1f} % of {self.n_input} frames tracked"
         return (
             f"ATE (rmse) {self.metrics['ate_rmse_m']:.4f} m over {self.n_pairs} poses{covered} "
             f"[{self.protocol_id} {self.protocol_digest}]"
@@ -113,9 +112,7 @@ def evaluate(
     estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
     comparison = compare(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     diagnostics += comparison.similarity.doubts(comparison.truth)
-    metrics: dict[str, float] = {}
-    for metric in METRICS:
-        metrics |= metric(comparison)
+    metrics = {name: value for metric in METRICS for name, value in metric(comparison).items()}
     similarity = comparison.similarity
     return Evaluation(
         protocol_id=protocol.id,

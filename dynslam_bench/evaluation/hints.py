@@ -109,15 +109,8 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
         repeated = f", {notes.duplicates} of {notes.lines} lines repeat a stamp" if notes.duplicates else ""
         evidence.append(f"the stamps of the file go back by {notes.back_s:.0f} s{repeated}")
         numbers |= {"back_s": notes.back_s, "repeated_stamps": float(notes.duplicates)}
-    if not evidence:
-        return []
-    return [
-        Hint(
-            "several-recordings",
-            f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one",
-            numbers,
-        )
-    ]
+    text = f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one"
+    return [Hint("several-recordings", text, numbers)] if evidence else []
 
 
 # -- time ----------------------------------------------------------------------------------------------------------
@@ -399,8 +392,8 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
     """
     pairs = _pairs(stamps)
     true_poses = truth.at(stamps)
-    true = _relative(true_poses, pairs)
-    as_read, _ = _compare(_relative(poses, pairs), true)
+    true = se3.between(true_poses, pairs)
+    as_read, _ = _compare(se3.between(poses, pairs), true)
     if as_read < UNEXPLAINED or not np.isfinite(as_read):
         return [], poses
     limit = min(EXPLAINED, as_read / CLEARLY)
@@ -408,12 +401,12 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
         covered = truth.covers(stamps + shift)
         covered_pairs = pairs[covered[pairs].all(axis=1)]
         limit = min(
-            limit, _compare(_relative(poses, covered_pairs), _relative(truth.at(stamps + shift), covered_pairs))[0]
+            limit, _compare(se3.between(poses, covered_pairs), se3.between(truth.at(stamps + shift), covered_pairs))[0]
         )
     candidates: list[tuple[float, Convention, Array]] = []
     for convention in CONVENTIONS:
         undone = convention.undo(poses)
-        error, varies = _compare(_relative(undone, pairs), true)
+        error, varies = _compare(se3.between(undone, pairs), true)
         if error < limit and varies > VARIES:
             candidates.append((error, convention, undone))
     candidates = candidates or _in_axes_of_a_body(poses, pairs, true, true_poses)
@@ -437,11 +430,11 @@ def _in_axes_of_a_body(
     poses: Array, pairs: NDArray[np.intp], true: Array, true_poses: Array
 ) -> list[tuple[float, Convention, Array]]:
     """The convention where the truth is that of a body with axes of its own, such as a set of markers; none or one."""
-    motions = _relative(poses, pairs)
+    motions = se3.between(poses, pairs)
     as_turned, _ = _compare(motions, true, R_est_cam=_axes(motions, true))
     for convention in CONVENTIONS[:2]:
         undone = convention.undo(poses)
-        motions = _relative(undone, pairs)
+        motions = se3.between(undone, pairs)
         error, varies = _compare(motions, true, R_est_cam=_axes(motions, true))
         fits = convention.id != "inverted-poses" or (
             2 * fit(undone, true_poses).misfit <= fit(poses, true_poses).misfit
@@ -463,7 +456,7 @@ def _pairs(stamps: Array) -> NDArray[np.intp]:
 
 def _axes(motions: Array, true: Array) -> Array:
     """Rotation from the truth's axes to the estimate's that explains most of the rotations."""
-    u, _, vt = np.linalg.svd(_axis(motions).T @ _axis(true))
+    u, _, vt = np.linalg.svd(se3.sine_axes(motions)[0].T @ se3.sine_axes(true)[0])
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
 
@@ -492,7 +485,7 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
     moving = angle >= np.median(angle)
     if (turned := float(np.median(angle[moving]))) > ROTATES_DEG:
         off = np.rad2deg(se3.rotation_angle(se3.inverse(motions[moving]) @ true[moving]))
-        scores.append((float(np.median(off)) / turned, _correlation(_axis(motions), _axis(true))))
+        scores.append((float(np.median(off)) / turned, _correlation(se3.sine_axes(motions)[0], se3.sine_axes(true)[0])))
     length = np.linalg.norm(true[:, :3, 3], axis=1)
     moving = length >= np.median(length)
     moved, estimated = true[moving, :3, 3], motions[moving, :3, 3]
@@ -503,12 +496,6 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
         )
         scores.append((float(np.median(off)) / true_length, _correlation(motions[:, :3, 3], true[:, :3, 3])))
     return max((error for error, _ in scores), default=np.inf), max((good for _, good in scores), default=0.0)
-
-
-def _reordered(poses: Array) -> Array:
-    """The poses of a file whose quaternions stand as ``qw qx qy qz``."""
-    position, quaternion = se3.to_quaternion(poses)
-    return se3.from_quaternion(position, np.roll(quaternion, -1, axis=1))
 
 
 @dataclass(frozen=True)
@@ -539,7 +526,7 @@ CONVENTIONS = (
         "quaternion-order",
         "the quaternions seem to be in the order qw qx qy qz",
         "after re-ordering; write them as qx qy qz qw",
-        _reordered,
+        se3.w_first,
     ),
     Convention(
         "inverted-rotations",
@@ -563,10 +550,6 @@ CONVENTIONS = (
 """The likeliest first."""
 
 
-def _relative(poses: Array, pairs: NDArray[np.intp]) -> Array:
-    return np.asarray(se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]])
-
-
 def _correlation(first: Array, second: Array) -> float:
     """Correlation of vectors ``[N, 3]`` about their means, jumps left out; 0 where one does not vary."""
     length = np.linalg.norm(first, axis=1)
@@ -576,9 +559,3 @@ def _correlation(first: Array, second: Array) -> float:
     if sizes[0] <= 0.1 * np.linalg.norm(length[usual]) or not sizes[1] > 0:
         return 0.0
     return float((first * second).sum() / (sizes[0] * sizes[1]))
-
-
-def _axis(motions: Array) -> Array:
-    """Axes of rotation, as long as the sines of the angles ``[N, 3]``."""
-    r = motions[:, :3, :3]
-    return np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2

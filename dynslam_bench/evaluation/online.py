@@ -114,7 +114,6 @@ class OnlineError:
             frame_trans, frame_rot = float(np.linalg.norm(gap[:3, 3])), float(np.rad2deg(se3.rotation_angle(gap)))
             if pose is None:
                 self._lost_way_m += frame_trans
-        tracked = pose is not None
         return OnlineSample(
-            trans, rot, frame_trans, frame_rot, self._way_m, tracked, self._lost_way_m, truth, self._held
+            trans, rot, frame_trans, frame_rot, self._way_m, pose is not None, self._lost_way_m, truth, self._held
         )

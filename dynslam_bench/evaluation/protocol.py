@@ -21,7 +21,21 @@ Truth = Literal["as-is", "bonn-camera", "bonn-droid-w"]
 
 MONOCULAR = "tum-rgbd/v1-sim3"
 """Id of the protocol for trackers whose scale is unknown: that of TUM with a Sim(3) alignment."""
-_UNIT_NAMES = {"f": "frame", "s": "s", "m": "m", "rad": "rad", "deg": "deg"}
+_PHRASES = {
+    "none": "no alignment",
+    "origin": "origin-aligned",
+    "se3": "SE(3)-aligned",
+    "sim3": "Sim(3)-aligned",
+    "yaw": "yaw- and position-aligned",
+    "exclude": "lost frames excluded",
+    "hold": "lost frames held at the last pose",
+    "bonn-camera": "Bonn's truth moved to the camera",
+    "bonn-droid-w": "Bonn's truth as DROID-W corrects it",
+    "tum-fixed": "TUM pairs",
+    "consecutive": "consecutive pairs",
+    "all": "all pairs",
+}
+"""What the choices of a protocol are called in its description."""
 
 
 class _Frozen(BaseModel):
@@ -75,9 +89,8 @@ class RPESpec(_Frozen):
         """For example ``1 s (TUM pairs)``."""
         if self.pairs == "tum-random":
             return f"{self.max_pairs} random pairs" if self.max_pairs else "all pairs"
-        plural = "s" if self.unit == "f" and self.delta != 1 else ""
-        kind = {"tum-fixed": "TUM pairs", "consecutive": "consecutive pairs", "all": "all pairs"}[self.pairs]
-        return f"{self.delta:g} {_UNIT_NAMES[self.unit]}{plural} ({kind}{', as a rate' if self.rate else ''})"
+        unit = self.unit if self.unit != "f" else "frame" if self.delta == 1 else "frames"
+        return f"{self.delta:g} {unit} ({_PHRASES[self.pairs]}{', as a rate' if self.rate else ''})"
 
 
 class Protocol(_Frozen):
@@ -163,30 +176,15 @@ class Protocol(_Frozen):
 
     def describe(self) -> str:
         """One line for captions: everything that the numbers depend on."""
-        alignment = {
-            "none": "no alignment",
-            "origin": "origin-aligned",
-            "se3": "SE(3)-aligned",
-            "sim3": "Sim(3)-aligned",
-            "yaw": "yaw- and position-aligned",
-        }
-        lost = {
-            "exclude": "lost frames excluded",
-            "hold": "lost frames held at the last pose",
-        }
-        truths = {
-            "bonn-camera": "Bonn's truth moved to the camera",
-            "bonn-droid-w": "Bonn's truth as DROID-W corrects it",
-        }
         parts = [
-            alignment[self.alignment],
+            _PHRASES[self.alignment],
             f"|dt| {'<' if self.strict else '<='} {self.max_dt:g} s {'one-to-one' if self.one_to_one else 'nearest'}",
             *(["RPE over " + " and ".join(spec.describe() for spec in self.rpe)] if self.rpe else []),
             *(["segments of " + ", ".join(f"{s:g}" for s in self.segments_m) + " m"] if self.segments_m else []),
-            *([truths[self.truth]] if self.truth != "as-is" else []),
+            *([_PHRASES[self.truth]] if self.truth != "as-is" else []),
             *([f"every {self.every} matched frames, at most {self.most_frames or 'all'}"] if self.thins else []),
             f"{self.trajectory} trajectory",
-            lost[self.lost_frames],
+            _PHRASES[self.lost_frames],
         ]
         return f"{self.id}: " + ", ".join(parts) + f" [{self.digest()}]"
 

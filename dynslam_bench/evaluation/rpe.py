@@ -57,9 +57,9 @@ def tum_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
     tolerance = 2 * float(np.median(np.diff(truth.timestamps))) if len(truth) > 1 else 0.0
     covered = nearest_gap(estimate.timestamps, truth.timestamps) <= tolerance
     pairs = pairs[covered[pairs[:, 0]] & covered[pairs[:, 1]]]
-    steps = _relative(estimate.T_world_cam, pairs)
+    steps = se3.between(estimate.T_world_cam, pairs)
     steps[:, :3, 3] *= comparison.similarity.scale
-    true_steps = _relative(truth.T_world_cam, nearest[pairs])
+    true_steps = se3.between(truth.T_world_cam, nearest[pairs])
     return steps @ se3.inverse(true_steps), np.diff(estimate.timestamps[pairs], axis=1)[:, 0]
 
 
@@ -74,12 +74,8 @@ def evo_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
         As `tum_relative_errors`.
     """
     pairs = select_pairs(comparison.stamps, comparison.aligned, spec)
-    errors = se3.inverse(_relative(comparison.truth, pairs)) @ _relative(comparison.aligned, pairs)
+    errors = se3.inverse(se3.between(comparison.truth, pairs)) @ se3.between(comparison.aligned, pairs)
     return errors, np.diff(comparison.stamps[pairs], axis=1)[:, 0]
-
-
-def _relative(poses: Array, pairs: Index) -> Array:
-    return np.asarray(se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]])
 
 
 # Which pairs of poses a relative pose error is taken over: TUM's two ways and evo's two.
@@ -121,10 +117,8 @@ def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
     if spec.unit == "s":
         return stamps
     steps = se3.inverse(poses[:-1]) @ poses[1:]
-    if spec.unit == "m":
-        step = np.asarray(np.linalg.norm(steps[:, :3, 3], axis=1), dtype=np.float64)
-    else:
-        step = se3.rotation_angle(steps) * _ANGLES[spec.unit]
+    by_metres = spec.unit == "m"
+    step = np.linalg.norm(steps[:, :3, 3], axis=1) if by_metres else se3.rotation_angle(steps) * _ANGLES[spec.unit]
     return np.asarray(np.concatenate([np.zeros(1), np.cumsum(step)]), dtype=np.float64)
 
 
@@ -202,7 +196,7 @@ def segment_errors(estimate: Array, ground_truth: Array, lengths_m: Sequence[flo
     ends = np.searchsorted(travelled, travelled[starts] + metres, side="right")
     inside = ends < len(travelled)
     metres, pairs = metres[inside], np.stack([starts, ends], axis=1)[inside]
-    error = se3.inverse(_relative(estimate, pairs)) @ _relative(ground_truth, pairs)
+    error = se3.inverse(se3.between(estimate, pairs)) @ se3.between(ground_truth, pairs)
     return np.linalg.norm(error[:, :3, 3], axis=1) / metres * 100, np.rad2deg(se3.rotation_angle(error)) / metres
 
 

@@ -1,14 +1,7 @@
 """SE(3): exponential, logarithm, inverse, quaternions; poses are 4x4 float64 matrices, batched along leading axes."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 """Numbers; docstrings state the shape."""
@@ -35,11 +28,8 @@ def exp(xi: Array) -> Array:
     c = np.where(small, 1 / 6 - theta**2 / 120, (safe - np.sin(safe)) / safe**3)
     skew = hat(phi)
     skew2 = skew @ skew
-    pose = np.zeros((*xi.shape[:-1], 4, 4))
-    pose[..., :3, :3] = np.eye(3) + a * skew + b * skew2
-    pose[..., :3, 3] = ((np.eye(3) + b * skew + c * skew2) @ rho[..., None])[..., 0]
-    pose[..., 3, 3] = 1.0
-    return pose
+    translation = ((np.eye(3) + b * skew + c * skew2) @ rho[..., None])[..., 0]
+    return from_matrix(translation, np.eye(3) + a * skew + b * skew2)
 
 
 def log(pose: Array) -> Array:
@@ -61,11 +51,14 @@ def inverse(pose: Array) -> Array:
     """Inverse poses, by transposition of the rotation."""
     pose = np.asarray(pose, dtype=np.float64)
     rotation_t = np.swapaxes(pose[..., :3, :3], -1, -2)
-    result = np.zeros_like(pose)
-    result[..., :3, :3] = rotation_t
-    result[..., :3, 3] = -(rotation_t @ pose[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
+    return from_matrix(-(rotation_t @ pose[..., :3, 3:])[..., 0], rotation_t)
+
+
+def from_matrix(translation: NDArray[np.integer | np.floating], rotation: NDArray[np.integer | np.floating]) -> Array:
+    """Poses ``[..., 4, 4]`` of translations ``[..., 3]`` and rotation matrices ``[..., 3, 3]``."""
+    pose = np.zeros((*rotation.shape[:-2], 4, 4))
+    pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, translation, 1.0
+    return pose
 
 
 def from_quaternion(translation: Array, quaternion: Array) -> Array:
@@ -73,43 +66,44 @@ def from_quaternion(translation: Array, quaternion: Array) -> Array:
 
     Quaternions of any length but 0 are rotations, also of one whose square is no number any more.
     """
-    translation = np.asarray(translation, dtype=np.float64)
+    from scipy.spatial.transform import Rotation  # loaded when needed: code that only copies poses does not load it
+
     quaternion = np.asarray(quaternion, dtype=np.float64)
     largest = np.abs(quaternion).max(axis=-1, keepdims=True, initial=0.0)
     if ((largest > _SQUARES) | ((largest > 0) & (largest < 1 / _SQUARES))).any():
         quaternion = quaternion / np.where(largest > 0, largest, 1.0)
-    pose = np.zeros((*translation.shape[:-1], 4, 4))
-    rotation = _rotations().from_quat(quaternion.reshape(-1, 4)).as_matrix()
-    pose[..., :3, :3] = rotation.reshape(*translation.shape[:-1], 3, 3)
-    pose[..., :3, 3] = translation
-    pose[..., 3, 3] = 1.0
-    return pose
+    rotation = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix()
+    return from_matrix(translation, rotation.reshape(*quaternion.shape[:-1], 3, 3))
 
 
 def to_quaternion(pose: Array) -> tuple[Array, Array]:
     """Translations ``[..., 3]`` and unit quaternions ``[..., 4]`` (qx qy qz qw, qw >= 0) of poses ``[..., 4, 4]``."""
+    from scipy.spatial.transform import Rotation
+
     pose = np.asarray(pose, dtype=np.float64)
-    quaternion = _rotations().from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
+    quaternion = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
     return pose[..., :3, 3].copy(), quaternion.reshape(*pose.shape[:-2], 4)
 
 
 def rotation_angle(pose: Array) -> Array:
     """Rotation angles ``[...]`` in rad, in [0, pi], all of them accurate: by sine and cosine together."""
-    return _sine_axes(pose)[1]
+    return sine_axes(pose)[1]
 
 
 def rotation_vectors(pose: Array) -> Array:
     """Rotation vectors ``[..., 3]`` in rad of poses or rotation matrices, of length in [0, pi]."""
     pose = np.asarray(pose, dtype=np.float64)
-    axes, angle = _sine_axes(pose)
+    axes, angle = sine_axes(pose)
     if np.max(angle, initial=0.0) > 3.0:  # near a half turn the sine does not tell the axis
-        rotation = _rotations().from_matrix(pose[..., :3, :3].reshape(-1, 3, 3))
+        from scipy.spatial.transform import Rotation
+
+        rotation = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3))
         return np.asarray(rotation.as_rotvec().reshape(*angle.shape, 3))
     sine = np.sin(angle)
     return np.asarray(axes * np.where(sine > 1e-9, angle / np.where(sine > 1e-9, sine, 1.0), 1.0)[..., None])
 
 
-def _sine_axes(pose: Array) -> tuple[Array, Array]:
+def sine_axes(pose: Array) -> tuple[Array, Array]:
     """Axes ``[..., 3]`` times the sine of the angle, and the angles ``[...]``, of rotations."""
     pose = np.asarray(pose, dtype=np.float64)
     x = pose[..., 2, 1] - pose[..., 1, 2]
@@ -131,9 +125,20 @@ def stands_still(poses: Array) -> bool:
     return bool(within and np.degrees(rotation_angle(moved)).max() <= STILL_DEG)
 
 
+def between(poses: Array, pairs: NDArray[np.intp]) -> Array:
+    """Motions ``[P, 4, 4]`` from one pose to the other of pairs ``[P, 2]`` of poses ``[N, 4, 4]``."""
+    return np.asarray(inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]])
+
+
 def transform(pose: Array, points: Array) -> Array:
     """Points ``[N, 3]`` moved by one pose ``[4, 4]``."""
     return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def w_first(pose: Array) -> Array:
+    """The poses ``[N, 4, 4]`` of a file that holds qw qx qy qz and was read as if it held qx qy qz qw."""
+    translation, quaternion = to_quaternion(pose)
+    return from_quaternion(translation, np.roll(quaternion, -1, axis=1))
 
 
 def with_rotation(pose: Array, rotation: Array) -> Array:
@@ -147,18 +152,10 @@ def is_pose(pose: object, tolerance: float = 1e-4) -> bool:
     """Whether the value is a finite 4x4 rigid transformation: orthonormal rotation, determinant 1, last row 0 0 0 1."""
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or not np.issubdtype(pose.dtype, np.floating):
         return False
-    if not np.isfinite(pose).all():
-        return False
     rotation = pose[:3, :3]
     return bool(
-        np.abs(rotation @ rotation.T - np.eye(3)).max() < tolerance
+        np.isfinite(pose).all()
+        and np.abs(rotation @ rotation.T - np.eye(3)).max() < tolerance
         and np.linalg.det(rotation) > 0
         and np.abs(pose[3] - (0, 0, 0, 1)).max() < tolerance
     )
-
-
-def _rotations() -> type[Rotation]:
-    """The rotations of scipy, loaded when first needed: code that only copies poses does not load them."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation

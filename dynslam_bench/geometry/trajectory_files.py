@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core import TrajectoryError, read_lines, write_atomic
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.rigs import nearest_rotation
 from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
@@ -104,8 +105,7 @@ def load_tum(path: str | Path) -> TumFile:
     Raises:
         TrajectoryError: As `read_tum`.
     """
-    path = Path(path)
-    values, numbers, texts = _read_table(path, 8, _COLUMNS)
+    values, numbers, texts = _read_table(Path(path), 8, _COLUMNS)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
     valid = finite & (norm >= _ZERO_NORM)
@@ -136,8 +136,9 @@ def load_tum(path: str | Path) -> TumFile:
         back_s=float(-np.diff(ns).min(initial=0)) / 1e9,
     )
     every_line = RepeatedStamps(to_seconds(exact), se3.from_quaternion(lines[:, 1:4], lines[:, 4:8]), exact)
-    last = np.flatnonzero(last_of_stamp)
-    trajectory = Trajectory(every_line.timestamps[last], every_line.T_world_cam[last], exact[last])
+    trajectory = Trajectory(
+        every_line.timestamps[last_of_stamp], every_line.T_world_cam[last_of_stamp], exact[last_of_stamp]
+    )
     return TumFile(trajectory, notes, every_line if notes.duplicates else None)
 
 
@@ -160,10 +161,9 @@ def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
     stamps = [format_ns(ns) for ns in trajectory.timestamps_ns.tolist()]
     position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
     rows = np.concatenate([position, quaternion], axis=1).tolist()
-    lines = [f"# {line}" for line in comment.splitlines()] + [f"# {_COLUMNS}"]
-    for stamp, row in zip(stamps, rows, strict=True):
-        lines.append(f"{stamp} " + " ".join(f"{value:.9f}" for value in row))
-    return "\n".join(lines) + "\n"
+    heading = [f"# {line}" for line in (*comment.splitlines(), _COLUMNS)]
+    lines = [" ".join([stamp, *map("{:.9f}".format, row)]) for stamp, row in zip(stamps, rows, strict=True)]
+    return "\n".join([*heading, *lines]) + "\n"
 
 
 def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
@@ -260,14 +260,12 @@ def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
         TrajectoryError: A file cannot be read, a line is malformed or no rigid pose, or the stamps do not fit.
     """
     rows = read_table(Path(path), 12, _MEANING)
-    poses = np.zeros((len(rows), 4, 4))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
-    poses[:, 3, 3] = 1.0
+    matrices = rows.reshape(-1, 3, 4)
+    poses = se3.from_matrix(matrices[:, :, 3], matrices[:, :, :3])
     for index, pose in enumerate(poses):
         if not se3.is_pose(pose, tolerance=1e-3):
             raise TrajectoryError(f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING)
-    u, _, vt = np.linalg.svd(poses[:, :3, :3])
-    poses[:, :3, :3] = u @ vt
+    poses = se3.with_rotation(poses, nearest_rotation(poses[:, :3, :3]))
     ns = read_stamps(Path(times))
     if len(ns) != len(poses):
         raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")

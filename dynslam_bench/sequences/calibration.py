@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise, product
 from typing import Any
 
 import cv2
@@ -24,8 +26,7 @@ from scipy.stats import t as student
 
 from dynslam_bench.contracts import Sequence
 from dynslam_bench.core import SequenceError, raising
-from dynslam_bench.geometry import Array, Camera
-from dynslam_bench.geometry.se3 import hat
+from dynslam_bench.geometry import Array, Camera, se3
 from dynslam_bench.sequences.rgbd_motion import follow_corners
 
 WINDOW_FRAMES = 16
@@ -302,50 +303,47 @@ def _over_windows(
 def _readout(estimate: Estimate, windows: list[Window], camera: Camera) -> Quantity:
     interval_s = float(np.median([np.median(np.diff(window.stamps)) for window in windows]))
     low, high = estimate.value - estimate.half, estimate.value + estimate.half
-    about = Quantity("readout_s", estimate.value, low, high)
+    measured = partial(Quantity, "readout_s", estimate.value, low, high)
     if not estimate.resolved:
         change = float(np.median([window.turning_change() for window in windows]))
-        return replace(
-            about,
+        return measured(
             reason=f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: the turning rate "
             f"changes by {change:.2f} rad/s within a window; turn the camera to and fro faster",
         )
     if high < 0 or estimate.value > interval_s + RESOLVED_S:
-        return replace(about, reason=f"outside of 0 to {1e3 * interval_s:.0f} ms, a frame's interval: check the stamps")
-    about = replace(about, observable=True)
+        return measured(reason=f"outside of 0 to {1e3 * interval_s:.0f} ms, a frame's interval: check the stamps")
     if low <= 0:
         agrees = "the interval contains 0: a global shutter, or as good as one"
-        return replace(about, written=0.0 if camera.readout_s > high else None, reason=agrees)
+        return measured(written=0.0 if camera.readout_s > high else None, observable=True, reason=agrees)
     if low <= camera.readout_s <= high:
-        return replace(about, reason=f"agrees with the camera's {1e3 * camera.readout_s:g} ms")
-    return replace(about, written=round(estimate.value, 4), reason="a rolling shutter")
+        return measured(observable=True, reason=f"agrees with the camera's {1e3 * camera.readout_s:g} ms")
+    return measured(written=round(estimate.value, 4), observable=True, reason="a rolling shutter")
 
 
 def _delay(estimate: Estimate, camera: Camera) -> Quantity:
     """The stamps that the reader gives have the camera's own delay added already."""
     low, high, own = estimate.value - estimate.half, estimate.value + estimate.half, camera.depth_delay_s
-    about = Quantity("depth_delay_s", own + estimate.value, own + low, own + high)
+    measured = partial(Quantity, "depth_delay_s", own + estimate.value, own + low, own + high)
     if not estimate.resolved:
-        return replace(
-            about,
+        return measured(
             reason=f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: too slow a motion",
         )
     if abs(estimate.value) > LARGEST_DELAY_S:
-        return replace(about, reason=f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?")
-    about = replace(about, observable=True)
+        return measured(reason=f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?")
     if low <= 0 <= high or abs(estimate.value) < SMALLEST_DELAY_S:
-        return replace(about, reason="colour and depth are exposed as their stamps say, to a sixth of a frame")
-    late = "later" if estimate.value > 0 else "earlier"
-    return replace(about, written=round(own + estimate.value, 4), reason=f"depth is exposed {late} than its stamps say")
+        return measured(
+            observable=True, reason="colour and depth are exposed as their stamps say, to a sixth of a frame"
+        )
+    reason = f"depth is exposed {'later' if estimate.value > 0 else 'earlier'} than its stamps say"
+    return measured(written=round(own + estimate.value, 4), observable=True, reason=reason)
 
 
 def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
     """The depth factor by which the windows' paths are as long as the ground truth's."""
-    about = Quantity("depth_factor")
-    truth = sequence.ground_truth
+    truth, name = sequence.ground_truth, "depth_factor"
     if truth is None or len(truth) < 2:
-        return replace(about, reason="there is no ground truth: images alone do not determine the unit of length")
-    used, scales, information = [], [], []
+        return Quantity(name, reason="there is no ground truth: images alone do not determine the unit of length")
+    used: list[tuple[Window, float, float]] = []
     for window in windows:
         stamps = window.start + window.stamps - window.stamps[0]
         after = np.clip(np.searchsorted(truth.timestamps, stamps), 1, len(truth) - 1)
@@ -359,25 +357,22 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
         scale = float((turn * true).sum()) / length
         error = float(((true - scale * turn) ** 2).sum()) / (3 * len(own) - 7)
         if scale > 0:
-            used.append(window)
-            scales.append(scale)
-            information.append(length / max(error, 1e-12))
-    if len(scales) < LEAST_WINDOWS:
-        return replace(about, reason=f"the ground truth covers {len(scales)} of {len(windows)} windows")
-    estimate = _over_windows(
-        used, np.array(scales), np.array(information), SYSTEMATIC_FACTOR * float(np.median(scales))
-    )
+            used.append((window, scale, length / max(error, 1e-12)))
+    if len(used) < LEAST_WINDOWS:
+        return Quantity(name, reason=f"the ground truth covers {len(used)} of {len(windows)} windows")
+    covered, scales, information = zip(*used, strict=True)
+    systematic = SYSTEMATIC_FACTOR * float(np.median(scales))
+    estimate = _over_windows(list(covered), np.array(scales), np.array(information), systematic)
     if estimate.half > RESOLVED_FACTOR * estimate.value:
         share = f"{estimate.half / estimate.value:.0%}"
-        return replace(
-            about, reason=f"interval of +- {share}, wanted +- {RESOLVED_FACTOR:.0%}: the camera's path is too short"
+        return Quantity(
+            name, reason=f"interval of +- {share}, wanted +- {RESOLVED_FACTOR:.0%}: the camera's path is too short"
         )
     factor = sequence.camera.depth_factor
     low, high = factor / (estimate.value + estimate.half), factor / (estimate.value - estimate.half)
-    about = replace(about, value=factor / estimate.value, low=low, high=high, observable=True)
-    if low <= factor <= high:
-        return replace(about, reason=f"agrees with the camera's {factor:g}")
-    return replace(about, written=float(f"{factor / estimate.value:.4g}"), reason=f"the camera states {factor:g}")
+    agrees, value = low <= factor <= high, factor / estimate.value
+    reason = f"agrees with the camera's {factor:g}" if agrees else f"the camera states {factor:g}"
+    return Quantity(name, value, low, high, None if agrees else float(f"{value:.4g}"), True, reason)
 
 
 # Bundle adjustment of a window whose camera moves continuously: every row and every depth image has its own time.
@@ -420,16 +415,15 @@ def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, 
     free = allowed.copy()
     for x, y in taken:
         cv2.circle(free, (int(x), int(y)), 12, 0, -1)
-    rows, columns = 4, 5
-    per_cell = int(np.ceil(1.5 * count / (rows * columns)))
+    rows, columns = np.linspace(0, height, 5).astype(int).tolist(), np.linspace(0, width, 6).astype(int).tolist()
     pixels = [np.zeros((0, 2), np.float32)]
-    for r in range(rows):
-        for c in range(columns):
-            ys = slice(r * height // rows, (r + 1) * height // rows)
-            xs = slice(c * width // columns, (c + 1) * width // columns)
-            in_cell = cv2.goodFeaturesToTrack(image[ys, xs], per_cell, 0.02, 12, mask=free[ys, xs])
-            if in_cell is not None:
-                pixels.append(np.asarray(in_cell.reshape(-1, 2) + np.array([xs.start, ys.start]), np.float32))
+    cells = list(product(pairwise(rows), pairwise(columns)))
+    per_cell = int(np.ceil(1.5 * count / len(cells)))
+    for (top, bottom), (left, right) in cells:
+        cell = np.s_[top:bottom, left:right]
+        in_cell = cv2.goodFeaturesToTrack(image[cell], per_cell, 0.02, 12, mask=free[cell])
+        if in_cell is not None:
+            pixels.append(np.asarray(in_cell.reshape(-1, 2) + np.array([left, top]), np.float32))
     return np.concatenate(pixels)
 
 
@@ -527,8 +521,7 @@ class Window:
                 raise Unusable("the points do not move as one rigid scene")
             chosen = inliers[:, 0]
             turn, shift = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], matrix, None, turn, shift)
-            step = np.eye(4)
-            step[:3, :3], step[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+            step = se3.from_matrix(shift[:, 0], cv2.Rodrigues(turn)[0])
             error = np.linalg.norm(self.camera.project(points @ step[:3, :3].T + step[:3, 3]) - pixels, axis=1)
             moving = np.flatnonzero(usable)[~(error < 6.0)]
             self.xy[moving, i + 1 :] = self.inverse_depth[moving, i + 1 :] = np.nan
@@ -633,7 +626,7 @@ class Window:
         by_point[..., 2, 2] = -1 / z**2
         by_point *= weight[..., None]
         by_world = by_point @ moment.R
-        by_pose = np.concatenate([-by_point @ hat(points), -by_world], axis=-1)  # rotation, centre
+        by_pose = np.concatenate([-by_point @ se3.hat(points), -by_world], axis=-1)  # rotation, centre
         moving = np.cross(moment.turning, points) - (moment.R @ moment.velocity[..., None])[..., 0]
         share = np.zeros((L, n, n))  # of each pose in the interpolated one
         np.put_along_axis(share, moment.nodes, moment.weights, axis=2)

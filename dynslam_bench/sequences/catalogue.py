@@ -3,7 +3,6 @@
 import fnmatch
 import re
 from collections.abc import Iterable, Iterator
-from collections.abc import Sequence as PySequence
 from functools import cache
 from itertools import groupby
 from operator import attrgetter
@@ -273,7 +272,7 @@ def _is_path(name: str) -> bool:
     return name.startswith((".", "/", "~", "\\"))
 
 
-def parse_frames(frames: PySequence[int | None] | str | None) -> tuple[int, int | None]:
+def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int | None]:
     """First frame and one past the last (None: to the end) of ``"A:B"``, ``"A:"``, ``":B"`` or a pair.
 
     Raises:
@@ -395,7 +394,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
     }
 
 
-def expand(names: PySequence[str]) -> list[str]:
+def expand(names: Iterable[str]) -> list[str]:
     """Ids that match patterns such as ``bonn/*``; everything else stays as it is.
 
     Raises:

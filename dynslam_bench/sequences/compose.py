@@ -266,10 +266,9 @@ def _poses(truth: Trajectory, stamps: NDArray[np.float64]) -> NDArray[np.float64
     """Interpolated poses ``[N, 4, 4]`` at stamps; beyond its ends those of the ends."""
     times = truth.timestamps
     at = np.clip(stamps, times[0], times[-1])
-    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
-    poses[:, :3, :3] = Slerp(times, Rotation.from_matrix(truth.T_world_cam[:, :3, :3]))(at).as_matrix()
-    poses[:, :3, 3] = np.stack([np.interp(at, times, axis) for axis in truth.T_world_cam[:, :3, 3].T], axis=1)
-    return poses
+    rotation = Slerp(times, Rotation.from_matrix(truth.T_world_cam[:, :3, :3]))(at).as_matrix()
+    places = np.stack([np.interp(at, times, axis) for axis in truth.positions.T], axis=1)
+    return se3.from_matrix(places, rotation)
 
 
 class _Actor:
@@ -310,9 +309,8 @@ class _Actor:
             distance_m = rng.uniform(*_DISTANCES_M)
             target = distance_m * np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.1, 0.2), 1.0])
             for scale in _SCALES:
-                T_start_people = np.eye(4)
-                T_start_people[:3, :3] = scale * self.turned
-                T_start_people[:3, 3] = scale * (target - self.turned @ np.median(centres, axis=0))
+                shift = scale * (target - self.turned @ np.median(centres, axis=0))
+                T_start_people = se3.from_matrix(shift, scale * self.turned)
                 self.T_world_people = self.T_world_cam[0] @ T_start_people
                 shares, hidden = [], []
                 for i, depth in zip(sampled, behind, strict=True):

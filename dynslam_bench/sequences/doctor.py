@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
@@ -465,23 +464,20 @@ class Streams:
 
     def add(self, stretch: list[Frame]) -> None:
         """Add consecutive frames of one size."""
-        colour_maps, depth_maps = [], []
-        self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
+        grays = [np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for frame in stretch]
+        depths = [frame.depth for frame in stretch]
+        measured = [depth[::4, ::4][depth[::4, ::4] > 0] for depth in depths]
+        deep = [len(values) >= 100 for values in measured]
+        self.dark += sum(bool(gray.std() < 1.0) for gray in grays)
+        self.empty += deep.count(False)
+        self.medians += [float(np.median(values)) for values, enough in zip(measured, deep, strict=True) if enough]
+        self.rough += [_roughness(depths[i], self.depth_factor) for i in range(0, len(stretch), 5) if deep[i]]
         self.colour_run = max(self.colour_run, _longest_run([frame.rgb for frame in stretch]))
-        self.depth_run = max(self.depth_run, _longest_run([frame.depth for frame in stretch]))
-        for number, frame in enumerate(stretch):
-            gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-            valid = frame.depth[::4, ::4]
-            valid = valid[valid > 0]
-            self.dark += bool(gray.std() < 1.0)
-            self.empty += bool(len(valid) < 100)
-            if len(valid) >= 100:
-                self.medians.append(float(np.median(valid)))
-                if number % 5 == 0:
-                    self.rough.append(_roughness(frame.depth, self.depth_factor))
-            colour_maps.append(_standardised(_colour_contours(gray, self.cell_px)))
-            depth_maps.append(_standardised(_depth_contours(frame.depth, self.cell_px)))
-        self.contours.append((np.stack(colour_maps), np.stack(depth_maps)))
+        self.depth_run = max(self.depth_run, _longest_run(depths))
+        self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
+        colour_maps = np.stack([_standardised(_colour_contours(gray, self.cell_px)) for gray in grays])
+        depth_maps = np.stack([_standardised(_depth_contours(depth, self.cell_px)) for depth in depths])
+        self.contours.append((colour_maps, depth_maps))
 
 
 def _longest_run(images: list[NDArray[Any]]) -> int:
@@ -499,7 +495,7 @@ def _correlation(colour: Map, depth: Map) -> Map:
     return np.fft.irfft2(spectrum, s=colour.shape[1:]).astype(np.float32)
 
 
-def _by_delay(streams: Streams, delays: PySequence[int]) -> tuple[Map, NDArray[np.intp]]:
+def _by_delay(streams: Streams, delays: range) -> tuple[Map, NDArray[np.intp]]:
     """Correlation of every second colour image with the depth so many frames later.
 
     Returns:
@@ -659,7 +655,7 @@ def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
 
 
 def _shifted(streams: Streams) -> Finding | None:
-    sums, pairs = _by_delay(streams, (-1, 0, 1))
+    sums, pairs = _by_delay(streams, range(-1, 2))
     middle = sums / np.maximum(pairs, 1)[:, None, None]
     peaks = [(*_peak(surface, 30), surface) for surface in middle]
     clear, (row, column), surface = max(peaks, key=lambda peak: float(peak[2][peak[1]]))
@@ -715,9 +711,7 @@ _MISREAD = {
 }
 
 
-def truth_findings(
-    stamps: Array, truth: Trajectory | None, camera: Camera, pairs: PySequence[RgbdPair]
-) -> list[Finding]:
+def truth_findings(stamps: Array, truth: Trajectory | None, camera: Camera, pairs: list[RgbdPair]) -> list[Finding]:
     """What the truth of a recording does not share with its images, then what camera and depth do not.
 
     Args:
@@ -845,7 +839,7 @@ def _turn(R_body_cam: Array) -> str:
 
 
 def _measured(
-    motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: PySequence[RgbdPair]
+    motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: list[RgbdPair]
 ) -> list[Finding]:
     """Of a truth whose rotations are the camera's: units, positions' axes, then camera, depth and lever arm."""
     first, relative, turns, valid = truth.between(motions.start + stated.shift_s, motions.end + stated.shift_s)
@@ -887,7 +881,7 @@ def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Ma
     return []
 
 
-def _fitted(pairs: PySequence[RgbdPair], relative: Array, camera: Camera) -> list[Finding]:
+def _fitted(pairs: list[RgbdPair], relative: Array, camera: Camera) -> list[Finding]:
     """The one of focal length, principal point, depth scale, axes and lever arm that explains the errors best."""
     before = fit_camera(pairs, relative, camera, ())
     fits = {name: fit_camera(pairs, relative, camera, names) for name, names in _GROUPS.items()}
@@ -917,19 +911,21 @@ _DEPTH_FOR_LEVER = 0.5
 
 
 def _described(name: str, fit: Fit, size: float, sigma: float, errors: str, camera: Camera) -> Finding:
-    value = fit.value[_GROUPS[name][0]]
-    factor, facts = float(np.exp(value[0])), {"sigma": sigma, "percent": 100 * sigma, "errors": errors}
-    if name == "focal":
-        return fault("camera-focal-length", factor, fx=camera.fx * factor, fy=camera.fy * factor, **facts)
-    if name == "centre":
-        dx, dy = float(fit.value["cx"][0]), float(fit.value["cy"][0])
-        return fault("camera-principal-point", size, dx=dx, dy=dy, cx=camera.cx + dx, cy=camera.cy + dy, **facts)
-    if name == "scale":
-        return fault("depth-factor", factor, new=camera.depth_factor / factor, old=camera.depth_factor, **facts)
-    if name == "turn":
-        turn = se3.exp(np.concatenate([np.zeros(3), value]))[:3, :3]
-        return fault("truth-axes/fit", float(np.degrees(size)), matrix=_turn(turn), **facts)
-    return fault("truth-lever-arm", size, lever=", ".join(f"{metres:+.3f}" for metres in value), **facts)
+    """The finding of a group of `_GROUPS`; each takes what it needs of all values."""
+    focal, dx, dy, scale = (float(fit.value[part][0]) for part in ("focal", "cx", "cy", "scale"))
+    by, depth, turn = np.exp(focal), np.exp(scale), se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
+    case, value = {
+        "focal": ("camera-focal-length", by),
+        "centre": ("camera-principal-point", size),
+        "scale": ("depth-factor", depth),
+        "turn": ("truth-axes/fit", np.degrees(size)),
+        "lever": ("truth-lever-arm", size),
+    }[name]
+    return fault(
+        case, value, sigma=sigma, percent=100 * sigma, errors=errors, fx=camera.fx * by, fy=camera.fy * by,
+        dx=dx, dy=dy, cx=camera.cx + dx, cy=camera.cy + dy, new=camera.depth_factor / depth, old=camera.depth_factor,
+        matrix=_turn(turn), lever=", ".join(f"{metres:+.3f}" for metres in fit.value["lever"]),
+    )  # fmt: skip
 
 
 # Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.
@@ -986,7 +982,7 @@ def _reprojection_errors(
     return np.asarray(moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre - second)
 
 
-def fit_camera(pairs: PySequence[RgbdPair], relative: Array, camera: Camera, free: PySequence[str]) -> Fit:
+def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tuple[str, ...]) -> Fit:
     """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
 
     Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.

@@ -25,13 +25,15 @@ class Preprocessed(Wrapped):
         settings: What to do.
 
     Attributes:
-        camera: Intrinsics of the images after preprocessing.
+        camera: Intrinsics after preprocessing: without distortion if it is removed, scaled along with the images.
     """
 
     def __init__(self, base: Sequence, settings: PreprocessingSettings) -> None:
         self.base = base
         self.settings = settings
-        self.camera = preprocessed_camera(base.camera, settings)
+        self.camera = base.camera.undistorted() if settings.undistort else base.camera
+        if settings.width is not None and settings.height is not None:
+            self.camera = self.camera.resized(settings.width, settings.height)
 
     @property
     def masks(self) -> MaskSource | None:
@@ -66,15 +68,6 @@ class Preprocessed(Wrapped):
 
 
 _undistortion = lru_cache(maxsize=4)(Camera.undistortion_maps)
-
-
-def preprocessed_camera(camera: Camera, settings: PreprocessingSettings) -> Camera:
-    """The camera after preprocessing: without distortion if it is removed, with the intrinsics scaled along."""
-    if settings.undistort:
-        camera = camera.undistorted()
-    if settings.width is not None and settings.height is not None:
-        camera = camera.resized(settings.width, settings.height)
-    return camera
 
 
 def resize(image: Image, width: int, height: int, *, colour: bool) -> Any:

@@ -3,8 +3,7 @@
 The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
 """
 
-from collections.abc import Iterable, Iterator
-from collections.abc import Sequence as PySequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,9 +105,7 @@ def measure_pair(first: Frame, second: Frame, start: Pixels, end: Pixels, camera
         rotation, translation = cv2.solvePnPRefineLM(
             points[inliers], b[inliers], camera.matrix, None, rotation, translation
         )
-        pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(rotation)[0].T
-        pose[:3, 3] = -pose[:3, :3] @ np.asarray(translation).reshape(3)
+        pose = se3.inverse(se3.from_matrix(translation[:, 0], cv2.Rodrigues(rotation)[0]))
     displacement, share = float(np.median(np.linalg.norm(b - a, axis=1))), float(np.mean(first.depth[::4, ::4] > 0))
     pose = pose if pose is not None and np.isfinite(pose).all() else None
     return RgbdPair(first.index, second.index, a, depth, b, inliers, pose, displacement, share)
@@ -168,7 +165,7 @@ class Motions:
     depth_m: float
 
 
-def motions_of(pairs: PySequence[RgbdPair], stamps: Array) -> Motions:
+def motions_of(pairs: Sequence[RgbdPair], stamps: Array) -> Motions:
     """The motions of pairs that have one."""
     poses = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
     first, second = [pair.first for pair in pairs], [pair.second for pair in pairs]
@@ -198,9 +195,8 @@ class TruthMotion:
         index = np.clip(np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2)
         low, high = self.stamps[index], self.stamps[index + 1]
         share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
-        poses, turn, slack = self.poses[index].copy(), np.zeros((len(stamps), 6)), 0.005
-        turn[:, 3:] = share * self._turns[index]
-        poses[:, :3, :3] = poses[:, :3, :3] @ se3.exp(turn)[:, :3, :3]
+        turn, slack = np.pad(share * self._turns[index], ((0, 0), (3, 0))), 0.005
+        poses = se3.with_rotation(self.poses[index], self.poses[index, :3, :3] @ se3.exp(turn)[:, :3, :3])
         poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
         inside = (stamps >= self.stamps[0] - slack) & (stamps <= self.stamps[-1] + slack)
         return poses, inside & (high - low <= self._widest)
@@ -215,11 +211,9 @@ class TruthMotion:
 def read_as(poses: Array, reading: str) -> Array:
     """Poses ``[N, 4, 4]`` of a file that was written in the convention `reading` and read as if in TUM's."""
     if reading.startswith("w first"):
-        position, quaternion = se3.to_quaternion(poses)
-        poses = se3.from_quaternion(position, quaternion[:, [1, 2, 3, 0]])
+        poses = se3.w_first(poses)
     if reading == "rotations inverted":
-        poses = poses.copy()
-        poses[:, :3, :3] = np.swapaxes(poses[:, :3, :3].copy(), 1, 2)
+        poses = se3.with_rotation(poses, np.swapaxes(poses[:, :3, :3], 1, 2))
     return se3.inverse(poses) if reading in ("inverted", "w first, inverted") else poses
 
 

@@ -38,13 +38,10 @@ def motion_tags(truth: Trajectory) -> set[str]:
     poses, duration_s = truth.T_world_cam[index], times[-1] - times[0]
     steps = se3.inverse(poses[:-1]) @ poses[1:]
     steps_m, turned_deg = np.linalg.norm(steps[:, :3, 3], axis=1), np.degrees(se3.rotation_angle(steps))
-    tags = set()
-    if steps_m.sum() >= FAST_M_S * duration_s or turned_deg.sum() >= FAST_DEG_S * duration_s:
-        tags.add("fast")
+    fast = steps_m.sum() >= FAST_M_S * duration_s or turned_deg.sum() >= FAST_DEG_S * duration_s
     some = np.linspace(0, len(index) - 1, min(len(index), MOST_POSES)).astype(int)
     path_m, positions = np.concatenate([[0.0], steps_m.cumsum()])[some], poses[some, :3, 3]
     apart_m = np.linalg.norm(positions[:, None] - positions, axis=2)
     closes = (apart_m <= LOOP_GAP_M) & (path_m - path_m[:, None] >= LOOP_PATH_M)
-    if apart_m.max() >= LOOP_EXTENT_M and closes.any():
-        tags.add("loop")
-    return tags
+    loop = apart_m.max() >= LOOP_EXTENT_M and closes.any()
+    return {tag for tag, holds in (("fast", fast), ("loop", loop)) if holds}

@@ -121,14 +121,16 @@ class Suite(Record):
             PluginError: A tracker is not known (with a did-you-mean).
             RunError: A tracker is given settings but is no part of the suite.
         """
-        shared: dict[str, Any] = {"frames": frames or self.frames, "stride": self.stride, "device": device}
-        shared |= {
+        shared: dict[str, Any] = {
+            "frames": frames or self.frames,
+            "stride": self.stride,
+            "device": device,
             "snapshots": snapshots,
             "threads": threads or self.threads,
             "cache": self.cache,
             "limits": self.limits,
+            "data_root": None if data_root is None else str(data_root),
         }
-        shared |= {"data_root": None if data_root is None else str(data_root)}
         entries = self._entries(trackers)
         return (
             RunSpec(

@@ -6,6 +6,8 @@ import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Mapping
+from contextlib import suppress
 from random import Random
 from typing import Any
 
@@ -110,21 +112,28 @@ def mutate_lines(data: bytes, random: Random) -> bytes:
     return b"\n".join(lines)
 
 
+def zipped(files: Mapping[str | zipfile.ZipInfo, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    """A zip archive of files by their names."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content, method)
+    return buffer.getvalue()
+
+
 def mutate_zip(data: bytes, random: Random) -> bytes:
     """A sound zip archive with right checksums, one of whose files or names is damaged."""
-    buffer = io.BytesIO()
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
-            chosen = random.choice(old.namelist())
-            for name in old.namelist():
-                content = old.read(name) if old.getinfo(name).file_size < 1 << 16 else b""
-                if name == chosen:
-                    content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
-                    name = random.choice((name, name, name, "../x.txt", "/etc/passwd", f"runs/{'0' * 16}/run.json"))
-                new.writestr(name, content)
+        with zipfile.ZipFile(io.BytesIO(data)) as old:
+            sizes = {entry.filename: entry.file_size for entry in old.infolist()}
+            files = {name: old.read(name) if size < 1 << 16 else b"" for name, size in sizes.items()}
     except Exception:  # a seed that is no archive any more is damaged as bytes
         return mutate(data, [data], random)
-    return buffer.getvalue()
+    name = random.choice(list(files))
+    content = files.pop(name)
+    content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
+    name = random.choice((name, name, name, "../x.txt", "/etc/passwd", f"runs/{'0' * 16}/run.json"))
+    return zipped(files | {name: content})
 
 
 def mutate_png(data: bytes, random: Random) -> bytes:
@@ -133,27 +142,26 @@ def mutate_png(data: bytes, random: Random) -> bytes:
         return data
     position, chunks = 8, []
     while position + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, position)
-        chunks.append((data[position + 4 : position + 8], data[position + 8 : position + 8 + length]))
-        position += 12 + length
+        end = position + 8 + struct.unpack_from(">I", data, position)[0]
+        chunks.append(data[position + 4 : end])
+        position = end + 4
     if not chunks:
         return data
     at = random.randrange(len(chunks))
-    kind, body = chunks[at]
-    if random.random() < 0.3 and body:  # the compressed pixels themselves
-        try:
-            body = zlib.compress(mutate(zlib.decompress(body), [], random), 1)
-        except zlib.error:
-            body = mutate(body, [], random)
-    else:
-        body = mutate(body, [], random)
-    chunks[at] = (kind, body)
+    kind, body = chunks[at][:4], chunks[at][4:]
+    damaged = mutate(body, [], random)
+    if random.random() < 0.3:  # the compressed pixels themselves
+        with suppress(zlib.error):
+            damaged = zlib.compress(mutate(zlib.decompress(body), [], random), 1)
+    chunks[at] = kind + damaged
     if random.random() < 0.1:
         chunks.insert(random.randrange(len(chunks)), random.choice(chunks))
-    out = [data[:8]]
-    for kind, body in chunks:
-        out.append(struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)))
-    return b"".join(out)
+    return data[:8] + b"".join(png_chunk(chunk) for chunk in chunks)
+
+
+def png_chunk(content: bytes) -> bytes:
+    """A chunk of a PNG, of its kind and body, with its length and a right checksum."""
+    return struct.pack(">I", len(content) - 4) + content + struct.pack(">I", zlib.crc32(content))
 
 
 def _changed(value: Any, random: Random) -> Any:

@@ -11,6 +11,7 @@ import tarfile
 import tempfile
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -22,72 +23,53 @@ import torch
 from published_folders import WRITERS, random_poses
 
 from dynslam_bench.cli.output import cell_text  # how a cell of a table is written
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import MapOutputs
-from dynslam_bench.core import download as address
-from dynslam_bench.core import images, toml
-from dynslam_bench.core import sanitise as harmless
-from dynslam_bench.core import settings as core_settings
-from dynslam_bench.core.errors import DynslamError, TrackerError
-from dynslam_bench.core.reading import compare_sums
-from dynslam_bench.core.records import Record
+from dynslam_bench.contracts import Frame, MapOutputs
+from dynslam_bench.core import (
+    DynslamError,
+    TrackerError,
+    compare_sums,
+    download,
+    images,
+    sanitise,
+    settings,
+    toml,
+)
 from dynslam_bench.core.stage_cache import StageCache  # what of the cache reads
-from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.geometry import trajectory_files
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.evaluation import get_protocol
+from dynslam_bench.geometry import Camera, load_tum, read_kitti
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.runs import RunStore, bank
-from dynslam_bench.runs import artifacts as snapshots
-from dynslam_bench.runs import frames as rows
-from dynslam_bench.runs import running as packing
-from dynslam_bench.runs.exchange import formats
-from dynslam_bench.runs.exchange import transfer as provenance
-from dynslam_bench.runs.exchange.transfer import PROVENANCE_FILE, Provenance
-from dynslam_bench.runs.frames import FrameLog, load_frames
+from dynslam_bench.runs import RunStore, artifacts, bank, frames, running
+from dynslam_bench.runs.exchange import formats, transfer
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.segmentation import recorded
-from dynslam_bench.segmentation.networks import loading
-from dynslam_bench.segmentation.networks import onnx_segmenter as onnx
+from dynslam_bench.segmentation.networks import loading, onnx_segmenter
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.training import labelled_images as labels
-from dynslam_bench.segmentation.training.labelled_images import PreparedImages
+from dynslam_bench.segmentation.training import labelled_images
 from dynslam_bench.sequences import cameras, catalogue, fetch
-from dynslam_bench.sequences import fetch as archives
-from dynslam_bench.sequences.fetch import Receipt
 from dynslam_bench.sequences.readers import layouts, lists
 from dynslam_bench.sequences.readers import recorded as reader
-from dynslam_bench.sequences.readers import recorded as recorded_sequence
-from dynslam_bench.sequences.readers.layouts import layout_of
-from dynslam_bench.sequences.readers.recorded import RecordedSequence
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png
 from dynslam_bench.slam import map_files
 from dynslam_bench.slam.atlas import open_atlas, packed
-from dynslam_bench.slam.map_files import HEADER, MapFeatures, MapHeader, described
 from dynslam_bench.slam.settings import TrackingSettings
 from dynslam_bench.suites import load_suite
-from dynslam_bench.trackers.adapters import orbslam3 as vocabulary
-from dynslam_bench.trackers.adapters import subprocess_tracker as answers
+from dynslam_bench.trackers.adapters import orbslam3, subprocess_tracker
 from dynslam_bench.tuning import Study, StudySummary, study_file
 
 from .campaign import Target, at, written
-from .mutate import mutate, mutate_json, mutate_lines, mutate_png, mutate_zip
+from .mutate import mutate, mutate_json, mutate_lines, mutate_png, mutate_zip, zipped
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "results"
-RUN = "a7abe04996a79cc4"
+RUN, OTHER = "a7abe04996a79cc4", b"e7f8d4df9db4bb16"
 
 
 @cache
 def _stored(name: str) -> bytes:
     (path,) = FIXTURE.glob(name)
     return path.read_bytes()
-
-
-def _other(data: bytes) -> bytes:
-    """The same of the other run."""
-    return data.replace(RUN.encode(), b"e7f8d4df9db4bb16")
 
 
 def _store(folder: Path, run: bytes | None) -> RunStore:
@@ -145,13 +127,13 @@ def _read_part(data: bytes | None, folder: Path) -> None:
 
 def _read_log(data: bytes | None, folder: Path) -> None:
     """Whatever a tracker's process left, a run can be stored of it."""
-    log = FrameLog.read(at(folder, rows.FRAMES_FILE, data))
+    log = frames.FrameLog.read(at(folder, frames.FRAMES_FILE, data))
     log.write(folder, "comment")
     log.timings(), log.mask_iou(), log.lost_streak(), log.epipolar_skipped()
 
 
 def _log_seeds() -> list[bytes]:
-    made = rows.read_csv(FIXTURE / "runs" / RUN / "frames.csv")
+    made = frames.read_csv(FIXTURE / "runs" / RUN / "frames.csv")
     pose = [0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0]
     lines = [json.dumps({**vars(row), "pose": pose}) + "\n" for row in made]
     odd = ({"pose": pose[:6]}, {"stats": {"a": "x"}}, {"state": "asleep"}, {"timestamp": "nan"}, {"x": 1})
@@ -164,23 +146,14 @@ def _log_seeds() -> list[bytes]:
 
 def _packed_seeds() -> list[bytes]:
     store = RunStore(FIXTURE)
-    packed = packing.pack(store, store.read(RUN))
+    packed = running.pack(store, store.read(RUN))
     lying = bytearray(packed)
     start = lying.index(b"PK\x01\x02") + 24  # the size that the first file claims
     lying[start : start + 4] = b"\xfe\xff\xff\xff"
-    squeezed = io.BytesIO()
-    with zipfile.ZipFile(squeezed, "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr(f"runs/{RUN}/run.json", "{}")
-    return [packed, bytes(lying), squeezed.getvalue(), _renamed(packed, "0" * 16), _renamed(packed, "zz")]
-
-
-def _renamed(packed: bytes, run: str) -> bytes:
-    """The same archive under another run's name."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(packed)) as old, zipfile.ZipFile(buffer, "w") as new:
-        for name in old.namelist():
-            new.writestr(name.replace(RUN, run), old.read(name))
-    return buffer.getvalue()
+    with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    renamed = [{name.replace(RUN, run): content for name, content in files.items()} for run in ("0" * 16, "zz")]
+    return [packed, bytes(lying), zipped({f"runs/{RUN}/run.json": b"{}"}, zipfile.ZIP_LZMA), *map(zipped, renamed)]
 
 
 def _read_study(data: bytes | None, folder: Path) -> None:
@@ -225,17 +198,7 @@ def _read_entry(data: bytes | None, folder: Path) -> None:
     assert found is None or found.cost_s == 0.1
 
 
-def _summary(cls: type[Record], seed: str) -> dict[str, Any]:
-    return {
-        "read": lambda data, folder: cls.read(at(folder, "record.json", data)),
-        "seeds": lambda: [_stored(seed)],
-        "mutation": mutate_json,
-    }
-
-
-def _receipt_seeds() -> list[bytes]:
-    made = Receipt(id="tum/x", url="https://host/x.tgz", sha256="0" * 64, size_bytes=1, checked=True, files=3)
-    return [made.to_json().encode()]
+RECEIPT = fetch.Receipt(id="tum/x", url="https://host/x.tgz", sha256="0" * 64, size_bytes=1, checked=True, files=3)
 
 
 def _snapshot_seeds() -> list[bytes]:
@@ -252,7 +215,7 @@ RECORDS = [
     Target(
         "run record",
         _read_run,
-        lambda: [_stored(f"runs/{RUN}/run.json"), _other(_stored(f"runs/{RUN}/run.json"))],
+        lambda: [_stored(f"runs/{RUN}/run.json").replace(RUN.encode(), run) for run in (RUN.encode(), OTHER)],
         mutate_json,
     ),
     Target("index of runs", _read_index, lambda: [_index()]),
@@ -264,22 +227,27 @@ RECORDS = [
     Target("frame log", _read_log, _log_seeds, mutate_lines),
     Target(
         "frame table",
-        lambda data, folder: load_frames(at(folder, rows.CSV_FILE, data)),
+        lambda data, folder: frames.load_frames(at(folder, frames.CSV_FILE, data)),
         lambda: [_stored(f"runs/{RUN}/frames.csv")],
     ),
-    Target("packed run", lambda data, folder: packing.unpack(data or b"", RunStore(folder)), _packed_seeds, mutate_zip),
-    Target("study's summary", **_summary(StudySummary, "studies/small/summary.json")),
+    Target("packed run", lambda data, folder: running.unpack(data or b"", RunStore(folder)), _packed_seeds, mutate_zip),
+    Target(
+        "study's summary",
+        lambda data, folder: StudySummary.read(at(folder, "record.json", data)),
+        lambda: [_stored("studies/small/summary.json")],
+        mutate_json,
+    ),
     Target("stored study", _read_study, _study_seeds, mutate_json),
     Target("journal of a study", _read_journal, lambda: [_stored("studies/small/journal.log")], mutate_lines),
     Target(
         "receipt of a fetch",
-        lambda data, folder: Receipt.read(at(folder, "fetched.json", data)),
-        _receipt_seeds,
+        lambda data, folder: fetch.Receipt.read(at(folder, "fetched.json", data)),
+        lambda: [RECEIPT.to_json().encode()],
         mutate_json,
     ),
     Target(
         "snapshots of a run",
-        lambda data, folder: snapshots.read_snapshots(at(folder, snapshots.SNAPSHOTS_FILE, data).parent),
+        lambda data, folder: artifacts.read_snapshots(at(folder, artifacts.SNAPSHOTS_FILE, data).parent),
         _snapshot_seeds,
         mutate_zip,
     ),
@@ -315,7 +283,7 @@ _DEPTH = cv2.imencode(".png", np.full((8, 8), 5000, np.uint16))[1].tobytes()
 _PNG = cv2.imencode(".png", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
 
 
-class FewSettings(core_settings.Settings):
+class FewSettings(settings.Settings):
     """As large as it takes to have a group: the settings of a whole system take a thousand times as long."""
 
     tracking: TrackingSettings = TrackingSettings()
@@ -325,17 +293,8 @@ def _text_of(data: bytes | None) -> str:
     return (data or b"").decode("utf-8", "surrogateescape")
 
 
-def _read_sums(data: bytes | None, folder: Path) -> None:
-    at(folder, bank.SUMS, data)
-    assert all(isinstance(fault, str) for fault in bank.verify(folder))
-
-
 def _of_text(read: Callable[[str], object]) -> Callable[[bytes | None, Path], object]:
     return lambda data, _: read(_text_of(data))
-
-
-def _read_kitti(data: bytes | None, folder: Path) -> None:
-    trajectory_files.read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n"))
 
 
 def _read_folder(data: bytes | None, folder: Path) -> None:
@@ -352,9 +311,10 @@ def _read_folder(data: bytes | None, folder: Path) -> None:
         at(folder, f"rgb/{name}", _PNG)
         at(folder, f"depth/{name}", _DEPTH)
     camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0)
-    sequence = recorded_sequence.RecordedSequence(folder, layouts.read_tum(folder, 30.0), camera, id="fuzz")
-    files = (*sequence._colour, *sequence._depth)
-    assert files and all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)
+    sequence = reader.RecordedSequence(folder, layouts.read_tum(folder, 30.0), camera, id="fuzz")
+    assert all(
+        (folder / file).resolve().is_relative_to(folder.resolve()) for file in sequence._colour + sequence._depth
+    )
 
 
 def _read_manifest(data: bytes | None, folder: Path) -> None:
@@ -365,45 +325,33 @@ def _read_manifest(data: bytes | None, folder: Path) -> None:
 def _read_coco(data: bytes | None, folder: Path) -> None:
     at(folder, "a.png", _PNG)
     at(folder, "b/c.png", _PNG)
-    images = labels.coco_images(at(folder, "annotations.json", data))
-    assert images.name and images.version
-    for index in range(min(len(images), 4)):
-        images[index]
+    labelled = labelled_images.coco_images(at(folder, "annotations.json", data))
+    assert labelled.name and labelled.version
+    for index in range(min(len(labelled), 4)):
+        labelled[index]
 
 
 def _read_yolo(data: bytes | None, folder: Path) -> None:
     at(folder, "images/a.png", _PNG)
     at(folder, "labels/a.txt", data)
-    images = labels.yolo_images(folder)
-    assert images.name and images.version and len(images) == 1
-    images[0]
+    labelled = labelled_images.yolo_images(folder)
+    assert labelled.name and labelled.version and len(labelled) == 1
+    labelled[0]
 
 
 def _read_answer(text: str) -> None:
-    answer = answers.parse_answer(text)
-    try:
-        answers.read_track_answer(answer, "program at frame 1", lambda: 0.1)
-    except TrackerError:
-        answers.read_final_answer(answer, "program at finalize")
-    else:
-        answers.read_final_answer(answer, "program at finalize")
-
-
-def _override(text: str) -> None:
-    assigned = core_settings.parse_assignments(text.split("\n"))
-    core_settings.apply_overrides(FewSettings(), assigned)
-
-
-def _read_settings(data: bytes | None, folder: Path) -> None:
-    core_settings.apply_overrides(FewSettings(), toml.read_settings(at(folder, "s.toml", data)))
+    answer = subprocess_tracker.parse_answer(text)
+    with suppress(TrackerError):
+        subprocess_tracker.read_track_answer(answer, "program at frame 1", lambda: 0.1)
+    subprocess_tracker.read_final_answer(answer, "program at finalize")
 
 
 def _harmless(text: str) -> None:
     """Whatever a record says, the terminal gets no escape, the file no half character, the path no way out."""
-    assert not set(harmless.printable(text)) & {chr(code) for code in (*range(9), *range(14, 32), 0x9B, 0x202E)}
-    str(harmless.storable({text: [text]})).encode()
+    assert not set(sanitise.printable(text)) & {chr(code) for code in (*range(9), *range(14, 32), 0x9B, 0x202E)}
+    str(sanitise.storable({text: [text]})).encode()
     assert "\n" not in cell_text(text)
-    if harmless.is_inside(text):
+    if sanitise.is_inside(text):
         assert (Path("/root/x") / text).resolve().is_relative_to("/root/x")
 
 
@@ -417,16 +365,14 @@ def _study_texts() -> list[bytes]:
 
 def _ids(text: str) -> None:
     for read in (parse_synthetic_id, catalogue.parse_frames, catalogue.entry_of):
-        try:
+        with suppress(DynslamError):
             read(text)
-        except DynslamError:
-            continue
 
 
 TEXTS = [
     Target(
         "TUM trajectory",
-        lambda data, folder: trajectory_files.load_tum(at(folder, "poses.txt", data)),
+        lambda data, folder: load_tum(at(folder, "poses.txt", data)),
         lambda: [
             POSES,
             b"1 2 3\n",
@@ -439,7 +385,7 @@ TEXTS = [
     ),
     Target(
         "KITTI trajectory",
-        _read_kitti,
+        lambda data, folder: read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n")),
         lambda: [
             *(b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3" + b"\n" * ends for ends in (1, 2)),
             *(b"# none\n\n", b"1 0 0 0 0 1 0 0 0 0 1 x\n", b"1 2 3\n", b"2 0 0 0 0 2 0 0 0 0 2 0\n"),
@@ -453,7 +399,11 @@ TEXTS = [
         lambda: [LIST, LIST.replace(b"rgb/2", b"../2"), PAIRS, POSES, PAIRS.replace(b"rgb/2", b"../2")],
     ),
     Target("manifest of a fetch", _read_manifest, lambda: [b"0" * 64 + b"  rgb/1.png\n" + b"1" * 64 + b"  gone.png\n"]),
-    Target("checksums of a bank", _read_sums, lambda: [b"0" * 64 + b"  runs/x\n" + b"1" * 64 + b"  ../gone\n", b"x\n"]),
+    Target(
+        "checksums of a bank",
+        lambda data, folder: bank.verify(at(folder, bank.SUMS, data).parent),
+        lambda: [b"0" * 64 + b"  runs/x\n" + b"1" * 64 + b"  ../gone\n", b"x\n"],
+    ),
     Target(
         "manifest of a bank",
         lambda data, folder: bank.read_manifest(at(folder, "m.toml", data)),
@@ -466,7 +416,7 @@ TEXTS = [
     ),
     Target(
         "settings file",
-        _read_settings,
+        lambda data, folder: settings.apply_overrides(FewSettings(), toml.read_settings(at(folder, "s.toml", data))),
         lambda: [
             b"[settings]\n[settings.tracking]\nradius_px = 15\n",
             *(b"a.b = 1\n", b"settings = 3\n", b'tracking.radius_px = "' + b"a" * 300 + b'"\n'),
@@ -475,7 +425,7 @@ TEXTS = [
     ),
     Target(
         "--set",
-        _of_text(_override),
+        _of_text(lambda text: settings.apply_overrides(FewSettings(), settings.parse_assignments(text.split("\n")))),
         lambda: [
             b"tracking.radius_px=15\ntracking.local_map=all",
             *(b"x=1", b"tracking=1", b"tracking.radius_px.x=1", b"a.b.c=1", b"tracking.x=1"),
@@ -543,7 +493,7 @@ TEXTS = [
     ),
     Target(
         "web address",
-        lambda data, _: address.check_address(_text_of(data), checked=False),
+        lambda data, _: download.check_address(_text_of(data), checked=False),
         lambda: [
             b"https://cvg.cit.tum.de/rgbd/x.tgz",
             b"https://[::1]:8080/x?y=z",
@@ -663,26 +613,17 @@ def _tar(*members: tuple[str, bytes, bytes], form: int = tarfile.GNU_FORMAT) -> 
 
 
 def _archives() -> list[bytes]:
-    plain = ("seq/", b"", tarfile.DIRTYPE), ("seq/rgb.txt", b"1 a\n" * 50, tarfile.REGTYPE)
+    lines, link = b"1 a\n" * 50, zipfile.ZipInfo("seq/link")
+    link.external_attr = 0o120777 << 16
+    plain = ("seq/", b"", tarfile.DIRTYPE), ("seq/rgb.txt", lines, tarfile.REGTYPE)
     long = ("seq/" + "n" * 150 + "/" + "m" * 99, b"x", tarfile.REGTYPE)
-    link = ("seq/link", b"", tarfile.SYMTYPE)
-    packed = _zip("seq/rgb.txt")
+    packed = zipped({"seq/": b"", "seq/rgb.txt": lines})
     return [
         *(gzip.compress(_tar(*plain), 1), gzip.compress(_tar(*plain), 1)[:-20], _tar(*plain, long)),
-        *(_tar(*plain, long, form=tarfile.PAX_FORMAT), _tar(*plain, *plain), _tar(link), _tar(*plain, *plain[1:])),
-        *(packed, packed.replace(b"1 a", b"1 b", 1), _zip("../rgb.txt"), _zip("seq/rgb.txt", zipfile.ZIP_BZIP2)),
-        _zip("seq/link", attributes=0o120777 << 16),
+        *(_tar(*plain, long, form=tarfile.PAX_FORMAT), _tar(*plain, *plain), _tar(("seq/link", b"", tarfile.SYMTYPE))),
+        *(_tar(*plain, *plain[1:]), packed, packed.replace(b"1 a", b"1 b", 1), zipped({"../rgb.txt": lines})),
+        *(zipped({"seq/rgb.txt": lines}, zipfile.ZIP_BZIP2), zipped({link: lines})),
     ]
-
-
-def _zip(name: str, method: int = zipfile.ZIP_STORED, attributes: int = 0) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", method) as archive:
-        archive.writestr("seq/", "")
-        entry = zipfile.ZipInfo(name)
-        entry.compress_type, entry.external_attr = method, attributes
-        archive.writestr(entry, "1 a\n" * 50)
-    return buffer.getvalue()
 
 
 def _tar_checked(data: bytes, random: Random) -> bytes:
@@ -710,7 +651,7 @@ def _tar_checked(data: bytes, random: Random) -> bytes:
 def _extract(data: bytes | None, folder: Path) -> None:
     target = folder / "out"
     target.mkdir()
-    sums = archives.extract(at(folder, "archive.tgz", data or b""), target, lambda progress: None)
+    sums = fetch.extract(at(folder, "archive.tgz", data or b""), target, lambda progress: None)
     assert all((target / name).resolve().is_relative_to(target.resolve()) for name in sums)
     assert not any(path.is_symlink() for path in target.rglob("*"))
 
@@ -732,11 +673,8 @@ def _checkpoints() -> list[bytes]:
         *({"model": {**state, "roi_heads.box_predictor.cls_score.weight": torch.zeros(size, 4)}} for size in (91, 7)),
     ]
     stored = [written(lambda file, content=content: torch.save(content, file)) for content in contents]
-    stored.append(written(lambda file: torch.save(ours, file, _use_new_zipfile_serialization=False)))
-    bomb = io.BytesIO()
-    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("archive/data.pkl", bytes(1 << 20))
-    return [*stored, bomb.getvalue()]
+    old = written(lambda file: torch.save(ours, file, _use_new_zipfile_serialization=False))
+    return [*stored, old, zipped({"archive/data.pkl": bytes(1 << 20)}, zipfile.ZIP_DEFLATED)]
 
 
 def _onnx() -> bytes:
@@ -755,11 +693,7 @@ def _read_prepared(data: bytes | None, folder: Path) -> None:
     np.save(folder / "labels.npy", np.zeros((1, 4, 4), np.uint8))
     at(folder, "names.json", b'[["person"]]' if len(data or b"") % 2 == 0 else b"[]")
     at(folder, "images.npy", data)
-    PreparedImages(folder, ("person",))
-
-
-def _read_vocabulary(data: bytes | None, folder: Path) -> None:
-    vocabulary._check(vocabulary._unpack(data or b""), folder / "voc.txt")
+    labelled_images.PreparedImages(folder, ("person",))
 
 
 def _vocabularies() -> list[bytes]:
@@ -798,16 +732,16 @@ BINARIES = [
     ),
     Target(
         "ONNX header",
-        lambda data, folder: str(onnx.read_header(at(folder, "net.onnx", data))),
+        lambda data, folder: str(onnx_segmenter.read_header(at(folder, "net.onnx", data))),
         lambda: [_onnx(), b"\x80" * 20],
     ),
     Target("prepared images", _read_prepared, lambda: [PREPARED, PREPARED + b"x"]),
     Target(
         "vocabulary",
-        _read_vocabulary,
+        lambda data, folder: orbslam3._check(orbslam3._unpack(data or b""), folder / "voc.txt"),
         _vocabularies,
         _repressed,
-        allowed=(vocabulary.TrackerError, lzma.LZMAError, EOFError, ValueError),
+        allowed=(orbslam3.TrackerError, lzma.LZMAError, EOFError, ValueError),
     ),
 ]
 
@@ -836,9 +770,9 @@ def _attacked(name: str, damaged: tuple[str, ...]) -> Target:
         for file, content in _files(name).items():
             at(folder, file, content)
         at(folder, damaged[first % GONE % len(damaged)], None if data is None or first >= GONE else data[1:])
-        contents = layout_of(name).read(folder)
+        contents = layouts.layout_of(name).read(folder, None)
         camera = Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0)
-        sequence = RecordedSequence(folder, contents, camera, id="fuzz", any_depth_size=True)
+        sequence = reader.RecordedSequence(folder, contents, camera, id="fuzz", any_depth_size=True)
         for index in range(min(len(sequence), 3)):
             depth = sequence[index].depth
             assert np.isfinite(depth).all() and (depth >= 0).all()
@@ -932,17 +866,17 @@ def _read_colmap(data: bytes | None, folder: Path) -> None:
 
 def _read_provenance(data: bytes | None, folder: Path) -> None:
     """Asked of the file and of its folder; whatever it says, no other file is looked at, and nothing is raised."""
-    at(folder, PROVENANCE_FILE, data)
+    at(folder, transfer.PROVENANCE_FILE, data)
     file = at(folder, "trajectory.txt", b"# none\n")
-    assert [asked for asked in (file, folder) if not isinstance(provenance.stated_provenance(asked), str)] == []
+    assert [asked for asked in (file, folder) if not isinstance(transfer.stated_provenance(asked), str)] == []
 
 
 def _provenances() -> list[bytes]:
-    digest = provenance.digest_of(Path(__file__))
+    digest = transfer.digest_of(Path(__file__))
     record = RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json")
     shared = {"format": "tum", "which": "final", "run": record}
     files = ({"trajectory.txt": digest}, {"../x": digest}, {"a\x00b": digest}, {})
-    return [Provenance(files=each, **shared).to_json().encode() for each in files]
+    return [transfer.Provenance(files=each, **shared).to_json().encode() for each in files]
 
 
 def _maps() -> list[bytes]:
@@ -954,16 +888,21 @@ def _maps() -> list[bytes]:
         return [path.read_bytes()]
 
 
-FEATURES = MapFeatures(extractor="orb", levels=8, scale_factor=1.2)
+FEATURES = map_files.MapFeatures(extractor="orb", levels=8, scale_factor=1.2)
 
 
 def _sound_map() -> dict[str, Any]:
     """Two keyframes of three and two features, two points that both see, a submap."""
-    header = MapHeader(
-        sensors="rgbd", camera=described(LENS), features=FEATURES, next_keyframe=4, next_point=9, made_by="nobody"
+    header = map_files.MapHeader(
+        sensors="rgbd",
+        camera=map_files.described(LENS),
+        features=FEATURES,
+        next_keyframe=4,
+        next_point=9,
+        made_by="nobody",
     )
     return {
-        HEADER: np.frombuffer(header.to_json().encode(), np.uint8),
+        map_files.HEADER: np.frombuffer(header.to_json().encode(), np.uint8),
         "kf_id": np.array([0, 2]), "kf_map": np.array([0, 1]), "kf_pose": np.tile(np.eye(4), (2, 1, 1)),
         "kf_count": np.array([3, 2]), "kf_raw": np.full((5, 2), 4.0, np.float32), "kf_response": np.ones(5, np.float32),
         "kf_xy": np.full((5, 2), 4.0), "kf_right": np.array([1.0, np.nan, 1.0, 1.0, 1.0]),
@@ -982,19 +921,17 @@ def _sound_map() -> dict[str, Any]:
 def _map_seeds() -> list[bytes]:
     """A sound map, and one for every kind of fault."""
     sound = _sound_map()
-    far = {"kf_count": np.array([2**60, 2]), "kf_right": np.ones(5), "kf_pose": 2 * np.ones((2, 4, 4))}
-    odd: list[dict[str, Any]] = [{}, *({name: value} for name, value in far.items())]
-    odd += [{"far": np.zeros(2)}, {"id": np.array([3, 3])}, {"kf_id": np.array([0, 9])}, {"rgb": np.zeros((2, 4))}]
-    odd += [{"obs_ft": np.array([2, 2, 0, 1], np.int32)}, {"obs_ft": np.array([2, 1, 0, 0], np.int32)}]
-    odd += [{"n_obs": np.array([1, 1], np.int32)}]
-    odd += [{"visible": np.zeros(2, np.int32)}, {"position": np.full((2, 3), np.nan)}, {"more": np.zeros(1)}]
-    odd += [{HEADER: np.array([255], np.uint8)}, {HEADER: np.frombuffer(b"{}", np.uint8)}]
-    nothing = {name: value[:0] for name, value in sound.items() if name != HEADER}
-    return [_npz(sound | each) for each in (*odd, nothing)] + [_npz({"header ": np.zeros(1)})]
-
-
-def _npz(arrays: dict[str, Any]) -> bytes:
-    return written(lambda file: np.savez(file, **arrays))
+    odd: list[tuple[str, np.ndarray]] = [
+        ("kf_count", np.array([2**60, 2])), ("kf_right", np.ones(5)), ("kf_pose", 2 * np.ones((2, 4, 4))),
+        ("far", np.zeros(2)), ("id", np.array([3, 3])), ("kf_id", np.array([0, 9])), ("rgb", np.zeros((2, 4))),
+        ("obs_ft", np.array([2, 2, 0, 1], np.int32)), ("obs_ft", np.array([2, 1, 0, 0], np.int32)),
+        ("n_obs", np.array([1, 1], np.int32)), ("visible", np.zeros(2, np.int32)), ("more", np.zeros(1)),
+        ("position", np.full((2, 3), np.nan)), (map_files.HEADER, np.array([255], np.uint8)),
+        (map_files.HEADER, np.frombuffer(b"{}", np.uint8)),
+    ]  # fmt: skip
+    nothing = {name: value[:0] for name, value in sound.items() if name != map_files.HEADER}
+    faulty = [sound, *(sound | {name: value} for name, value in odd), sound | nothing, {"header ": np.zeros(1)}]
+    return [written(lambda file, arrays=arrays: np.savez(file, **arrays)) for arrays in faulty]
 
 
 def _read_map(data: bytes | None, folder: Path) -> None:

@@ -37,33 +37,26 @@ class Server:
         if "status" in fault:
             handler.send_error(fault["status"])
             return
-        start = 0
         wanted = re.fullmatch(r"bytes=(\d+)-", handler.headers.get("Range") or "")
-        if wanted and self.ranges and handler.headers.get("If-Range", self.etag) == self.etag:
-            start = int(wanted[1])
-            if start >= len(self.data):
-                handler.send_response(416)
-                handler.send_header("Content-Range", f"bytes */{len(self.data)}")
-                handler.send_header("Content-Length", "0")
-                handler.end_headers()
-                return
-        body = self.data[start:]
-        handler.send_response(206 if start else 200)
+        resumed = wanted and self.ranges and handler.headers.get("If-Range", self.etag) == self.etag
+        start, size, headers = int(wanted[1]) if resumed else 0, len(self.data), {"ETag": self.etag}
+        body, status = self.data[start:], 416 if start >= size else 206 if start else 200
         if start:
-            handler.send_header("Content-Range", f"bytes {start}-{len(self.data) - 1}/{len(self.data)}")
-        handler.send_header("ETag", self.etag)
+            headers["Content-Range"] = f"bytes {f'{start}-{size - 1}' if body else '*'}/{size}"
+        sent = body[: fault.get("cut", size)]
         if fault.get("chunked"):
-            handler.send_header("Transfer-Encoding", "chunked")
-            handler.end_headers()
+            headers["Transfer-Encoding"] = "chunked"
             half = len(body) // 2
-            handler.wfile.write(b"%x\r\n" % half + body[:half] + b"\r\n")
-            if fault["chunked"] == "whole":
-                handler.wfile.write(b"%x\r\n" % len(body[half:]) + body[half:] + b"\r\n0\r\n\r\n")
-            return
-        handler.send_header("Content-Length", str(len(body) + fault.get("lie", 0)))
+            first, rest = (b"%x\r\n" % len(part) + part + b"\r\n" for part in (body[:half], body[half:]))
+            sent = first + rest + b"0\r\n\r\n" if fault["chunked"] == "whole" else first
+        else:
+            headers["Content-Length"] = str(len(body) + fault.get("lie", 0))
+        handler.send_response(status)
+        for name, value in headers.items():
+            handler.send_header(name, value)
         handler.end_headers()
         with contextlib.suppress(ConnectionError):
-            handler.wfile.write(body[: fault.get("cut", len(body))])
+            handler.wfile.write(sent)
 
     def close(self):
         self.http.shutdown()

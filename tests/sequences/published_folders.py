@@ -7,6 +7,8 @@ from dynslam_bench.geometry import se3
 
 NED = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 BASE_CAM = se3.exp(np.array([0.2, -0.1, 0.9, 0.3, -1.1, 0.7]))
+MATRIX = ", ".join(repr(value) for value in BASE_CAM.ravel().tolist())
+"""The same as files have it."""
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -87,7 +89,6 @@ def write_shibuya(folder, poses, size=(640, 360)):
 
 def write_openloris(folder, poses, size=(848, 480)):
     write_tum(folder, poses @ np.linalg.inv(BASE_CAM), size, ("color", "aligned_depth"), 2000)
-    matrix = ", ".join(repr(float(value)) for value in BASE_CAM.ravel())
     (folder / "sensors.yaml").write_text(
         "%YAML:1.0\n---\nd400_color_optical_frame:\n   sensor_type: camera\n   fps: 30\n   width: 848\n   height: 480\n"
         "   intrinsics: !!opencv-matrix\n      rows: 1\n      cols: 4\n      dt: d\n"
@@ -97,27 +98,24 @@ def write_openloris(folder, poses, size=(848, 480)):
         "%YAML:1.0\n---\ntrans_matrix:\n   - parent_frame: d400_color_optical_frame\n     child_frame: d400_gyroscope\n"
         "     matrix: !!opencv-matrix\n        rows: 4\n        cols: 4\n        dt: d\n        data: [ 1, 2, 3, 4 ]\n"
         "   - parent_frame: base_link\n     child_frame: d400_color_optical_frame\n     matrix: !!opencv-matrix\n"
-        f"        rows: 4\n        cols: 4\n        dt: d\n        data: [ {matrix} ]\n"
+        f"        rows: 4\n        cols: 4\n        dt: d\n        data: [ {MATRIX} ]\n"
     )
 
 
 def write_vslam_lab(folder, poses, size=(64, 48)):
-    start = 1403636579763555584
-    stamps = [start + i * 33_333_333 for i in range(len(poses))]
+    stamps = [1403636579763555584 + i * 33_333_333 for i in range(len(poses))]
     images(folder, [(f"rgb_0/{i}.png", f"depth_0/{i}.png") for i in range(len(poses))], size, 2000)
     rows = [f"{stamp},rgb_0/{i}.png,{stamp}.0,depth_0/{i}.png" for i, stamp in enumerate(stamps)]
     lines(folder / "rgb.csv", ["ts_rgb_0 (ns),path_rgb_0,ts_depth_0 (ns),path_depth_0", *rows])
     body = poses @ np.linalg.inv(BASE_CAM)
-    poses_of = [tum_line(stamp, pose).split()[1:] for stamp, pose in zip(stamps, body, strict=True)]
-    truth = [",".join([str(stamp), *values]) for stamp, values in zip(stamps, poses_of, strict=True)]
+    truth = [f"{stamp}," + ",".join(tum_line(0, pose).split()[1:]) for stamp, pose in zip(stamps, body, strict=True)]
     lines(folder / "groundtruth.csv", ["ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw", *truth])
-    matrix = ", ".join(repr(float(value)) for value in BASE_CAM.ravel())
     (folder / "calibration.yaml").write_text(
         "%YAML:1.0\n\ncameras:\n  - {cam_name: rgb_0,\n     cam_type: rgb+depth,\n     depth_name: depth_0,\n"
         "     cam_model: pinhole,\n     distortion_type: radtan5,\n     focal_length: [60.5, 61.5],\n"
         "     principal_point: [31.5, 23.5],\n     distortion_coefficients: [0.1, -0.2, 0.001, 0.002, 0.05], \n"
         f"     image_dimension: [{size[0]}, {size[1]}],\n     depth_factor: 1000.0,\n     fps: 30.0,\n"
-        f"     T_BS: [{matrix}] # Sensor extrinsics wrt. the body-frame.\n    }}\n"
+        f"     T_BS: [{MATRIX}] # Sensor extrinsics wrt. the body-frame.\n    }}\n"
     )
 
 
@@ -129,17 +127,15 @@ def write_euroc(folder, poses, size=(64, 48)):
     for name in ("cam0", "depth0"):
         lines(base / name / "data.csv", ["#timestamp [ns],filename", *[f"{s},{s}.png" for s in stamps]])
     position, q = se3.to_quaternion(poses @ np.linalg.inv(BASE_CAM))
-    rows = []
-    for stamp, p, (x, y, z, w) in zip(stamps, position, q, strict=True):
-        rows.append(",".join([str(stamp), *[repr(float(v)) for v in (*p, w, x, y, z)], "0", "0", "0"]))
+    body = np.column_stack([position, q[:, [3, 0, 1, 2]], np.zeros((len(poses), 3))]).tolist()
+    rows = [",".join([str(stamp), *map(repr, row)]) for stamp, row in zip(stamps, body, strict=True)]
     heading = (
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v, v, v"
     )
     lines(base / "state_groundtruth_estimate0" / "data.csv", [heading, *rows])
-    matrix = ", ".join(repr(float(value)) for value in BASE_CAM.ravel())
     (base / "cam0" / "sensor.yaml").write_text(
         "# General sensor definitions.\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\n# Extrinsics.\n"
-        f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{matrix}]\n\nrate_hz: 20\nresolution: [{size[0]}, {size[1]}]\n"
+        f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{MATRIX}]\n\nrate_hz: 20\nresolution: [{size[0]}, {size[1]}]\n"
         "camera_model: pinhole\nintrinsics: [58.6, 57.2, 31.2, 24.3] #fu, fv, cu, cv\n"
         "distortion_model: radial-tangential\ndistortion_coefficients: [-0.28, 0.07, 0.0001, 1.7e-05]\n"
     )

@@ -9,7 +9,6 @@ import pytest
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.synthetic import CAMERA
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
@@ -60,8 +59,8 @@ class Altered:
     def __init__(self, base, *, frame=None, truth=None, camera=None):
         self.base, self.frame = base, frame
         self.frames = getattr(base, "frames", None) or [base[index] for index in range(len(base))]
-        self.ground_truth = base.ground_truth if truth is None else truth(base.ground_truth)
-        self.camera = base.camera if camera is None else camera(base.camera)
+        self.ground_truth = truth(base.ground_truth) if truth else base.ground_truth
+        self.camera = camera(base.camera) if camera else base.camera
 
     def __getattr__(self, name):
         return getattr(self.base, name)
@@ -75,17 +74,6 @@ class Altered:
             return frame
         rgb, depth = self.frame(frame, self.base)
         return Frame(frame.index, frame.timestamp, np.ascontiguousarray(rgb), np.ascontiguousarray(depth))
-
-
-def scaled(factor):
-    """Change a truth's lengths."""
-
-    def change(truth):
-        poses = truth.T_world_cam.copy()
-        poses[:, :3, 3] *= factor
-        return Trajectory(truth.timestamps, poses)
-
-    return change
 
 
 def frame_hash(frame):

@@ -3,6 +3,7 @@
 import gzip
 import io
 import resource
+import shutil
 import struct
 import subprocess
 import sys
@@ -10,9 +11,9 @@ import tarfile
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -20,20 +21,15 @@ import pytest
 from published_folders import WRITERS, image, lines, random_poses, write_seven_scenes
 from sequence_folders import SHARED, make_folder, needs_shared, rewrite
 
-from dynslam_bench.core.errors import DynslamError, SequenceError, TrajectoryError
-from dynslam_bench.core.folders import STAGES_VARIABLE
+from dynslam_bench.core import STAGES_VARIABLE, DynslamError, SequenceError, TrajectoryError
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.envs import SlamEnv
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory_files import load_tum, read_tum
-from dynslam_bench.sequences import PreprocessingSettings, Sequence, SequenceView, open_sequence
-from dynslam_bench.sequences import fetch as archives
+from dynslam_bench.geometry import Camera, load_tum, read_tum, se3
+from dynslam_bench.sequences import PreprocessingSettings, Sequence, SequenceView, fetch, open_sequence
 from dynslam_bench.sequences.bags import unpack_bag
 from dynslam_bench.sequences.catalogue import catalogue
 from dynslam_bench.sequences.decoded import Decoded
-from dynslam_bench.sequences.fetch import MANIFEST, verify
 from dynslam_bench.sequences.readers import recorded
 from dynslam_bench.sequences.readers.layouts import LAYOUTS, find_layout, layout_of
 from dynslam_bench.sequences.readers.lists import read_image_list
@@ -85,20 +81,14 @@ def test_a_folder_in_the_published_format_is_read(written, name):
     assert chosen.camera.fx == 100.0 and chosen.digest() != sequence.digest()
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_poses_of_kinectfusion_are_read_to_the_last_bit(tmp_path, seed):
-    poses = random_poses(seed, n=5)
-    write_seven_scenes(tmp_path / "seq-01", poses, size=(640, 480))
-    truth = open_sequence(tmp_path / "seq-01").ground_truth
-    assert np.array_equal(truth.T_world_cam, poses) and len(truth) == 5
-
-
-def test_missing_depth_of_seven_scenes_and_frames_that_kinectfusion_lost(tmp_path):
-    write_seven_scenes(tmp_path / "seq-01", random_poses(3))
+def test_seven_scenes_to_the_last_bit_with_missing_depth_and_frames_that_kinectfusion_lost(tmp_path):
+    poses = random_poses(3, n=40)
+    write_seven_scenes(tmp_path / "seq-01", poses)
     lines(tmp_path / "seq-01" / "frame-000002.pose.txt", ["-1.#IND -1.#IND -1.#IND -1.#IND"] * 4)
     sequence = open_sequence(tmp_path / "seq-01")
+    assert np.array_equal(sequence.ground_truth.T_world_cam, np.delete(poses, 2, axis=0))
+    assert "1 of 40 poses lost" in sequence.dropped.describe()
     assert (sequence[1].depth == 0).all() and (sequence[0].depth == 2.0).all()
-    assert len(sequence.ground_truth) == 2 and "1 of 3 poses lost" in sequence.dropped.describe()
 
 
 def test_the_sky_of_a_rendered_depth_is_missing(written):
@@ -162,16 +152,16 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize(("name", "at"), [(name, at) for name, cases in BROKEN.items() for at in range(len(cases))])
-def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, at):
-    file, content, words = BROKEN[name][at]
+@pytest.mark.parametrize(("name", "case"), [(name, case) for name, cases in BROKEN.items() for case in cases])
+def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, case):
+    file, content, words = case
     WRITERS[name](tmp_path / "s", random_poses(2))
     if content is None:
         (tmp_path / "s" / file).unlink()
     else:
         (tmp_path / "s" / file).write_text(content)
     with pytest.raises(DynslamError, match=words) as caught:
-        layout_of(name).read(tmp_path / "s")
+        layout_of(name).read(tmp_path / "s", None)
         sequence = open_sequence(tmp_path / "s")
         [sequence[i] for i in range(len(sequence))]
     assert "\n" not in str(caught.value) and str(tmp_path / "s") in str(caught.value)
@@ -181,12 +171,10 @@ def test_every_catalogued_sequence_opens_once_it_lies_where_it_belongs(tmp_path)
     """Nothing is listed that cannot be opened: the reader named reads a folder of the published layout."""
     entries, root, first = catalogue(), tmp_path / "root", {}
     for entry in entries.values():
-        made = tmp_path / f"{entry.layout} {entry.camera}"
+        made, camera = tmp_path / f"{entry.layout} {entry.camera}", entry.intrinsics()
         if not made.exists():
-            camera = entry.intrinsics()
-            WRITERS[entry.layout](
-                made, random_poses(5), **({} if camera is None else {"size": (camera.width, camera.height)})
-            )
+            size = {} if camera is None else {"size": (camera.width, camera.height)}
+            WRITERS[entry.layout](made, random_poses(5), **size)
         place = entry.folders(root)[0]
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(made)
@@ -213,22 +201,21 @@ def test_a_folder_of_ones_own_with_one_image_more(tmp_path):
 def test_reads_what_was_written(tmp_path):
     folder, rgb, depth = make_folder(tmp_path / "seq", frames=4)
     sequence = open_sequence(folder)
-    assert isinstance(sequence, Sequence)
-    assert sequence.id == "folder/seq"
-    assert len(sequence) == 4
+    assert isinstance(sequence, Sequence) and sequence.id == "folder/seq"
     assert (sequence.camera.width, sequence.camera.height) == (32, 24)
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, 100.066666667)  # to the nanosecond
     assert frame.rgb.dtype == np.uint8 and (frame.rgb == rgb[2]).all()
     assert frame.depth.dtype == np.float32
     assert np.allclose(frame.depth, depth[2] / 5000, rtol=1e-6) and (frame.depth[depth[2] == 0] == 0).all()
-    assert sequence[-1].index == 3
+    assert len(sequence) == 4 and sequence[-1].index == 3
     with pytest.raises(IndexError):
         sequence[4]
     assert np.array_equal(sequence.ground_truth.timestamps, sequence.timestamps)
     assert sequence.fps == 30 and sequence.masks is None
-    assert sequence.dropped.describe().startswith("4 frames of 4 colour and 4 depth images (|dt| < 0.02 s)")
-    assert sequence.dropped.absent == sequence.dropped.colour_unpaired == 0
+    assert (
+        sequence.dropped.describe() == "4 frames of 4 colour and 4 depth images (|dt| < 0.02 s); 4 ground-truth poses"
+    )
 
 
 @pytest.mark.parametrize(("frames", "fps"), [(5, 10), (1, 30)])
@@ -247,15 +234,21 @@ def test_stamps_in_another_unit_are_refused_with_the_unit(tmp_path, per_s, unit,
     assert f"{round(per_s / 30):g} s apart" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_digest_tells_contents_apart_and_survives_moving(tmp_path):
+def test_digest_tells_contents_apart_and_survives_moving_and_links(tmp_path):
     folder, *_ = make_folder(tmp_path / "a", frames=3)
-    before = open_sequence(folder).digest()
+    digests = [open_sequence(folder).digest()]
     moved = folder.rename(tmp_path / "b")
-    assert open_sequence(moved).digest() == before
+    (moved / "rgb").rename(tmp_path / "elsewhere")
+    (moved / "rgb").symlink_to(tmp_path / "elsewhere")
+    (moved / "up").symlink_to(moved)
+    assert open_sequence(moved).digest() == digests[0]
     rolling = replace(open_sequence(moved).camera, readout_s=0.02)
-    assert open_sequence(moved, camera=rolling).digest() != before
+    digests.append(open_sequence(moved, camera=rolling).digest())
     rewrite(moved / "groundtruth.txt", lambda lines: lines[:-1])
-    assert open_sequence(moved).digest() != before
+    digests.append(open_sequence(moved).digest())
+    (tmp_path / "elsewhere" / "0.png").write_bytes((moved / "rgb" / "1.png").read_bytes() + b"\0")
+    digests.append(open_sequence(moved).digest())
+    assert len(set(digests)) == 4
 
 
 def test_frames_and_stride(tmp_path):
@@ -266,23 +259,18 @@ def test_frames_and_stride(tmp_path):
     assert (view[1].rgb == rgb[3]).all()
     assert view.dropped.pairs == 7
     assert len(open_sequence(folder, frames=(2, None))) == 5
-    for bad, words in (("3", "no range"), ("a:b", "no range"), ("5:5", "no range"), ("-2:", "no range")):
+    wrong = [({"frames": frames}, "no range") for frames in ("3", "a:b", "5:5", "-2:")]
+    for part, words in (*wrong, ({"frames": "7:9"}, "hold none of the 7 frames"), ({"stride": 0}, "stride is 0")):
         with pytest.raises(SequenceError, match=words):
-            open_sequence(folder, frames=bad)
-    with pytest.raises(SequenceError, match="hold none of the 7 frames"):
-        open_sequence(folder, frames="7:9")
-    with pytest.raises(SequenceError, match="stride is 0"):
-        open_sequence(folder, stride=0)
+            open_sequence(folder, **part)
 
 
 def test_ground_truth_hole_and_bad_lines_are_counted(tmp_path):
     folder, *_ = make_folder(tmp_path / "seq", frames=30)
     rewrite(folder / "groundtruth.txt", lambda lines: [*lines[:11], "100.4 nan 0 0 0 0 0 1", *lines[21:]])
-    dropped = open_sequence(folder).dropped
-    assert dropped.frames_without_ground_truth == 10
-    assert dropped.largest_hole_s == pytest.approx(11 / 30)
-    assert "1 of 21 lines skipped: not finite" in dropped.describe()
-    assert "10 frames without ground truth within 0.02 s (largest hole 0.37 s)" in dropped.describe()
+    dropped = open_sequence(folder).dropped.describe()
+    assert "1 of 21 lines skipped: not finite" in dropped
+    assert "10 frames without ground truth within 0.02 s (largest hole 0.37 s)" in dropped
 
 
 def test_pairing_is_strict_one_to_one_and_counted(tmp_path):
@@ -293,7 +281,6 @@ def test_pairing_is_strict_one_to_one_and_counted(tmp_path):
     rewrite(folder / "depth.txt", lambda _: [f"{s:.4f} depth/{i}.png" for i, s in enumerate(shifted)])
     sequence = open_sequence(folder)
     assert sequence.timestamps.tolist() == [100.0, 100.2, 100.4]
-    assert (sequence.dropped.colour_unpaired, sequence.dropped.depth_unpaired) == (2, 2)
     assert "2 colour images without depth; 2 depth images unused" in sequence.dropped.describe()
 
 
@@ -301,25 +288,17 @@ def test_disordered_lists_are_put_in_order_and_counted(tmp_path):
     folder, rgb, _ = make_folder(tmp_path / "seq", frames=6)
 
     def disorder(lines):
-        stamp = lines[3].split()[0]
-        return ["# comment", lines[1], lines[0], *lines[2:], "nan rgb/0.png", f"{stamp} rgb/0.png", "101.5", ""]
+        stamp, comma = lines[3].split()[0], lines[2].replace(" ", ",")
+        return ["# comment", lines[1], lines[0], comma, *lines[3:], "nan rgb/0.png", f"{stamp} rgb/0.png", "101.5", ""]
 
     rewrite(folder / "rgb.txt", disorder)
+    rewrite(folder / "depth.txt", lambda lines: [line.replace(" ", "\t") + "\r" for line in lines])
     sequence = open_sequence(folder)
     assert (np.diff(sequence.timestamps) > 0).all() and len(sequence) == 6
     assert (sequence[0].rgb == rgb[0]).all()
     assert (sequence[3].rgb == rgb[0]).all()  # the last of two equal stamps wins, as in TUM's associate.py
-    dropped = sequence.dropped
-    assert (dropped.bad_stamps, dropped.duplicate_stamps, dropped.unnamed, dropped.unsorted) == (1, 1, 1, 2)
-    for words in ("1 stamps not finite", "1 duplicate stamps", "2 stamps out of order", "1 lines without a file name"):
-        assert words in dropped.describe()
-
-
-def test_other_separators(tmp_path):
-    folder, *_ = make_folder(tmp_path / "seq", frames=3)
-    rewrite(folder / "rgb.txt", lambda lines: [line.replace(" ", ",") for line in lines])
-    rewrite(folder / "depth.txt", lambda lines: [line.replace(" ", "\t") + "\r" for line in lines])
-    assert len(open_sequence(folder)) == 3
+    counts = "1 stamps not finite; 1 duplicate stamps; 2 stamps out of order; 1 lines without a file name"
+    assert counts in sequence.dropped.describe()
 
 
 @pytest.mark.parametrize(
@@ -388,13 +367,10 @@ def test_folders_without_lists(tmp_path):
         file.write("fps = 25.0\n")
     sequence = open_sequence(folder)
     assert sequence.timestamps.tolist() == [0, 0.04, 0.08] and (sequence[1].rgb == rgb[1]).all()
-    for kind in ("rgb", "depth"):
-        for i in range(3):
-            (folder / kind / f"{i}.png").rename(folder / kind / f"{50 + i}.5.png")
+    for path in folder.glob("*/?.png"):
+        path.rename(path.with_name(f"5{path.stem}.5.png"))
     assert open_sequence(folder).timestamps.tolist() == [50.5, 51.5, 52.5]
-    for path in (folder / "depth").iterdir():
-        path.unlink()
-    (folder / "depth").rmdir()
+    shutil.rmtree(folder / "depth")
     with pytest.raises(SequenceError, match=r"neither depth.txt nor a folder depth"):
         open_sequence(folder)
 
@@ -413,7 +389,7 @@ def test_few_missing_files_are_tolerated_and_counted(tmp_path):
     folder, *_ = make_folder(tmp_path / "seq", frames=60)
     (folder / "depth" / "17.png").unlink()
     sequence = open_sequence(folder)
-    assert len(sequence) == 59 and sequence.dropped.absent == 1
+    assert len(sequence) == 59
     assert "1 colour images without depth; 1 listed files that do not exist" in sequence.dropped.describe()
     (folder / "depth" / "18.png").unlink()
     with pytest.raises(SequenceError, match="2 of 60 depth images"):
@@ -430,18 +406,6 @@ def test_bonn_poses_are_the_camera_s_and_positions_stay_those_of_the_file():
     assert se3.is_pose(truth.T_world_cam[0], 1e-9)
 
 
-def test_a_change_behind_a_linked_folder_is_another_content(tmp_path):
-    folder = tmp_path / "fr3_x"
-    make_folder(folder)
-    (folder / "rgb").rename(tmp_path / "elsewhere")
-    (folder / "rgb").symlink_to(tmp_path / "elsewhere")
-    (folder / "up").symlink_to(folder)
-    before = open_sequence(str(folder)).digest()
-    images = sorted((tmp_path / "elsewhere").iterdir())
-    images[0].write_bytes(images[1].read_bytes() + b"\0")
-    assert open_sequence(str(folder)).digest() != before
-
-
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="needs the extra [bags]")
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra [bags]")
 typesys = pytest.importorskip("rosbags.typesys", reason="needs the extra [bags]")
@@ -450,6 +414,7 @@ SIZE, START = (16, 12), 1_700_000_000
 RNG = np.random.default_rng(0)
 COLOUR = RNG.integers(0, 256, (3, 12, 16, 3), dtype=np.uint8)
 MILLIMETRES = RNG.integers(500, 9000, (3, 12, 16), dtype=np.uint16)
+METRES = MILLIMETRES.astype(np.float32) / np.float32(1000)
 POSES = random_poses(4)
 
 
@@ -479,8 +444,7 @@ class Bag:
         self.writer.write(self.connections[topic], 10**18 + i, raw)
 
     def image(self, topic, i, pixels, encoding, frame="camera", padding=0):
-        rows = pixels.reshape(pixels.shape[0], -1).view(np.uint8)
-        rows = np.pad(rows, ((0, 0), (0, padding)))
+        rows = np.pad(pixels.reshape(len(pixels), -1).view(np.uint8), ((0, 0), (0, padding)))
         message = self.make(
             "sensor_msgs/msg/Image", header=self.header(i, frame), height=12, width=16, encoding=encoding,
             is_bigendian=0, step=rows.shape[1], data=rows.ravel(),
@@ -510,17 +474,16 @@ class Bag:
 
 @pytest.fixture
 def write(tmp_path):
-    def made(kind, *, metres=False, second_depth=False, info="/cam/color/camera_info", depth_frame="camera", **model):
+    def made(kind, *, depths=("/cam/aligned/image",), metres=False, models=("plumb_bob",), depth_frame="camera"):
         bag = Bag(tmp_path / f"bag_{kind}", kind)
+        images, encoding = (METRES, "32FC1") if metres else (MILLIMETRES, "16UC1")
         with bag.writer:
-            if info:
-                bag.info(info, **model)
+            for model in models:
+                bag.info("/cam/color/camera_info", model)
             for i in range(3):
                 bag.image("/cam/color/image_raw", i, COLOUR[i], "rgb8", padding=5)
-                depth = (MILLIMETRES[i] / np.float32(1000)).astype(np.float32) if metres else MILLIMETRES[i]
-                bag.image("/cam/aligned/image", i, depth, "32FC1" if metres else "16UC1", depth_frame)
-                if second_depth:
-                    bag.image("/cam/raw/image", i, MILLIMETRES[i], "16UC1")
+                for topic in depths:
+                    bag.image(topic, i, images[i], encoding, depth_frame)
                 bag.pose("/mocap", i, POSES[i])
         return bag.path
 
@@ -535,13 +498,11 @@ def test_a_bag_is_unpacked_to_the_last_bit(write, tmp_path, kind):
     sequence = open_sequence(tmp_path / "out")
     assert len(sequence) == found.frames == 3
     for i in range(3):
-        assert (sequence[i].rgb == COLOUR[i]).all()
-        assert np.array_equal(sequence[i].depth, MILLIMETRES[i].astype(np.float32) / np.float32(1000))
+        assert (sequence[i].rgb == COLOUR[i]).all() and np.array_equal(sequence[i].depth, METRES[i])
     assert np.allclose(sequence.timestamps, START + np.arange(3) * 0.033333333, atol=1e-6, rtol=0)
     assert np.abs(sequence.ground_truth.T_world_cam - POSES).max() < 1e-12
-    camera = sequence.camera
-    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (16, 12, 300.0, 301.0, 8.0, 6.0)
-    assert camera.distortion == (0.1, -0.2, 1e-3, 2e-3, 0.3)
+    lens = (0.1, -0.2, 1e-3, 2e-3, 0.3)
+    assert sequence.camera == Camera(16, 12, 300.0, 301.0, 8.0, 6.0, lens, depth_factor=1000.0)
     with pytest.raises(SequenceError, match=r"is a bag \(unpack it first: dynslam-bench sequences unpack"):
         open_sequence(bag)
 
@@ -552,35 +513,28 @@ def test_a_single_mcap_file_and_depth_in_metres(write, tmp_path):
     assert found.truth == "" and "depth is in the frame 'ir', colour in 'camera'" in found.notes[0]
     sequence = open_sequence(tmp_path / "out")
     assert sequence.ground_truth is None
-    assert np.array_equal(sequence[2].depth, (MILLIMETRES[2] / np.float32(1000)).astype(np.float32))
+    assert np.array_equal(sequence[2].depth, METRES[2])
 
 
-def test_several_topics_are_a_question(write, tmp_path):
-    bag = write("ros2", second_depth=True)
-    with pytest.raises(SequenceError, match=r"2 topics of depth images: /cam/aligned/image, /cam/raw/image.*--depth"):
-        unpack_bag(bag, tmp_path / "out")
-    with pytest.raises(SequenceError, match=r"no topic '/x' of depth images \(there are: /cam/aligned/image"):
-        unpack_bag(bag, tmp_path / "out", depth="/x")
-    assert not (tmp_path / "out").exists()
-    assert unpack_bag(bag, tmp_path / "out", depth="/cam/raw/image").depth == "/cam/raw/image"
+def test_several_topics_are_a_question_and_wrong_bags_give_one_clear_line(write, tmp_path):
+    out, damaged = tmp_path / "out", tmp_path / "damaged.bag"
+    bag = write("ros2", depths=("/cam/aligned/image", "/cam/raw/image"))
+    for source, depth, words in (
+        (bag, None, r"2 topics of depth images: /cam/aligned/image, /cam/raw/image.*--depth"),
+        (bag, "/x", r"no topic '/x' of depth images \(there are: /cam/aligned/image"),
+        (write("ros1", models=()), None, "0 topics of calibration"),
+        (write("mcap", models=("equidistant",)), None, "distortion 'equidistant', only plumb_bob"),
+        (tmp_path / "none.bag", None, "there is no bag"),
+        (tmp_path / "bag_mcap" / "metadata.yaml", None, "cannot be read"),
+        (damaged, None, "cannot be read"),
+    ):
+        damaged.write_bytes((tmp_path / "bag_ros1.bag").read_bytes()[:900])
+        with pytest.raises(SequenceError, match=words) as caught:
+            unpack_bag(source, out, depth=depth)
+        assert "\n" not in str(caught.value) and not out.exists()
+    assert unpack_bag(bag, out, depth="/cam/raw/image").depth == "/cam/raw/image"
     with pytest.raises(SequenceError, match="exists already"):
-        unpack_bag(bag, tmp_path / "out", depth="/cam/raw/image")
-
-
-def test_wrong_bags_give_one_clear_line(write, tmp_path):
-    with pytest.raises(SequenceError, match="0 topics of calibration"):
-        unpack_bag(write("ros1", info=""), tmp_path / "out")
-    with pytest.raises(SequenceError, match="distortion 'equidistant', only plumb_bob"):
-        unpack_bag(write("mcap", model="equidistant"), tmp_path / "out")
-    with pytest.raises(SequenceError, match="there is no bag"):
-        unpack_bag(tmp_path / "none.bag", tmp_path / "out")
-    damaged = tmp_path / "damaged.bag"
-    damaged.write_bytes((tmp_path / "bag_ros1.bag").read_bytes()[:900])
-    for bag in (damaged, tmp_path / "bag_mcap" / "metadata.yaml"):
-        with pytest.raises(SequenceError, match="cannot be read") as caught:
-            unpack_bag(bag, tmp_path / "out")
-        assert "\n" not in str(caught.value)
-    assert not (tmp_path / "out").exists()
+        unpack_bag(bag, out, depth="/cam/raw/image")
 
 
 @pytest.fixture(autouse=True)
@@ -595,43 +549,32 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The colour images that are decoded from now on."""
-    names: list[str] = []
-    read = recorded.read_colour
-
-    def counted(path: Path, **how: object) -> np.ndarray:
-        names.append(path.name)
-        return read(path, **how)
-
+def reads(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """Counts the colour images that are decoded."""
+    counted = Mock(wraps=recorded.read_colour)
     monkeypatch.setattr(recorded, "read_colour", counted)
-    return names
+    return counted
 
 
 def files(cache: StageCache) -> list[Path]:
     return sorted(cache.folder.rglob("*.*"))
 
 
-def same(one: object, other: object) -> bool:
-    pairs = list(zip(one, other, strict=True))
+def same(one: Sequence, other: Sequence) -> bool:
+    frames, others = ([sequence[index] for index in range(len(sequence))] for sequence in (one, other))
     return all(
         a.timestamp == b.timestamp and a.index == b.index and (a.rgb == b.rgb).all() and (a.depth == b.depth).all()
-        for a, b in pairs
+        for a, b in zip(frames, others, strict=True)
     )
 
 
-def frames(sequence: object) -> Iterator[object]:
-    return (sequence[index] for index in range(len(sequence)))
-
-
-def test_frames_are_the_same_and_decoded_once(folder: Path, reads: list[str], cache: StageCache) -> None:
+def test_frames_are_the_same_and_decoded_once(folder: Path, reads: Mock, cache: StageCache) -> None:
     plain = open_sequence(folder)
     mapped = Decoded(plain)
-    reads.clear()
+    reads.reset_mock()
     again = Decoded(open_sequence(folder))
-    assert len(reads) == 1, "opening decodes the first frame"
-    assert same(frames(mapped), frames(again)) and len(reads) == 1
-    assert same(frames(mapped), frames(plain)) and mapped[-1].index == 5
+    assert same(mapped, again) and reads.call_count == 1, "opening decodes the first frame"
+    assert same(mapped, plain) and mapped[-1].index == 5
     assert (mapped.id, mapped.digest(), mapped.camera) == (plain.id, plain.digest(), plain.camera)
     assert mapped[0].rgb.dtype == np.uint8 and mapped[0].depth.dtype == np.float32
     assert len(files(cache)) == 1 and cache.info()["entries_by_stage"] == {"frames": 1}
@@ -644,7 +587,7 @@ def test_a_damaged_file_is_written_again(folder: Path, cache: StageCache, damage
     Decoded(open_sequence(folder))
     (file,) = files(cache)
     file.write_bytes(damage(file.read_bytes()))
-    assert same(frames(Decoded(open_sequence(folder))), frames(open_sequence(folder)))
+    assert same(Decoded(open_sequence(folder)), open_sequence(folder))
 
 
 def test_other_frames_are_another_file(folder: Path, cache: StageCache) -> None:
@@ -652,12 +595,12 @@ def test_other_frames_are_another_file(folder: Path, cache: StageCache) -> None:
     smaller = open_sequence(folder, preprocessing=PreprocessingSettings(width=16, height=16))
     variants = [whole, SequenceView(whole, 1), SequenceView(whole, 0, None, 2), smaller]
     for count, variant in enumerate(variants, 1):
-        assert same(frames(Decoded(variant)), frames(variant)) and len(files(cache)) == count
+        assert same(Decoded(variant), variant) and len(files(cache)) == count
     image = sorted((folder / "rgb").iterdir())[3]
     cv2.imwrite(str(image), 255 - cv2.imread(str(image)))
     changed = open_sequence(folder)
-    assert same(frames(Decoded(changed)), frames(changed)) and len(files(cache)) == 5
-    assert not same(frames(Decoded(changed)), frames(Decoded(whole)))
+    assert same(Decoded(changed), changed) and len(files(cache)) == 5
+    assert not same(Decoded(changed), Decoded(whole))
 
 
 def test_of_several_processes_one_decodes(folder: Path, cache: StageCache) -> None:
@@ -669,9 +612,8 @@ def test_of_several_processes_one_decodes(folder: Path, cache: StageCache) -> No
         "decoded.Decoded(open_sequence(sys.argv[1]))\n"
         "print(len(count))\n"
     )
-    started = [
-        subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE, text=True) for _ in range(3)
-    ]
+    command = [sys.executable, "-c", code, str(folder)]
+    started = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     assert sorted(process.communicate()[0].strip() for process in started) == ["0", "0", "1"]
     assert len(files(cache)) == 1
 
@@ -723,9 +665,8 @@ def lying_png(width: int, height: int) -> bytes:
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    pixels = chunk(b"IDAT", zlib.compress(bytes(99)))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + pixels + chunk(b"IEND", b"")
+    header, pixels = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0), zlib.compress(bytes(99))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
@@ -761,8 +702,8 @@ def test_lists_name_nothing_outside_their_folder(tmp_path: Path, name: str) -> N
 def test_a_manifest_that_leads_outside_is_a_fault(tmp_path: Path) -> None:
     folder, *_ = make_folder(tmp_path / "seq")
     for content in (f"{'0' * 64}  ../../etc/passwd\n".encode(), b"\xff\xfe"):
-        (folder / MANIFEST).write_bytes(content)
-        (fault,) = verify(str(folder)).faults
+        (folder / fetch.MANIFEST).write_bytes(content)
+        (fault,) = fetch.verify(str(folder)).faults
         assert "does not lie in" in fault or "is not a text file" in fault
 
 
@@ -777,7 +718,7 @@ def test_ten_million_lines_are_refused_early_and_cheaply(tmp_path: Path) -> None
 
 def refuses(archive: Path, words: str) -> None:
     with tempfile.TemporaryDirectory() as target, pytest.raises(SequenceError, match=words):
-        archives.extract(archive, Path(target))
+        fetch.extract(archive, Path(target))
 
 
 def test_a_bomb_is_refused(tmp_path: Path) -> None:
@@ -806,16 +747,14 @@ def test_a_tar_header_that_claims_gigabytes_costs_nothing(tmp_path: Path, kind: 
 
 
 def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "MAX_MEMBERS", 20)
-    archive = tmp_path / "a.tar"
-    with tarfile.open(archive, "w") as tar:
+    monkeypatch.setattr(fetch, "MAX_MEMBERS", 20)
+    tar, zipped = tmp_path / "a.tar", tmp_path / "a.zip"
+    with tarfile.open(tar, "w") as as_tar, zipfile.ZipFile(zipped, "w") as as_zip:
         for number in range(30):
-            tar.addfile(tarfile.TarInfo(f"seq/{number}"))
-    refuses(archive, "holds more than 20 files, refused")
-    with zipfile.ZipFile(archive, "w") as made:
-        for number in range(30):
-            made.writestr(f"zip/{number}", "")
-    refuses(archive, "holds more than 20 files, refused")
+            as_tar.addfile(tarfile.TarInfo(f"seq/{number}"))
+            as_zip.writestr(f"zip/{number}", "")
+    for archive in (tar, zipped):
+        refuses(archive, "holds more than 20 files, refused")
 
 
 def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path) -> None:

@@ -318,31 +318,18 @@ class Layout:
     Attributes:
         name: For example ``7-scenes``; the catalogue names it.
         marks: A folder has this layout if all of these files are in it (patterns), or in its folder ``mav0``.
-        reader: Reads a folder of this layout, ``reader(folder, fps)``.
+        read: Reads a folder of this layout, ``read(folder, fps)``, fps being the nominal frame rate in Hz, where the
+            user or the catalogue states one. It raises a `SequenceError` where the folder is not in this layout or
+            damaged, a `TrajectoryError` where its ground truth cannot be read.
     """
 
     name: str
     marks: tuple[str, ...]
-    reader: Callable[[Path, float | None], Contents]
+    read: Callable[[Path, float | None], Contents]
 
     def fits(self, folder: Path) -> bool:
         """Whether a folder has this layout."""
         return any(all(any(base.glob(mark)) for mark in self.marks) for base in (folder, folder / "mav0"))
-
-    def read(self, folder: Path, fps: float | None = None) -> Contents:
-        """What a folder of this layout holds.
-
-        Args:
-            folder: The sequence's folder.
-            fps: Nominal frame rate in Hz, where the user or the catalogue states one.
-
-        Raises:
-            SequenceError: It is not in this layout, or damaged.
-            TrajectoryError: Its ground truth cannot be read.
-        """
-        if not folder.is_dir():
-            raise SequenceError(f"there is no sequence folder {folder}")
-        return self.reader(folder, fps)
 
 
 TUM = Layout("tum", ("rgb.txt",), read_tum)

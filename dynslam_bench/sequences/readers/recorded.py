@@ -179,7 +179,6 @@ class RecordedSequence:
         return len(self._colour)
 
     def __getitem__(self, index: int) -> Frame:
-
         index = range(len(self))[index]
         size = (self.camera.width, self.camera.height)
         expected = f"{size[0]}x{size[1]}"

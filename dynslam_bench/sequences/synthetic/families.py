@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from dynslam_bench.core.seeding import stream
+from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.synthetic.arithmetic import Array, arctan2, atan2, cos, norm, product, sin
 from dynslam_bench.sequences.synthetic.parts import (
     At,
@@ -91,14 +92,8 @@ def camera_poses(motion: str, people: str, scene: int, times: Array) -> Array:
     offset += hand(rng, t, 0.004, 3)
     angles += hand(rng, t, math.radians(0.5), 3)
     base = camera_axes(TILT_RAD)
-    return poses_of(product(base, rotations(angles)), product(offset, base.T) + np.array([0.0, 0.0, EYE_HEIGHT_M]))
-
-
-def poses_of(rotation: Array, position: Array) -> Array:
-    """Poses ``[N, 4, 4]`` of rotations ``[N, 3, 3]`` and positions ``[N, 3]``."""
-    poses = np.tile(np.eye(4), (len(rotation), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotation, position
-    return poses
+    place = product(offset, base.T) + np.array([0.0, 0.0, EYE_HEIGHT_M])
+    return se3.from_matrix(place, product(base, rotations(angles)))
 
 
 def camera_axes(tilt: float) -> Array:
@@ -210,7 +205,7 @@ def walking_camera(walk: Walk, scene: int, name: str, aside_deg: float, times: A
     turned[:, 2] = heading - math.pi / 2  # about the world's z axis; the camera at rest looks along +y
     rotation = product(rotations(turned), camera_axes(TILT_RAD), rotations(hand(rng, t, math.radians(0.7), 3)))
     place = np.column_stack([walk.at(t) + stray, np.full(len(t), EYE_HEIGHT_M)])
-    return poses_of(rotation, place + (steps + hand(rng, t, 0.006, 3)))
+    return se3.from_matrix(place + (steps + hand(rng, t, 0.006, 3)), rotation)
 
 
 def _slow(rng: np.random.Generator, t: Array, axes: int) -> Array:
@@ -337,7 +332,7 @@ def _camera(step: Step, scene: int, times: Array) -> Array:
     rotation = product(camera_axes(TILT_RAD), rotations(hand(rng, times, math.radians(0.5), 3)))
     place = hand(rng, times, 0.004, 3) + np.array([0.0, 0.0, EYE_HEIGHT_M])
     place[:, 0] += step(times)
-    return poses_of(rotation, place)
+    return se3.from_matrix(place, rotation)
 
 
 SYNCHRONOUS = {"synchronous": Variant(build_synchronous, "high-dynamic")}
@@ -355,11 +350,6 @@ def build_condition(change: Change, people: bool, scene: int) -> World:
     world = change(build_replica("walking", "xyz", scene), scene)
     world = replace(world, camera=partial(camera_poses, "halfsphere", "conditions", scene))
     return world if people else replace(world, actors=(), bodies=())
-
-
-def _plain(world: World, scene: int) -> World:
-    """The same things without a pattern."""
-    return replace(world, static=[replace(part, texture=("plain",) * 6) for part in world.static])
 
 
 def _hall(world: World, scene: int) -> World:
@@ -380,7 +370,7 @@ def _hall(world: World, scene: int) -> World:
 
 _CHANGES: dict[str, Change] = {
     "dark": lambda world, _: replace(world, optics=DARK),
-    "blank": _plain,
+    "blank": lambda world, _: replace(world, static=[replace(part, texture=("plain",) * 6) for part in world.static]),
     "far": _hall,
     "outdoor": lambda world, _: replace(world, optics=SUNLIGHT),
 }
@@ -853,7 +843,7 @@ def fast_camera(variant: str, scene: int, times: Array) -> Array:
         yaw[:, 2] = pick(rng, scene, 1.3, 1.6) * t
         place = np.array([2.7, 0.2, EYE_HEIGHT_M])
     base = product(rotations(yaw), camera_axes(TILT_RAD))
-    return poses_of(product(base, rotations(angles)), place + product(base, offset[..., None])[..., 0])
+    return se3.from_matrix(place + product(base, offset[..., None])[..., 0], product(base, rotations(angles)))
 
 
 FAST = {

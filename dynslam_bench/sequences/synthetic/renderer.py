@@ -183,13 +183,9 @@ class Renderer:
         """Share the bands of an image among the threads; under a rolling shutter they do not depend on their number."""
         whole = self.threads == 1 and not self.scene.world.optics.readout_s
         height = CAMERA.height if whole else _BAND
-        bands = [(first, first + height) for first in range(0, CAMERA.height, height)]
-        if self.threads == 1:
-            for first, end in bands:
-                work(first, end)
-            return
+        starts = range(0, CAMERA.height, height)
         with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, *zip(*bands, strict=True)))
+            list(pool.map(work, starts, [first + height for first in starts]))
 
     def _tiles(self, view: View) -> tuple[Tiles, Array]:
         """Bin the primitives into tiles by the bounds of their boxes, as seen by several rows of a rolling shutter.

@@ -116,8 +116,10 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
     ]
     for k in range(3):
         front, handle = unit + np.array([0, -0.305, 0.19 - 0.19 * k]), unit + np.array([0, -0.32, 0.22 - 0.19 * k])
-        parts.append(box(_EYE, front, (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92))
-        parts.append(box(_EYE, handle, (0.05, 0.008, 0.008), tint=tint["metal"]))
+        parts += [
+            box(_EYE, front, (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92),
+            box(_EYE, handle, (0.05, 0.008, 0.008), tint=tint["metal"]),
+        ]
     parts += _monitors(rng, plan, x, y, half)
     for k in range(5):
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
@@ -226,8 +228,10 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     x = plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5
     parts = [box(_EYE, (x, y, 0.42), (0.45, 0.22, 0.42), tint=tint["cabinet"])]
     for dx in (-0.225, 0.225):
-        parts.append(box(_EYE, (x + dx, y - 0.226, 0.42), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9))
-        parts.append(box(_EYE, (x + dx * 0.3, y - 0.24, 0.6), (0.008, 0.01, 0.06), tint=tint["metal"]))
+        parts += [
+            box(_EYE, (x + dx, y - 0.226, 0.42), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9),
+            box(_EYE, (x + dx * 0.3, y - 0.24, 0.6), (0.008, 0.01, 0.06), tint=tint["metal"]),
+        ]
     pot = np.array([x - 0.2 * side, y, 0.85])
     parts.append(cone(_EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25)))
     for _ in range(9):
@@ -407,11 +411,15 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
         a = turn(72 * k + 18)
         tip, u = product(a, np.array([0.28, 0, 0.05])), product(a, np.array([0.0, 1.0, 0.0]))
         z = (tip - hub) / norm(tip - hub)
-        parts.append(cone(np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame))
-        parts.append(cone(_EYE, tip - (0, 0, 0.015), (0, 0.032, 0.032), **frame | {"tint": metal * 0.7}))
+        parts += [
+            cone(np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame),
+            cone(_EYE, tip - (0, 0, 0.015), (0, 0.032, 0.032), **frame | {"tint": metal * 0.7}),
+        ]
     for side in (-1, 1):
-        parts.append(box(_EYE, (side * 0.27, 0.03, 0.66), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8}))
-        parts.append(box(_EYE, (side * 0.27, 0.05, 0.55), (0.015, 0.02, 0.1), **frame))
+        parts += [
+            box(_EYE, (side * 0.27, 0.03, 0.66), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8}),
+            box(_EYE, (side * 0.27, 0.05, 0.55), (0.015, 0.02, 0.1), **frame),
+        ]
     return parts
 
 

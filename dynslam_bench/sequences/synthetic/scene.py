@@ -178,11 +178,11 @@ class Scene:
 
     def atlas(self) -> textures.Atlas:
         """The scene's textures."""
-        images = {}
-        for name in self.texture_names:
-            maker = textures.MAKERS[name.partition(":")[0]]
-            images[name] = maker(stream(self.seed, "synthetic", "texture", name))
-        return textures.build_atlas(images)
+        drawn = (
+            textures.MAKERS[name.partition(":")[0]](stream(self.seed, "synthetic", "texture", name))
+            for name in self.texture_names
+        )
+        return textures.build_atlas(list(drawn))
 
     def place(self, time: float) -> tuple[Array, Array]:
         """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start)."""

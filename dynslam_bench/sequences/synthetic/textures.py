@@ -17,25 +17,23 @@ texture after texture; int64 ``[T, L]`` offset of each level's first byte; int32
 texture's edge."""
 
 
-def build_atlas(textures: dict[str, Image]) -> Atlas:
+def build_atlas(textures: list[Image]) -> Atlas:
     """Pack textures; each is halved by 2x2 means down to one texel."""
     levels = 12
     offsets = np.zeros((len(textures), levels), np.int64)
     log2 = np.zeros(len(textures), np.int32)
     parts: list[NDArray[np.uint8]] = []
     position = 0
-    for index, image in enumerate(textures.values()):
-        size = image.shape[0]
-        log2[index] = int(size).bit_length() - 1
+    for index, image in enumerate(textures):
+        log2[index] = len(image).bit_length() - 1
         current = np.clip(image, 0, 255)
         for level in range(levels):
-            offsets[index, level] = position
+            offsets[index, level:] = position
             texels = np.zeros((*current.shape[:2], 4), np.uint8)
             texels[..., :3] = np.floor(current + 0.5)
             parts.append(texels.ravel())
             position += texels.size
             if current.shape[0] == 1:
-                offsets[index, level:] = offsets[index, level]
                 break
             current = 0.25 * (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2])
     return np.concatenate(parts), offsets, log2
@@ -78,8 +76,7 @@ def plain(rng: np.random.Generator, size: int = 64, contrast: float = 4.0) -> Im
 
 def plaster(rng: np.random.Generator, size: int = 512) -> Image:
     """A painted wall: slow unevenness and fine grain."""
-    values = 228 + 9 * fractal(rng, size, 3, 3) + 3 * smooth_noise(rng, size, 128)
-    return _gray(values)
+    return _gray(228 + 9 * fractal(rng, size, 3, 3) + 3 * smooth_noise(rng, size, 128))
 
 
 def wood(rng: np.random.Generator, size: int = 256) -> Image:
