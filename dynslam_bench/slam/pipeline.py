@@ -17,20 +17,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts import (
+    DynamicFilter,
+    FeatureExtractor,
+    FilterResult,
+    FilterState,
+    FlowEstimator,
+    FlowResult,
+    Frame,
+    FrameBundle,
+    Keypoints,
+    MapOutputs,
+    MaskedExtractor,
+    TrackResult,
+)
 from dynslam_bench.contracts.checks import check_frame
-from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
-from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import GuardSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.backend import RgbdBackend
@@ -170,8 +177,7 @@ class SlamPipeline:
         with clock("features"):
             keypoints = self._extract(gray, mask)
             xy = camera.undistort_points(keypoints.xy)
-        column, row = np.rint(keypoints.xy).astype(np.intp).T
-        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
+        z = depth[pixel_index(keypoints.xy, depth.shape)[0]].clip(min=0)
         bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
         state = self._filter_state(bundle, camera)
         static, image = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave
@@ -393,7 +399,5 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     camera, T_prev_cur = state.camera, se3.inverse(state.T_world_prev) @ state.T_world_pred
     points = camera.unproject(frame.xy[has_depth], frame.z[has_depth]) @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
     ahead = points[:, 2] > 0.05
-    pixels = np.full((len(points), 2), np.nan)
-    pixels[ahead] = camera.distort_points(camera.project(points[ahead]))
-    guess[has_depth] = pixels
+    guess[np.flatnonzero(has_depth)[ahead]] = camera.distort_points(camera.project(points[ahead]))
     return guess
