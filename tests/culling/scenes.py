@@ -5,12 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import FilterState, FrameBundle, KeyframeView
-from dynslam_bench.contracts.flow import FlowResult
-from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.contracts import FilterState, FlowResult, FrameBundle, Instances, KeyframeView, Keypoints
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
