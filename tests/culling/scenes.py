@@ -1,6 +1,6 @@
 """Constructed scenes: exact flow and depth of static and moving points seen by a moving camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -65,6 +65,7 @@ def scene(
     motion: np.ndarray | None = None,
     noise_px: float = 0.1,
     seed: int = 0,
+    instances: Instances | None = None,
 ) -> Scene:
     """Static points all over the image, moving ones inside x 200..330, y 100..380 at 1.5 m.
 
@@ -94,7 +95,7 @@ def scene(
         T_world_pred=T_prev_cur,
         flow=FlowResult(before.astype(np.float32), np.ones(len(xy), bool), np.zeros(len(xy), np.float32)),
     )
-    return Scene(frame, state, moving)
+    return Scene(replace(frame, instances=instances), state, moving)
 
 
 def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> Instances:
