@@ -126,7 +126,8 @@ class OrbExtractor:
         missing = 0
         for level, quota, among in list(zip(levels, quotas, allowed, strict=True))[::-1]:
             strong = among & (level.response >= self.settings.fast_threshold)
-            eligible = strong | among & ~np.isin(level.cells, level.cells[strong])
+            filled = np.bincount(level.cells[strong], minlength=level.cells.max(initial=0) + 1) > 0
+            eligible = strong | among & ~filled[level.cells]
             chosen.append(spread(level.cells, level.response, eligible, quota + missing))
             missing += quota - len(chosen[-1])  # a coarse level's missing features are added to the next finer level
         return chosen[::-1]
