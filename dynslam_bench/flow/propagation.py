@@ -111,8 +111,10 @@ def common_motions(
         out: float32 ``[2, 4]``, ``(a, b, tx, ty)``; NaN where fewer than 6 points agree.
     """
     out[:] = np.nan
-    if len(points) >= 4:  # sorted in numpy: in a kernel it would add a tenth to the compile time of all kernels
-        better = np.sort(np.argsort(costs, kind="stable")[: max(len(costs) // 2, 4)])
+    if len(points) >= 4:  # partitioned in numpy: in a kernel it would add a tenth to the compile time of all kernels
+        half = max(len(costs) // 2, 4)
+        keys = costs * len(costs) + np.arange(len(costs))  # of equal costs the first
+        better = np.sort(np.argpartition(keys, half - 1)[:half])
         motions_of(points, labels, better, hypotheses, tolerance, seed, out)
 
 

@@ -37,7 +37,7 @@ from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import GuardSettings
-from dynslam_bench.geometry import Camera, Trajectory, pixel_index, se3
+from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.backend import RgbdBackend
@@ -161,7 +161,8 @@ class SlamPipeline:
         with clock("features"):
             keypoints = self._extract(gray, mask)
             xy = camera.undistort_points(keypoints.xy)
-        z = depth[pixel_index(keypoints.xy, depth.shape)[0]].clip(min=0)
+        column, row = np.rint(keypoints.xy).astype(np.intp).T
+        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
         bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
         state = self._filter_state(bundle, camera)
         static, image = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FrameBundle, Keypoints
 from dynslam_bench.features.matching import CellGrid, Words, as_words, rotation_consistent, search_in_radius
-from dynslam_bench.geometry import Camera, pixel_index, se3
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import PoseEstimate, optimise_pose
 from dynslam_bench.slam.settings import TrackingSettings
@@ -111,6 +111,8 @@ def observe(
     octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
     variance = scales[octave] ** 2
     noise = RIGHT_SIGMA_PX**2 * variance + (camera.fx * camera.baseline_m * DEPTH_NOISE) ** 2
+    height, width = frame.rgb.shape[:2]
+    column, row = np.rint(keypoints.xy).astype(np.int64).T
     return Observations(
         keypoints,
         xy,
@@ -122,7 +124,7 @@ def observe(
         weight[index] / variance,
         np.where(z > 0, weight[index] / noise, 0.0),
         CellGrid.of(xy, camera.width, camera.height),
-        frame.rgb[pixel_index(keypoints.xy, frame.gray.shape)[0]],
+        frame.rgb[row.clip(0, height - 1), column.clip(0, width - 1)],
         frame.mask,
     )
 
