@@ -30,6 +30,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.load import load_runs, open_stores
 from dynslam_bench.reports.model.published import published, static_camera_errors
@@ -114,16 +115,20 @@ def read_cells(folder: Path) -> pd.DataFrame:
 
 
 def report(folder: Path) -> str:
-    """The whole Markdown text of a suite's results; ends the script where the reference system's are missing."""
+    """The whole Markdown text of a suite's results.
+
+    Raises:
+        DynslamError: The folder holds no runs, or not the reference system's.
+    """
     cells = read_cells(folder)
     ates = cells["ate"].unstack()
     replicas = [name for name in ates if name.startswith("synthetic/")] if len(cells) else []
     reference = ates.reindex(index=[EXACT], columns=replicas).loc[EXACT]
     missing = [replica for replica in replicas if np.isnan(reference[replica])]
     if missing or not replicas:
-        raise SystemExit(
-            f"{folder} holds no run of mask-rcnn with exact masks on {missing[0] if missing else 'any replica'}: "
-            "run the suite 'dynamic', or mask-rcnn with --set segmentation.source=oracle"
+        raise DynslamError(
+            f"{folder} holds no run of mask-rcnn with exact masks on {missing[0] if missing else 'any replica'}",
+            "run the suite 'dynamic', or mask-rcnn with --set segmentation.source=oracle",
         )
     standstill = cells["static_camera"].unstack().loc[EXACT]
     if "never-move" in ates.index:
@@ -174,4 +179,7 @@ def short(replica: str) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("results", type=Path, help="folder that 'dynslam-bench bench dynamic' wrote")
-    print(report(parser.parse_args().results))
+    try:
+        print(report(parser.parse_args().results))
+    except DynslamError as error:
+        raise SystemExit(str(error)) from error
