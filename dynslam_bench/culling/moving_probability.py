@@ -114,8 +114,6 @@ def expand(
     expanded = probability.copy()
     certain = np.flatnonzero(linked & ((probability < CERTAIN[0]) | (probability > CERTAIN[1])))
     new = np.flatnonzero(~linked)
-    if not len(certain) or not len(new):
-        return expanded
     distance, nearest = cKDTree(xy[certain]).query(xy[new], distance_upper_bound=radius_px)
     near = np.isfinite(distance)
     influence = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * radius_px)))

@@ -238,8 +238,6 @@ def rotation_consistent(
     Returns:
         bool ``[N]``, True for matches in the (up to three) fullest bins.
     """
-    if not len(angle_a):
-        return np.zeros(0, bool)
     difference = np.mod(np.asarray(angle_a, np.float64) - np.asarray(angle_b, np.float64), 360.0)
     index = np.minimum((difference * (bins / 360.0)).round().astype(np.int64) % bins, bins - 1)
     counts = np.bincount(index, minlength=bins)

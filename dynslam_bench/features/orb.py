@@ -39,7 +39,6 @@ class _Level:
         xy: float32 ``[N, 2]``, pixels of the level.
         response: int16 ``[N]``, strengths.
         cells: int64 ``[N]``, cell of the grid that each lies in.
-        n_cells: Cells of the grid.
     """
 
     image: NDArray[np.uint8]
@@ -47,7 +46,6 @@ class _Level:
     xy: NDArray[np.float32]
     response: NDArray[np.int16]
     cells: NDArray[np.int64]
-    n_cells: int
 
 
 class OrbExtractor:
@@ -128,8 +126,7 @@ class OrbExtractor:
         missing = 0
         for level, quota, among in list(zip(levels, quotas, allowed, strict=True))[::-1]:
             strong = among & (level.response >= self.settings.fast_threshold)
-            filled = np.zeros(level.n_cells, bool)
-            filled[level.cells[strong]] = True
+            filled = np.bincount(level.cells[strong], minlength=level.cells.max(initial=0) + 1) > 0
             eligible = strong | among & ~filled[level.cells]
             chosen.append(spread(level.cells, level.response, eligible, quota + missing))
             missing += quota - len(chosen[-1])  # a coarse level's missing features are added to the next finer level
@@ -138,12 +135,12 @@ class OrbExtractor:
     def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
         inner = image[EDGE - 3 : image.shape[0] - EDGE + 3, EDGE - 3 : image.shape[1] - EDGE + 3]
         cell = self.settings.cell_px
-        columns, rows = -(-inner.shape[1] // cell), -(-inner.shape[0] // cell)
         corners = self._detector.detect(inner)
         xy = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float32).reshape(-1, 2)
         response = np.array([corner.response for corner in corners], dtype=np.int16)
         column, row = (xy * np.float32(1.0 / cell)).astype(np.int64).T
-        return _Level(image, scale, xy + np.float32(EDGE - 3), response, row * columns + column, rows * columns)
+        cells = row * -(-inner.shape[1] // cell) + column
+        return _Level(image, scale, xy + np.float32(EDGE - 3), response, cells)
 
     def _describe(
         self, gray: NDArray[np.uint8], levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]

@@ -32,22 +32,6 @@ def invalid_result(points: NDArray[np.float32], *, degenerate: bool) -> FlowResu
     return FlowResult(xy, np.zeros(n, np.bool_), np.ones(n, np.float32), flow_stats(n, degenerate=degenerate))
 
 
-def is_degenerate(reference: NDArray[np.uint8], target: NDArray[np.uint8]) -> bool:
-    """Whether a pair of images allows no flow: equal pixel by pixel, or one of them without texture.
-
-    Raises:
-        ValueError: They differ in size, or are no uint8 ``[H, W]`` images.
-    """
-    if reference.shape != target.shape:
-        raise ValueError(f"images differ in size: {reference.shape} and {target.shape}")
-    if reference.dtype != np.uint8 or target.dtype != np.uint8 or reference.ndim != 2:
-        raise ValueError(f"images must be uint8 [H, W], got {reference.dtype} {reference.shape} and {target.dtype}")
-    if reference is target or not reference.size:
-        return True
-    flat = any(np.ptp(image) <= FLAT_RANGE for image in (reference, target))
-    return flat or np.array_equal(reference, target)
-
-
 def usable_points(points: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Finite points inside an image of shape ``(H, W)``."""
     height, width = shape[:2]
@@ -61,12 +45,20 @@ def clean_points(
 
     Returns:
         float32 ``[N, 2]``, 0 where a point is not usable, and bool ``[N]``, usable; a result for no points and for
-        degenerate images.
+        degenerate images: equal pixel by pixel, or one of them without texture.
+
+    Raises:
+        ValueError: The images differ in size, or are no uint8 ``[H, W]`` images.
     """
+    if reference.shape != target.shape:
+        raise ValueError(f"images differ in size: {reference.shape} and {target.shape}")
+    if reference.dtype != np.uint8 or target.dtype != np.uint8 or reference.ndim != 2:
+        raise ValueError(f"images must be uint8 [H, W], got {reference.dtype} {reference.shape} and {target.dtype}")
     points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
-    if not len(points):
-        return invalid_result(points, degenerate=False)
-    if is_degenerate(reference, target):
+    images = (reference, target)
+    if not len(points) or not reference.size:
+        return invalid_result(points, degenerate=bool(len(points)))
+    if reference is target or any(np.ptp(image) <= FLAT_RANGE for image in images) or np.array_equal(*images):
         return invalid_result(points, degenerate=True)
     usable = usable_points(points, reference.shape)
     return np.where(usable[:, None], points, 0).astype(np.float32), usable

@@ -39,6 +39,7 @@ from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
 from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs, Words
 from dynslam_bench.flow.sparse import SparseDaisyFlow, side_of
+from dynslam_bench.geometry import pixel_index
 
 NEIGHBOURS = 9
 """Reliable regions that a regional motion is fitted to."""
@@ -115,13 +116,13 @@ class DenseDaisyFlow:
             return cleaned
         clean, usable = cleaned
         dense = self.flow(reference, target, seed=seed)
-        pixel = _pixels(clean)
+        pixel, _ = pixel_index(clean, target.maps.gray.shape)
         xy = (clean + dense.flow[pixel]).astype(np.float32)
         cost = dense.cost[pixel]
         valid = usable & dense.valid[pixel] & usable_points(xy, target.maps.gray.shape) & (cost < MAX_COST)
         if self.settings.forward_backward_px > 0:
             ends = np.where(valid[:, None], xy, clean)
-            error = np.linalg.norm(ends + dense.back[_pixels(ends)] - clean, axis=1)
+            error = np.linalg.norm(ends + dense.back[pixel_index(ends, target.maps.gray.shape)[0]] - clean, axis=1)
             valid &= error <= self.settings.forward_backward_px
         return FlowResult(xy, valid, cost, flow_stats(len(clean), int(valid.sum()), dense.evaluations))
 
@@ -139,7 +140,15 @@ class DenseDaisyFlow:
         if fitted is not None:
             height, smooth = len(flow), np.empty_like(flow)
             self._sparse.workers.run(
-                fill_and_smooth, 0, height, flow, valid, reference.regions.labels, *fitted.affine(), smooth
+                fill_and_smooth,
+                0,
+                height,
+                flow,
+                valid,
+                reference.regions.labels,
+                reference.centres,
+                fitted.astype(np.float32),
+                smooth,
             )
             flow = smooth
         return DenseFlow(flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back)
@@ -149,12 +158,6 @@ class DenseDaisyFlow:
         tolerance = np.float32(self.settings.consistency_px)
         self._sparse.workers.run(consistent, 0, len(valid), forward, backward, tolerance, valid)
         return valid
-
-
-def _pixels(points: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of the pixels that contain points inside an image."""
-    column, row = np.rint(points).astype(np.intp).T
-    return row, column
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +228,7 @@ class _RegionLabels:
         fitted = fit_regional_motion(self.flow(), valid, self._image.regions, self._image.half)
         if fitted is None:
             return
-        candidates = [fitted.labels()]
+        candidates = [nearest_similarities(fitted)]
         if self.settings.refinement == "lucas-kanade":
             candidates.append(candidates[0].copy())
             self._sparse.refine(self._image.centres, candidates[1], self._pair)
@@ -255,13 +258,10 @@ class _RegionLabels:
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        share = self._best[_half_pixels(self._image.maps.gray.shape, self._image.half.shape)]
+        full, half = self._image.maps.gray.shape, self._image.half.shape
+        rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(full, half, strict=True))
+        share = self._best[np.ix_(rows, columns)]
         return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)  # may overshoot
-
-
-def _half_pixels(shape: tuple[int, ...], half: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
-    """Index of the half-resolution pixel of every full-image pixel."""
-    return np.ix_(*(np.minimum(np.arange(full) // 2, size - 1) for full, size in zip(shape, half, strict=True)))
 
 
 @kernel
@@ -288,38 +288,17 @@ def consistent(start: int, stop: int, forward: Floats, backward: Floats, toleran
                 valid[y, x] = dx * dx + dy * dy <= limit
 
 
-@dataclass(frozen=True, eq=False)
-class RegionalMotion:
-    """Affine motions of K regions.
-
-    Attributes:
-        centres: float64 ``[K, 2]``, full-image pixels.
-        spread: float64 ``[K, 1]``, pixels a unit of `motion`.
-        motion: float64 ``[K, 3, 2]``, flow at the centre, and its change per unit along x and y.
-    """
-
-    centres: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    motion: NDArray[np.float64]
-
-    def affine(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Centres ``[K, 2]``, and ``[K, 3, 2]``: flow there and its change per pixel along x and y."""
-        motion = self.motion.copy()
-        motion[:, 1:] /= self.spread[:, :, None]
-        return self.centres.astype(np.float32), motion.astype(np.float32)
-
-    def labels(self) -> NDArray[np.float32]:
-        """The similarity nearest to each region's motion at its centre, as labels ``[K, 4]``."""
-        slope = self.motion[:, 1:] / self.spread[:, :, None]  # d flow / d (x, y): [K, (x, y), (u, v)]
-        a = 1 + 0.5 * (slope[:, 0, 0] + slope[:, 1, 1])
-        b = 0.5 * (slope[:, 0, 1] - slope[:, 1, 0])
-        s, theta = np.log2(np.maximum(np.hypot(a, b), 0.25)), np.arctan2(b, a)
-        return np.column_stack([self.motion[:, 0], s, theta]).astype(np.float32)
+def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The similarities nearest to affine motions ``[K, 3, 2]`` at their centres, as labels ``[K, 4]``."""
+    a = 1 + 0.5 * (motion[:, 1, 0] + motion[:, 2, 1])
+    b = 0.5 * (motion[:, 1, 1] - motion[:, 2, 0])
+    s, theta = np.log2(np.maximum(np.hypot(a, b), 0.25)), np.arctan2(b, a)
+    return np.column_stack([motion[:, 0], s, theta]).astype(np.float32)
 
 
 def fit_regional_motion(
     flow: NDArray[np.float32], valid: NDArray[np.bool_], regions: Superpixels, guide: NDArray[np.uint8]
-) -> RegionalMotion | None:
+) -> NDArray[np.float64] | None:
     """Fit an affine motion to the reliable regions around each region, robustly.
 
     Args:
@@ -329,7 +308,8 @@ def fit_regional_motion(
         guide: uint8 ``[H / 2, W / 2]``, their image; regions of similar grey level count more.
 
     Returns:
-        The motions; None where fewer than three regions are reliable.
+        float64 ``[K, 3, 2]``, flow at the centre, and its change per pixel along x and y; None where fewer than three
+        regions are reliable.
     """
     count = len(regions.centres)
     sums = np.zeros((count, 6))
@@ -358,7 +338,8 @@ def fit_regional_motion(
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
         motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
         weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
-    return RegionalMotion(centres, spread, motion)
+    motion[:, 1:] /= spread[:, :, None]
+    return motion
 
 
 @kernel
@@ -389,8 +370,8 @@ def fill_and_smooth(
         flow: float32 ``[H, W, 2]``.
         valid: bool ``[H, W]``, consistent pixels.
         labels: `Superpixels.labels`.
-        centres: float32 ``[K, 2]`` of `RegionalMotion.affine`.
-        motion: float32 ``[K, 3, 2]``, likewise.
+        centres: float32 ``[K, 2]``, full-image pixels.
+        motion: float32 ``[K, 3, 2]`` of `fit_regional_motion`.
         out: float32 ``[H, W, 2]``, filled.
     """
     limit = np.float32(SMOOTH_PX**2)

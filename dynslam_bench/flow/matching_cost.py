@@ -162,8 +162,10 @@ def rotate_descriptor(descriptor: Words, at: int, a: int, turned: Words, out: By
 
 
 @kernel
-def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTables, out: Bytes) -> None:
-    """Reference descriptors of points, with their bins rotated by each quantised angle.
+def describe(
+    start: int, stop: int, points: Floats, image: Side, tables: CostTables, out: Bytes, appearances: Ints
+) -> None:
+    """Reference descriptors of points, with their bins rotated by each quantised angle, and their appearance.
 
     Args:
         start: First point.
@@ -172,6 +174,7 @@ def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTab
         image: `Side` of the reference.
         tables: `CostTables`.
         out: uint8, flat ``[N, S, ROTATIONS, 17 * 8]``.
+        appearances: int32 ``[N, S, 2]``, filled with grey levels and gradient magnitudes where the terms need them.
     """
     height, width = image.gray.shape
     descriptor, turned = np.empty(17, dtype=np.uint64), np.empty((2, 17), dtype=np.uint64)
@@ -183,6 +186,8 @@ def describe(start: int, stop: int, points: Floats, image: Side, tables: CostTab
             read_descriptor(x, y, image, tables, descriptor, 0)
             for a in range(13):
                 rotate_descriptor(descriptor, 0, a, turned, out, ((i * supports + q) * 13 + a) * 136)
+            if tables.appearance:
+                appearances[i, q, 0], appearances[i, q, 1] = appearance(image, x, y)
 
 
 @inlined
@@ -256,20 +261,6 @@ def appearance(image: Side, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     column = min(max(np.int64(x + np.float32(0.5)), 0), width - 1)
     row = min(max(np.int64(y + np.float32(0.5)), 0), height - 1)
     return np.int64(image.gray[row, column]), np.int64(image.gradients[row, column])
-
-
-@kernel
-def reference_appearance(points: Floats, image: Side, tables: CostTables, out: Ints) -> None:
-    """Fill int32 ``[N, S, 2]`` with the reference's grey levels and gradient magnitudes at the support."""
-    for i in range(len(points)):
-        for q in range(len(tables.support)):
-            gray, gradient = appearance(
-                image,
-                points[i, 0] + np.float32(tables.support[q, 0]),
-                points[i, 1] + np.float32(tables.support[q, 1]),
-            )
-            out[i, q, 0] = gray
-            out[i, q, 1] = gradient
 
 
 @kernel

@@ -111,21 +111,11 @@ def common_motions(
         out: float32 ``[2, 4]``, ``(a, b, tx, ty)``; NaN where fewer than 6 points agree.
     """
     out[:] = np.nan
-    if len(points) >= 4:
-        motions_of(points, labels, better_half(costs), hypotheses, tolerance, seed, out)
-
-
-def better_half(costs: Longs) -> Longs:
-    """Indices of the lower half of the costs, four at least, ascending; of equal ones the first.
-
-    In numpy: in a kernel, ``np.partition`` would add a tenth to the compile time of all kernels.
-    """
-    half = max(len(costs) // 2, 4)
-    threshold = np.partition(costs, half - 1)[half - 1]
-    chosen = costs < threshold
-    ties = np.flatnonzero(costs == threshold)
-    chosen[ties[: half - np.count_nonzero(chosen)]] = True
-    return np.flatnonzero(chosen).astype(np.int64)
+    if len(points) >= 4:  # partitioned in numpy: in a kernel it would add a tenth to the compile time of all kernels
+        half = max(len(costs) // 2, 4)
+        keys = costs * len(costs) + np.arange(len(costs))  # of equal costs the first
+        better = np.sort(np.argpartition(keys, half - 1)[:half])
+        motions_of(points, labels, better, hypotheses, tolerance, seed, out)
 
 
 @kernel

@@ -22,7 +22,6 @@ from dynslam_bench.flow.matching_cost import (
     cost_tables,
     describe,
     parabola,
-    reference_appearance,
 )
 from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, Side, orientation_maps
 from dynslam_bench.flow.propagation import (
@@ -138,10 +137,8 @@ class SparseDaisyFlow:
         """What the search needs of the reference points: their rotated descriptors and appearance."""
         count, supports = len(points), len(tables.support)
         descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
-        self.workers.run(describe, 0, count, points, image.side, tables, descriptors)
         appearance = np.zeros((count, supports, 2), dtype=np.int32)
-        if tables.appearance:
-            reference_appearance(points, image.full_side, tables, appearance)
+        self.workers.run(describe, 0, count, points, side_of(image, tables), tables, descriptors, appearance)
         return Reference(points, descriptors, appearance)
 
     def search(

@@ -385,8 +385,6 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
 
 def carry_dense(instances: Instances, flow: NDArray[np.float32]) -> Instances:
     """The objects moved by the dense flow from their image (see `dense_flow`); lost objects are left out."""
-    if not len(instances):
-        return instances
     return _moved(instances, [_carry_object(mask, flow) for mask in instances.masks])
 
 

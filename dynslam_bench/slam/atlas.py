@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.map import Array, Map
 from dynslam_bench.slam.map_files import (
     FEATURE_ARRAYS,

@@ -11,12 +11,9 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.filter import FrameBundle
-from dynslam_bench.contracts.tracker import MapOutputs, TrackingState, TrackResult
+from dynslam_bench.contracts import FrameBundle, MapOutputs, TrackingState, TrackResult
 from dynslam_bench.core.errors import TrackerError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.slam.atlas import open_atlas, save_atlas
 from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser
 from dynslam_bench.slam.local_mapping import KeyframePolicy, LocalMapper, refined

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.features.matching import rotation_consistent, search_in_radius
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import NEAR_M, optimise_pose

@@ -11,13 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import KeyframeView
-from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
+from dynslam_bench.contracts import KeyframeRecord, KeyframeView, Keypoints, MapOutputs
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.tracking import Observations
@@ -239,9 +236,7 @@ class Map:
 
     def observe(self, keyframe: int, features: Slots, points: Slots) -> None:
         """Add observations: features of a keyframe show points."""
-        if not len(points):
-            return
-        self._reserve(int(self.n_obs[points].max()) + 1)
+        self._reserve(int(self.n_obs[points].max(initial=0)) + 1)
         _link(*self._observed, self.kf_point, keyframe, features, points)
 
     def unobserve(self, keyframes: Slots, features: Slots) -> None:

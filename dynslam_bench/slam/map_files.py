@@ -22,9 +22,7 @@ from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
 from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
 from dynslam_bench.core.records import Record, schema, write_atomic
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.stamps import format_ns, ns_of
+from dynslam_bench.geometry import Camera, format_ns, ns_of, se3
 
 MAP_FILE = "map.npz"
 MAP_SCHEMA = 1

@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.features.matching import CellGrid
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.slam.map import Array, Map
 from dynslam_bench.slam.pose_optimisation import apply_twist
 from dynslam_bench.slam.settings import MotionModelSettings

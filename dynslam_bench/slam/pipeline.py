@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,20 +17,27 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.contracts import (
+    DynamicFilter,
+    FeatureExtractor,
+    FilterResult,
+    FilterState,
+    FlowEstimator,
+    FlowResult,
+    Frame,
+    FrameBundle,
+    Keypoints,
+    MapOutputs,
+    MaskedExtractor,
+    TrackResult,
+)
 from dynslam_bench.contracts.checks import check_frame
-from dynslam_bench.contracts.features import FeatureExtractor, Keypoints, MaskedExtractor
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle
-from dynslam_bench.contracts.flow import FlowEstimator, FlowResult
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import MapOutputs, TrackResult
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import GuardSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.backend import RgbdBackend
@@ -72,23 +79,6 @@ class StageClock:
         yield
         elapsed = time.perf_counter() - start + (0.0 if cached is None else cached.saved_s)
         self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
-
-
-@dataclass(frozen=True, eq=False)
-class PreviousFrame:
-    """What filters and flow read of the frame before.
-
-    Attributes:
-        frame: The frame.
-        keep: bool ``[N]``, its static keypoints.
-        image: Its image as the flow prepared it; None if no flow ran.
-        T_world_cam: Its pose, None if it was not tracked.
-    """
-
-    frame: FrameBundle
-    keep: NDArray[np.bool_]
-    image: Any
-    T_world_cam: NDArray[np.float64] | None
 
 
 class SlamPipeline:
@@ -142,7 +132,8 @@ class SlamPipeline:
         for part in (*self._filters, self._masks):
             if part is not None and hasattr(part, "reset"):
                 part.reset(camera)
-        self._previous: PreviousFrame | None = None
+        self._before: dict[str, Any] = {}  # what `FilterState` holds of the previous frame
+        self._image: Any = None  # the previous image as the flow prepared it; None if no flow ran
         self._keyframe_due = True
 
     # ------------------------------------------------------------------ one frame
@@ -178,7 +169,8 @@ class SlamPipeline:
         result = backend.track(bundle, static.keep, static.weight)  # with mapping and loop closing
         # the pose of a frame that is not tracked in the root map's world is unknown
         pose = result.T_world_cam if result.state == backend.state == "ok" else None
-        self._previous = PreviousFrame(bundle, static.keep, image, pose)
+        self._before = {"previous": bundle, "previous_keep": static.keep, "T_world_prev": pose}
+        self._image = image
         self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
         timings = clock.seconds | dict(result.timings)
         if self._masks is not None and self._masks.beside_s:
@@ -194,20 +186,17 @@ class SlamPipeline:
 
     def _filter_state(self, frame: FrameBundle, camera: Camera) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
-        previous = self._previous
         T_world_pred, covariance = self._backend.predict(frame.timestamp)
         view = self._backend.view()
         return FilterState(
             camera=camera,
             keep=np.ones(len(frame.xy), dtype=bool),
-            previous=None if previous is None else previous.frame,
-            previous_keep=None if previous is None else previous.keep,
-            T_world_prev=None if previous is None else previous.T_world_cam,
             T_world_pred=T_world_pred,
             motion_covariance=covariance,
             keyframes=view.keyframes,
             map_points=(view.ids, view.positions),
             seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
+            **self._before,
         )
 
     def _cull(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> tuple[FilterResult, Any]:
@@ -242,8 +231,8 @@ class SlamPipeline:
         assert self._flow is not None  # checked in the constructor
         with clock("flow"):
             image = self._flow.prepare(frame.gray)
-            if (previous := self._previous) is not None:
-                other = self._flow.prepare(previous.frame.gray) if previous.image is None else previous.image
+            if state.previous is not None:
+                other = self._flow.prepare(state.previous.gray) if self._image is None else self._image
                 state.flow = flow_to_previous(self._flow, image, other, frame, state)
         with clock("ego_motion"):
             state.T_world_pred = refine_prediction(frame, state)
@@ -393,7 +382,5 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     camera, T_prev_cur = state.camera, se3.inverse(state.T_world_prev) @ state.T_world_pred
     points = camera.unproject(frame.xy[has_depth], frame.z[has_depth]) @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
     ahead = points[:, 2] > 0.05
-    pixels = np.full((len(points), 2), np.nan)
-    pixels[ahead] = camera.distort_points(camera.project(points[ahead]))
-    guess[has_depth] = pixels
+    guess[np.flatnonzero(has_depth)[ahead]] = camera.distort_points(camera.project(points[ahead]))
     return guess

@@ -235,10 +235,7 @@ def _optimise(
                 if damping > 1e3:
                     break
         _classify(pose, points, uv, right, info, info_right, fx, fy, cx, cy, bf, inlier, error)
-        count = 0
-        for i in range(n):
-            count += inlier[i]
-        if count < 6:
+        if inlier.sum() < 6:
             break
     return pose, inlier, error, h
 

@@ -28,8 +28,7 @@ from scipy.spatial.transform import Rotation
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.features.matching import match_brute_force
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, pixel_index, se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.motion_model import pose_covariance
@@ -319,11 +318,8 @@ def verify_place(
         observations: The frame's features.
         settings: Radius and descriptor distances.
     """
-    keyframe, matches, points = (
-        candidate.keyframe,
-        candidate.matches,
-        world.points_of(around(world, candidate.keyframe)),
-    )
+    keyframe, matches = candidate.keyframe, candidate.matches
+    points = world.points_of(around(world, keyframe))
     estimate = solve(world.camera, observations, matches, candidate.T_cam_world)
     for _ in range(ROUNDS):
         before = len(matches)
@@ -336,9 +332,7 @@ def verify_place(
     own = world.kf_point[keyframe]
     in_view, uv, *_ = world.project(estimate.T_cam_world, own[own >= 0].astype(np.int64))
     if observations.mask is not None:  # the distortion is less than what masks are dilated by
-        height, width = observations.mask.shape
-        column, row = np.rint(uv).astype(np.int64).T
-        in_view = in_view[~observations.mask[row.clip(0, height - 1), column.clip(0, width - 1)]]
+        in_view = in_view[~observations.mask[pixel_index(uv, observations.mask.shape)[0]]]
     share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
     depth = float(np.median(se3.transform(estimate.T_cam_world, matches.position)[:, 2])) if len(matches) else np.nan
     return InitialPose(estimate.T_cam_world, matches, keyframe, share, depth)

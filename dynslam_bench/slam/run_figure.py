@@ -12,8 +12,7 @@ from PIL import Image, ImageDraw, ImageOps
 
 from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core.records import write_atomic
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory, se3
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]

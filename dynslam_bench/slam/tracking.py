@@ -10,11 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.contracts import FrameBundle, Keypoints
 from dynslam_bench.features.matching import CellGrid, Words, as_words, rotation_consistent, search_in_radius
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import PoseEstimate, optimise_pose
 from dynslam_bench.slam.settings import TrackingSettings

@@ -16,8 +16,7 @@ import gtsam
 import numpy as np
 from command_line import parser_of
 
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
 from dynslam_bench.slam.pose_optimisation import cauchy_width
 

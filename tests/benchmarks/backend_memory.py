@@ -30,8 +30,7 @@ from command_line import parser_of
 
 from dynslam_bench.contracts.sequence import FrameMasks, Sequence
 from dynslam_bench.core.settings import field_names
-from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.settings import PreprocessingSettings
+from dynslam_bench.sequences import PreprocessingSettings, open_sequence
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 
 

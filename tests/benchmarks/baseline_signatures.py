@@ -4,7 +4,7 @@ Reads the results folder of ``dynslam-bench bench dynamic`` and prints, in Markd
 rendered replica beside the class that published figures put it in.
 
     dynslam-bench bench dynamic --results results
-    python tests/benchmarks/baseline_signatures.py results --instances 100:200
+    python tests/benchmarks/baseline_signatures.py results
 
 Each instance of a replica is a row of its own. Its repeats (start offsets, sensor-noise seeds, seeds) are one cell: the
 median counts, the range stands beside it.
@@ -24,7 +24,6 @@ and clear if exactly one of the two holds. Sim(3)-aligned numbers and ablations 
 """
 
 import argparse
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -35,9 +34,7 @@ from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.evaluation.protocol import get_protocol
 from dynslam_bench.reports.model.load import load_runs, open_stores
 from dynslam_bench.reports.model.published import published, static_camera_errors
-from dynslam_bench.runs.record import FAILED
-from dynslam_bench.runs.store import DEFAULT_PROTOCOL
-from dynslam_bench.sequences.synthetic import parse_synthetic_id
+from dynslam_bench.runs import DEFAULT_PROTOCOL, FAILED
 from dynslam_bench.trackers.registry import TRACKERS
 
 FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"
@@ -63,23 +60,6 @@ def classify(
 def recorded(replica: str) -> str:
     """The recorded sequence behind a replica: ``synthetic/walking_xyz?scene=3`` -> ``tum/fr3/walking_xyz``."""
     return "tum/fr3/" + replica.removeprefix("synthetic/").partition("?")[0]
-
-
-def instance_of(sequence: str) -> int | None:
-    """The instance of a rendered replica; None for any other sequence."""
-    return parse_synthetic_id(sequence).scene if sequence.startswith("synthetic/") else None
-
-
-def instance_range(text: str) -> range:
-    """``100`` or ``100:200`` (one past the last).
-
-    Raises:
-        argparse.ArgumentTypeError: It is neither.
-    """
-    first, colon, last = text.partition(":")
-    if not first.isdigit() or (colon and not last.isdigit()):
-        raise argparse.ArgumentTypeError(f"'{text}' is no range of instances; write 100 or 100:200")
-    return range(int(first), int(last) if colon else int(first) + 1)
 
 
 def published_values(names: Iterable[str], sequence: str) -> list[float]:
@@ -111,12 +91,8 @@ def published_class(tracker: str, sequence: str) -> str | None:
     return FAILS if fails else SURVIVES
 
 
-def read_cells(folder: Path, instances: range | None = None) -> pd.DataFrame:
-    """Everything that the table needs: a row by (tracker, sequence), over its repeats.
-
-    Args:
-        folder: Results of the suite.
-        instances: Which instances of the replicas count; None for all.
+def read_cells(folder: Path) -> pd.DataFrame:
+    """Everything that the table needs of a suite's results: a row by (tracker, sequence), over its repeats.
 
     Returns:
         Medians of the ATE in metres (with its `low` and `high`), of the coverage, and of the ATE of a camera that never
@@ -125,8 +101,6 @@ def read_cells(folder: Path, instances: range | None = None) -> pd.DataFrame:
     rows = []
     for run in load_runs(open_stores(folder), get_protocol(DEFAULT_PROTOCOL)).rows:
         if run.kind != "run" or run.degrade or run.drop_share or run.realtime:
-            continue
-        if instances is not None and instance_of(run.sequence.id) not in instances:
             continue
         exact = run.tracker.id == "mask-rcnn" and run.overrides == {"segmentation.source": "oracle"}
         if exact or not run.overrides:
@@ -140,24 +114,15 @@ def read_cells(folder: Path, instances: range | None = None) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def report(folder: Path, instances: range | None = None) -> str:
-    """The whole Markdown text.
-
-    Args:
-        folder: Results of the suite.
-        instances: Which instances of the replicas count; None for all.
+def report(folder: Path) -> str:
+    """The whole Markdown text of a suite's results.
 
     Raises:
-        DynslamError: The folder holds no runs, or not the reference system's, or none on these instances.
+        DynslamError: The folder holds no runs, or not the reference system's.
     """
-    cells = read_cells(folder, instances)
+    cells = read_cells(folder)
     ates = cells["ate"].unstack()
     replicas = [name for name in ates if name.startswith("synthetic/")] if len(cells) else []
-    if not replicas and instances is not None:
-        raise DynslamError(
-            f"{folder} holds no runs on instances {instances.start} to {instances.stop - 1} of the rendered replicas",
-            "run the suite 'dynamic', or ask for other --instances",
-        )
     reference = ates.reindex(index=[EXACT], columns=replicas).loc[EXACT]
     missing = [replica for replica in replicas if np.isnan(reference[replica])]
     if missing or not replicas:
@@ -211,21 +176,10 @@ def short(replica: str) -> str:
     return replica.removeprefix("synthetic/").partition("&")[0].removesuffix("?scene=0")
 
 
-def main() -> int:
-    """Print the tables of one results folder."""
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("results", type=Path, help="folder that 'dynslam-bench bench dynamic' wrote")
-    parser.add_argument(
-        "--instances", type=instance_range, help="instances that count, e.g. 100:200 (held out); default all"
-    )
-    arguments = parser.parse_args()
     try:
-        sys.stdout.write(report(arguments.results, arguments.instances) + "\n")
+        print(report(parser.parse_args().results))
     except DynslamError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        raise SystemExit(str(error)) from error

@@ -20,8 +20,7 @@ from pathlib import Path
 from command_line import parser_of
 
 from dynslam_bench.contracts.sequence import Sequence
-from dynslam_bench.core.errors import SequenceError
-from dynslam_bench.core.folders import find_data_root
+from dynslam_bench.core import SequenceError, find_data_root
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.calibration import Quantity, calibrate
 from dynslam_bench.sequences.synthetic import families, open_synthetic

@@ -1,6 +1,8 @@
-"""The command lines of the benchmarks: options are named, typed and repeated as their defaults are."""
+"""The command lines of the benchmarks, whose options are named, typed and repeated as their defaults are; and times."""
 
 import argparse
+import time
+from collections.abc import Callable
 from typing import Any
 
 
@@ -20,3 +22,15 @@ def parser_of(doc: str | None, **options: Any) -> argparse.ArgumentParser:
         how |= {} if isinstance(default, type) else {"default": default}
         parser.add_argument(f"--{name.replace('_', '-')}", **how)
     return parser
+
+
+def timed(work: Callable[[], object], repeats: int) -> tuple[list[float], list[float]]:
+    """Wall and processor times in milliseconds, after one warm-up."""
+    work()
+    wall, processor = [], []
+    for _ in range(repeats):
+        start, used = time.perf_counter(), time.process_time()
+        work()
+        wall.append(1e3 * (time.perf_counter() - start))
+        processor.append(1e3 * (time.process_time() - used))
+    return wall, processor

@@ -31,12 +31,10 @@ from command_line import parser_of
 
 from dynslam_bench.contracts.sequence import FrameMasks
 from dynslam_bench.core.settings import parse_assignments
-from dynslam_bench.evaluation.evaluate import evaluate
-from dynslam_bench.evaluation.protocol import get_protocol
+from dynslam_bench.evaluation import evaluate, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.trackers import TrackerContext, build_tracker
-from dynslam_bench.trackers.registry import TRACKERS
+from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 
 SEQUENCES = [
     f"synthetic/walking_{motion}?scene={100 + number}&frames=300"

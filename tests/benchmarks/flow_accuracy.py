@@ -1,6 +1,6 @@
 """Error and cost evaluations of every flow and every label search, as Markdown tables.
 
-    PYTHONPATH=. python tests/benchmarks/flow_accuracy.py [--budgets 48 64 96 192 384] [--quick]
+    PYTHONPATH=. python tests/benchmarks/flow_accuracy.py [--budgets 48 64 96 192 384]
 
 Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by the length of the true motion. Dense:
 the KITTI pair. Every row uses the default settings but for what it names.
@@ -122,15 +122,10 @@ def dense_table(budgets: Sequence[int]) -> None:
 
 def main() -> None:
     """Print all tables."""
-    parser = parser_of(None, budgets=[48, 64, 96, 192, 384], seeds=[0], images=6, quick=False)
-    options = parser.parse_args()
-    warps = synthetic(KINDS, 2 if options.quick else options.images)
-    if options.quick:
-        frames = real("fr1_xyz", (1, 8), 16) + real("fr1_rpy", (1, 3), 8)
-        sets = {"Real frames (fr1_xyz, fr1_rpy)": frames}
-    else:
-        frames = real("fr1_xyz", (1, 3, 8, 14), 6) + real("fr1_rpy", (1, 2, 3, 5), 2)
-        sets = {"Real frames (fr1_xyz, fr1_rpy)": frames, "Real frames (Bonn crowd)": real("bonn", (1, 5, 10, 15), 12)}
+    options = parser_of(None, budgets=[48, 64, 96, 192, 384], seeds=[0], images=6).parse_args()
+    warps = synthetic(KINDS, options.images)
+    frames = real("fr1_xyz", (1, 3, 8, 14), 6) + real("fr1_rpy", (1, 2, 3, 5), 2)
+    sets = {"Real frames (fr1_xyz, fr1_rpy)": frames, "Real frames (Bonn crowd)": real("bonn", (1, 5, 10, 15), 12)}
     sparse_table({**sets, "Synthetic warps": warps, "KITTI pair": [kitti_pair()]}, options.budgets, options.seeds)
     kinds_table(warps)
     dense_table([192, 384])

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pose_optimisation import optimise_pose
 

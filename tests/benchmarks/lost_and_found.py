@@ -24,13 +24,11 @@ import numpy as np
 import pandas as pd
 from command_line import parser_of
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.contracts import FrameBundle, Keypoints
 from dynslam_bench.core.settings import apply_overrides, parse_assignments
 from dynslam_bench.features.registry import build_extractor
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.slam.backend import RgbdBackend

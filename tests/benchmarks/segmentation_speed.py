@@ -6,7 +6,6 @@ medians; user CPU time stands beside them, because wall times of a busy machine 
 
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
 
-from command_line import parser_of
+from command_line import parser_of, timed
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
@@ -30,18 +29,6 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
 
 WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
-
-
-def measure(work: Callable[[], object], repeats: int) -> tuple[float, float]:
-    """Median wall and CPU milliseconds after one warm-up."""
-    work()
-    wall, cpu = [], []
-    for _ in range(repeats):
-        start, used = time.perf_counter(), time.process_time()
-        work()
-        wall.append(1000 * (time.perf_counter() - start))
-        cpu.append(1000 * (time.process_time() - used))
-    return statistics.median(wall), statistics.median(cpu)
 
 
 def untrained(config: NetworkConfig, side: int, threads: int, objects: int, device: str) -> MaskRCNNSegmenter:
@@ -93,7 +80,7 @@ def main() -> None:
     rows.append(("depth repair and dilation", lambda: dynamic_mask(found, SegmentationSettings(repair="depth"), depth)))
     print("| stage | wall ms | CPU ms |\n| --- | --- | --- |")
     for label, work in rows:
-        wall, cpu = measure(work, arguments.repeats)
+        wall, cpu = map(statistics.median, timed(work, arguments.repeats))
         print(f"| {label} | {wall:.1f} | {cpu:.1f} |", flush=True)
 
 

@@ -1,6 +1,6 @@
 """What studies say where nothing is better and where something is: simulated studies.
 
-    python tests/benchmarks/study_null.py [--studies 100] [--table null choice planted regret extended]
+    python tests/benchmarks/study_null.py [--studies 100] [--table null choice planted regret]
 
 Whole studies (trials, choice, held-out check) over runs from a noise model: `sd` is the spread of the log ratio of two
 runs in one scene (measured 0.24 to 0.31), and beside it each setting differs from the baseline by 0.15 in log from
@@ -10,8 +10,7 @@ baseline, and a study has at most 40 trial runs. Beside it stands how often the 
 without any trial: by the study's rule, and by the best possible rule with as few false claims (a z-test of known
 variance over all scenes that no trial saw). Studies that are not proven are extended once by six scenes. `regret`: the
 true log ratio of the best trial to the optimum, beside that of fifteen lines of plain Optuna with the same runs and the
-same bound at the end. `extended`: null studies that are extended twice. A run is one of a configuration on one
-instance, counted once as the run store makes it.
+same bound at the end. A run is one of a configuration on one instance, counted once as the run store makes it.
 """
 
 import math
@@ -199,25 +198,7 @@ def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -
     return simulated.valley(min(best, key=bound).params), len(study.trials)
 
 
-def extended(studies: int, folder: Path) -> Iterable[str]:
-    """Null studies that are extended by six scenes, twice, as long as they do not end in `does not matter here`."""
-
-    simulated.STARTS_SD = 0.28
-    yield line("extensions", "chosen", "proven")
-    chosen, proven = Counter[int](), Counter[int]()
-    for seed in range(studies):
-        tuner = simulated.SimulatedTuner(study_on(6, sampler_seed=seed), folder / f"extended-{seed}", seed=seed)
-        for extension in range(3):
-            tuner.run()
-            summary = finish(tuner)
-            chosen[extension] += summary.best is not None and summary.best.chosen
-            proven[extension] += summary.verdict == Verdict.PROVEN
-            tuner.extend(scenes=6, trials=4)
-    for extension in range(3):
-        yield line(extension, chosen[extension] / studies, proven[extension] / studies)
-
-
-TABLES = {"null": null, "choice": choice, "planted": recovered, "regret": regret, "extended": extended}
+TABLES = {"null": null, "choice": choice, "planted": recovered, "regret": regret}
 
 
 def main() -> None:

@@ -15,12 +15,10 @@ import numpy as np
 import pandas as pd
 from command_line import parser_of
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackerContext
+from dynslam_bench.contracts import Frame, TrackerContext
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.evaluation.alignment import align
-from dynslam_bench.geometry.stamps import associate
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory, associate
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.trackers.adapters.orbslam3 import OrbSlam3
@@ -52,86 +50,54 @@ def without(frame: Frame, hidden: np.ndarray) -> Frame:
     return Frame(frame.index, frame.timestamp, mixed, np.where(grown > 0, np.float32(0), frame.depth))
 
 
-def trajectory(poses: list[tuple[float, np.ndarray]]) -> Trajectory:
-    """Of stamps and camera-to-world poses; there may be none."""
-    return Trajectory(np.array([stamp for stamp, _ in poses]), np.reshape([pose for _, pose in poses], (-1, 4, 4)))
-
-
-def error(estimate: Trajectory, truth: Trajectory) -> float | None:
-    """RMSE of the positions at common stamps after the best rigid alignment, m; None for fewer than three poses."""
+def error(estimate: Trajectory, truth: Trajectory) -> float:
+    """RMSE of the positions at common stamps after the best rigid alignment, m; NaN for fewer than three poses."""
     ours, theirs = associate(estimate.timestamps, truth.timestamps, 1e-4)
     if len(ours) < 3:
-        return None
+        return np.nan
     poses, expected = estimate.T_world_cam[ours], truth.T_world_cam[theirs]
     offset = align(poses, expected, "se3").apply(poses)[:, :3, 3] - expected[:, :3, 3]
-    return round(float(np.sqrt((offset**2).sum(axis=1).mean())), 5)
+    return float(np.sqrt((offset**2).sum(axis=1).mean()))
 
 
-class SideBySide:
-    """Several runs of ORB-SLAM3: each frame is read once and given to one run after the other.
-
-    Args:
-        sequence: What its frames are of.
-        runs: The seed of each.
-        fps: Frames a second, where not all of the sequence's are given.
-    """
-
-    def __init__(self, sequence: SyntheticSequence, runs: list[int], fps: float) -> None:
-        settings = OrbSlam3Settings(vocabulary=str(VOCABULARY))
-        self.runs, self._truth = runs, sequence.ground_truth
-        self._trackers = [OrbSlam3(settings, TrackerContext(sequence_id=sequence.id, fps=fps)) for _ in runs]
-        for tracker, run in zip(self._trackers, runs, strict=True):
-            tracker.reset(sequence.camera, rng=np.random.default_rng(run))
-        self._online: list[list[tuple[float, np.ndarray]]] = [[] for _ in runs]
-        self._frames = 0
-
-    def track(self, frame: Frame) -> None:
-        """One frame for each."""
-        self._frames += 1
-        for online, tracker in zip(self._online, self._trackers, strict=True):
-            result = tracker.track(frame)
-            if result.T_world_cam is not None and result.state == "ok":
-                online.append((frame.timestamp, result.T_world_cam))
-
-    def results(self) -> list[dict[str, object]]:
-        """Of each run its number, the RMSE of the final and the online trajectory in metres, and the coverage."""
-        rows: list[dict[str, object]] = []
-        for run, online, tracker in zip(self.runs, self._online, self._trackers, strict=True):
-            try:
-                final = error(tracker.finalize(), self._truth)
-            except TrackerError:  # with no keyframe left it dies while it saves
-                final = None
-            tracker.close()
-            rows.append({
-                "run": run, "final": final, "online": error(trajectory(online), self._truth),
-                "coverage": round(len(online) / self._frames, 4),
-            })  # fmt: skip
-        return rows
-
-
-def measure(id: str, control: str, runs: list[int], cache: Path) -> list[dict[str, object]]:
-    """Several runs of ORB-SLAM3 on one control of one sequence."""
+def frames_of(id: str, control: str, cache: Path) -> tuple[SyntheticSequence, list[Frame]]:
+    """A sequence, and its frames as a control has them."""
     people = "frozen" if control == "frozen" else "moving"
     sequence = open_synthetic(id, cache, settings=RenderSettings(people=people))
     sequence.render()
-    together = SideBySide(sequence, runs, sequence.fps)
-    for index in range(len(sequence)):
-        frame = sequence[index]
-        if control == "masked":
-            masks = sequence.masks[index]
-            names = masks.class_names
-            ids = [k for k in names if names[k] == "person" or k in masks.moving]
-            frame = without(frame, np.isin(masks.instances, ids))
-        together.track(frame)
-    truth = sequence.ground_truth
-    never = float(np.sqrt(((truth.positions - truth.positions.mean(0)) ** 2).sum(1).mean()))
-    about = {"id": id, "control": control}
-    return [about | row | {"never": round(never, 4)} for row in together.results()]
+    frames = [sequence[index] for index in range(len(sequence))]
+    if control == "masked":
+        for index, masks in enumerate(map(sequence.masks.__getitem__, range(len(frames)))):
+            ids = [k for k, name in masks.class_names.items() if name == "person" or k in masks.moving]
+            frames[index] = without(frames[index], np.isin(masks.instances, ids))
+    return sequence, frames
+
+
+def run(sequence: SyntheticSequence, frames: list[Frame], seed: int) -> dict[str, float]:
+    """RMSE of the final trajectory of ORB-SLAM3 in metres, and the coverage."""
+    settings = OrbSlam3Settings(vocabulary=str(VOCABULARY))
+    tracker = OrbSlam3(settings, TrackerContext(sequence_id=sequence.id, fps=sequence.fps))
+    tracker.reset(sequence.camera, rng=np.random.default_rng(seed))
+    tracked = sum(tracker.track(frame).state == "ok" for frame in frames)
+    try:
+        final = error(tracker.finalize(), sequence.ground_truth)
+    except TrackerError:  # with no keyframe left it dies while it saves
+        final = np.nan
+    tracker.close()
+    return {"final": final, "coverage": tracked / len(frames)}
+
+
+def measure(id: str, control: str, runs: int, cache: Path) -> list[dict[str, object]]:
+    """Several runs of ORB-SLAM3 on one control of one sequence."""
+    sequence, frames = frames_of(id, control, cache)
+    truth = sequence.ground_truth.positions
+    never = float(np.sqrt(((truth - truth.mean(0)) ** 2).sum(1).mean()))
+    return [{"id": id, "control": control, "never": never} | run(sequence, frames, seed) for seed in range(runs)]
 
 
 def table(rows: list[dict]) -> str:
     """Markdown: one line an id, the median final ATE of every control, with the coverage where frames are lost."""
-    frame = pd.DataFrame(rows).astype({"final": float, "coverage": float})
+    frame = pd.DataFrame(rows)
     controls = [control for control in CONTROLS if control in set(frame["control"])]
     lines = [f"| sequence | {' | '.join(controls)} | static camera |", f"|{' --- |' * (len(controls) + 2)}"]
     for id, of_id in frame.groupby("id", sort=False):
@@ -158,7 +124,7 @@ def main() -> None:
             row
             for id in arguments.ids
             for control in arguments.controls
-            for row in measure(id, control, list(range(arguments.runs)), Path(cache))
+            for row in measure(id, control, arguments.runs, Path(cache))
         ]
     print(table(rows))
 

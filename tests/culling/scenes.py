@@ -1,16 +1,12 @@
 """Constructed scenes: exact flow and depth of static and moving points seen by a moving camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import FilterState, FrameBundle, KeyframeView
-from dynslam_bench.contracts.flow import FlowResult
-from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.contracts import FilterState, FlowResult, FrameBundle, Instances, KeyframeView, Keypoints
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 CAMERA = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
@@ -69,6 +65,7 @@ def scene(
     motion: np.ndarray | None = None,
     noise_px: float = 0.1,
     seed: int = 0,
+    instances: Instances | None = None,
 ) -> Scene:
     """Static points all over the image, moving ones inside x 200..330, y 100..380 at 1.5 m.
 
@@ -98,7 +95,7 @@ def scene(
         T_world_pred=T_prev_cur,
         flow=FlowResult(before.astype(np.float32), np.ones(len(xy), bool), np.zeros(len(xy), np.float32)),
     )
-    return Scene(frame, state, moving)
+    return Scene(replace(frame, instances=instances), state, moving)
 
 
 def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> Instances:

@@ -14,6 +14,7 @@ from scenes import (
     CAMERA,
     SEGMENTATION,
     SIDEWAYS,
+    Scene,
     at_rest,
     box_instance,
     bundle,
@@ -65,16 +66,15 @@ PERSON = (220, 100, 330, 380)
 
 
 def test_semantic_drops_the_features_on_people_only() -> None:
-    made = scene(SIDEWAYS)
-    for name, dropped in (("person", on_rectangle(made, *BOX)), ("chair", np.zeros(len(made.frame), bool))):
-        made.frame.instances = box_instance(*BOX, name=name)
+    for name in ("person", "chair"):
+        made = scene(SIDEWAYS, instances=box_instance(*BOX, name=name))
+        dropped = on_rectangle(made, *BOX) & (name == "person")
         np.testing.assert_array_equal(SemanticFilter(SEGMENTATION).apply(made.frame, made.state).keep, ~dropped)
 
 
 def test_box_epipolar_has_a_limit_of_its_own_inside_boxes() -> None:
     slow = np.array([0.0, 0.0022, 0.0])  # about 0.8 px at 1.5 m
-    made = scene(SIDEWAYS, motion=slow, noise_px=0.02)
-    made.frame.instances = box_instance(*BOX)
+    made = scene(SIDEWAYS, motion=slow, noise_px=0.02, instances=box_instance(*BOX))
     strict = BoxEpipolarFilter(BoxEpipolarSettings(inside_px=0.3, outside_px=50.0), SEGMENTATION)
     keep = strict.apply(made.frame, made.state).keep
     assert not keep[made.moving].any() and keep[~on_rectangle(made, *BOX)].all()
@@ -97,9 +97,8 @@ def test_f_is_fitted_outside_the_previous_frame_s_boxes_where_sg_slam_does() -> 
 
 def test_class_rule_drops_people_and_only_those_movable_objects_that_move() -> None:
     rule = ClassRuleFilter(ClassRuleSettings(), SEGMENTATION)
-    moving, still = scene(SIDEWAYS, motion=ACROSS), scene(SIDEWAYS)
-    for made in (moving, still):
-        made.frame.instances = box_instance(*BOX, name="chair")
+    chair = box_instance(*BOX, name="chair")
+    moving, still = scene(SIDEWAYS, motion=ACROSS, instances=chair), scene(SIDEWAYS, instances=chair)
     keep = rule.apply(moving.frame, moving.state).keep
     assert not keep[moving.moving].any() and keep[~on_rectangle(moving, *BOX)].all()
     assert rule.apply(still.frame, still.state).keep.all()
@@ -108,8 +107,8 @@ def test_class_rule_drops_people_and_only_those_movable_objects_that_move() -> N
 
 
 def test_class_rule_fits_f_to_static_labelled_points_only() -> None:
-    made = scene(SIDEWAYS, n_static=160, n_moving=300, motion=ACROSS)
-    made.frame.instances = box_instance(*BOX, name="chair")
+    chair = box_instance(*BOX, name="chair")
+    made = scene(SIDEWAYS, n_static=160, n_moving=300, motion=ACROSS, instances=chair)
     keep = ClassRuleFilter(ClassRuleSettings(), SEGMENTATION).apply(made.frame, made.state).keep
     assert not keep[made.moving].any(), "a chair with most of the points does not become the reference"
     only_tv = ClassRuleFilter(ClassRuleSettings(movable="tv"), SEGMENTATION).apply(made.frame, made.state)
@@ -203,12 +202,17 @@ def test_expansion_gives_new_features_a_share_of_near_certain_ones() -> None:
     np.testing.assert_allclose(expanded, expected)
 
 
+def panned(shift: int) -> Scene:
+    """A camera that pans by 3 px before a wall; the texture in the box moves by `shift` pixels."""
+    before, after = moved_patch(shift)
+    made = scene(np.eye(4), instances=box_instance(*BOX))
+    made.frame.gray, made.state.previous.gray = np.roll(after, 3, axis=1), before
+    return made
+
+
 @pytest.mark.parametrize("shift", [0, 12])
 def test_moving_vote_drops_all_people_or_nobody(shift: int) -> None:
-    before, after = moved_patch(shift)
-    made = scene(np.eye(4))
-    made.frame.gray, made.state.previous.gray = np.roll(after, 3, axis=1), before  # the camera pans by 3 px
-    made.frame.instances = box_instance(*BOX)
+    made = panned(shift)
     verdict = MovingVoteFilter(MovingVoteSettings(threshold_px=1.0), SEGMENTATION).apply(made.frame, made.state)
     np.testing.assert_array_equal(verdict.keep, ~(on_rectangle(made, *BOX) & bool(shift)))
 
@@ -366,26 +370,22 @@ def test_guard_undoes_the_least_reliable_verdict_first() -> None:
 
 
 def tracked_corners(value: int) -> float:
-    before, after = moved_patch(12)
-    made = scene(np.eye(4))
-    made.frame.gray, made.state.previous.gray = np.roll(after, 3, axis=1), before
-    made.frame.instances = box_instance(*BOX)
+    made = panned(12)
     rule = MovingVoteFilter(MovingVoteSettings(corners=value), SEGMENTATION)
     return rule.apply(made.frame, made.state).stats["corners"]
 
 
 def chair_of_which_half_moves(value: float) -> list[bool]:
-    made = scene(SIDEWAYS, n_static=900, n_moving=40, motion=ACROSS)
-    made.frame.instances = box_instance(*BOX, name="chair")
+    chair = box_instance(*BOX, name="chair")
+    made = scene(SIDEWAYS, n_static=900, n_moving=40, motion=ACROSS, instances=chair)
     rule = ClassRuleFilter(ClassRuleSettings(vote_share=value, depth_m=2.0), SEGMENTATION)
     return rule.apply(made.frame, made.state).keep.tolist()
 
 
 def near_person(value: float) -> list[bool]:
     """A person who fills half of the image."""
-    made = scene(np.eye(4))
+    made = scene(np.eye(4), instances=box_instance(0, 0, 320, 480))
     made.frame.depth[:, :320], made.frame.depth[:, 320:] = 1.0, 3.0
-    made.frame.instances = box_instance(0, 0, 320, 480)
     rule = BoxDepthFilter(BoxDepthSettings(max_cover=value), SEGMENTATION)
     return rule.apply(made.frame, made.state).keep.tolist()
 

@@ -54,9 +54,8 @@ def compiled_cost(first, second, points, labels, terms=1, support=1):
     tables = matching_cost.cost_tables(first.shape, terms, support)
     here, there = (orientation_maps(image).full_side for image in (first, second))
     descriptors = np.empty(len(points) * support * 13 * 136, np.uint8)
-    matching_cost.describe(0, len(points), points, here, tables, descriptors)
     appearance = np.zeros((len(points), support, 2), np.int32)
-    matching_cost.reference_appearance(points, here, tables, appearance)
+    matching_cost.describe(0, len(points), points, here, tables, descriptors, appearance)
     out = np.empty(len(points), np.int64)
     label_costs(labels, matching_cost.Reference(points, descriptors, appearance), there, tables, out)
     return out, tables, descriptors

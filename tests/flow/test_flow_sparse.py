@@ -12,7 +12,7 @@ from dynslam_bench.core.errors import PluginError
 from dynslam_bench.core.settings import parameters
 from dynslam_bench.flow.label_search import STRATEGIES
 from dynslam_bench.flow.opencv import LucasKanadeFlow
-from dynslam_bench.flow.propagation import better_half, common_motions
+from dynslam_bench.flow.propagation import common_motions
 from dynslam_bench.flow.registry import FLOWS, build_flow
 from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 from dynslam_bench.flow.sparse import SparseDaisyFlow
@@ -188,14 +188,6 @@ def test_common_motions_finds_two_similarities_among_noise():
     np.testing.assert_allclose(found[:, :2], motions[:, :2], atol=0.03)
     common_motions(points[:3], labels[:3], costs[:3], 192, np.float32(5), np.uint64(1), found)
     assert np.isnan(found).all()
-
-
-@pytest.mark.parametrize("count", [4, 5, 9, 60])
-@pytest.mark.parametrize("levels", [1, 3, 1000])
-def test_the_better_half_is_that_of_a_stable_sort(count, levels):
-    costs = np.random.default_rng(count).integers(0, levels, count)
-    expected = np.sort(np.argsort(costs, kind="stable")[: max(count // 2, 4)])
-    assert better_half(costs).tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize("method", METHODS)

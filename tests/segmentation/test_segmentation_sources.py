@@ -636,24 +636,32 @@ def test_single_detections_leaving_objects_and_oracles_are_not_bridged():
 
 
 class Square:
-    """Finds the square of `scene` where it is."""
+    """Finds the square of `scene` where it is, after some time, but in a broken frame."""
 
-    def __init__(self):
-        self.calls = []
+    def __init__(self, takes_s=0.0, broken=None):
+        self.calls, self.takes_s, self.broken = [], takes_s, broken
 
     def segment(self, frame):
+        time.sleep(self.takes_s)
+        if frame.index == self.broken:
+            raise RuntimeError(f"frame {self.broken}")
         self.calls.append(frame.index)
         return instances(scene(3 * frame.index)[1])
+
+
+def feed(stage, index, *, keyframe=False):
+    """The objects in a frame of the moving square, and how well they cover it."""
+    gray, truth = scene(3 * index)
+    found = stage.masks_for(frame_of(gray, index), gray, keyframe=keyframe)
+    return found, iou(found.union(), truth)
 
 
 def run(settings, count=10, keyframes=()):
     segmenter, quality = Square(), []
     stage = MaskScheduler(settings, segmenter)
     for index in range(count):
-        gray, truth = scene(3 * index)
-        found = stage.masks_for(frame_of(gray, index), gray, keyframe=index in keyframes)
+        quality.append(feed(stage, index, keyframe=index in keyframes)[1])
         assert stage.segmented == (segmenter.calls[-1] == index)
-        quality.append(iou(found.union(), truth))
     return segmenter.calls, quality
 
 
@@ -678,36 +686,31 @@ def test_where_masks_cover_much_of_the_view_every_frame_is_segmented(when, rests
     assert run(less.model_copy(update={"confidence": 0.95}), keyframes=(0,))[0] == rests, "masks that do not count"
 
 
-@pytest.mark.parametrize("slow", [False, True])
-def test_beside_tracking_masks_come_late_by_the_stamps_and_are_carried_to_the_frame(slow):
-    class Slow(Square):
-        def segment(self, frame):
-            time.sleep(0.05 * slow)
-            return super().segment(frame)
+ASYNC = SegmentationSettings(schedule="async", latency_s=0.09)
 
-    stage = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.09), Slow())
+
+@pytest.mark.parametrize("takes_s", [0.0, 0.05])
+def test_beside_tracking_masks_come_late_by_the_stamps_and_are_carried_to_the_frame(takes_s):
+    stage = MaskScheduler(ASYNC, Square(takes_s))
     taken, quality = [], []
     for index in range(14):
-        gray, truth = scene(3 * index)
         if index == 8:
             stage = deepcopy(stage)
-        found = stage.masks_for(frame_of(gray, index), gray, keyframe=True)
+        quality.append(feed(stage, index, keyframe=True)[1])
         taken += [index] * stage.segmented
-        quality.append(iou(found.union(), truth))
     stage.reset()
     assert stage.segmenter.calls == [0, 1, 4, 7, 10, 13] and taken == [0, 4, 7, 10, 13]
     assert min(quality) > 0.85
-    stage.masks_for(frame_of(gray), gray, keyframe=True)
+    feed(stage, 0)
     assert stage.segmented, "a sequence begins with masks"
 
 
 def test_beside_tracking_missed_detections_count_the_frames_between_those_segmented(monkeypatch):
-    stage, apart = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.09), Square()), []
+    stage, apart = MaskScheduler(ASYNC, Square()), []
     update = stage._missed.update
     monkeypatch.setattr(stage._missed, "update", lambda found, frames: apart.append(frames) or update(found, frames))
     for index in range(11):
-        gray = scene(3 * index)[0]
-        stage.masks_for(frame_of(gray, index), gray, keyframe=False)
+        feed(stage, index)
     assert stage.segmenter.calls[:4] == [0, 1, 4, 7] and apart == [1, 1, 3, 3]
 
 
@@ -723,29 +726,21 @@ def test_beside_tracking_masks_are_due_at_the_same_frames_from_any_first_stamp(e
 
 
 def test_beside_tracking_the_segmenter_keeps_the_settings_that_it_began_with():
-    class Slow(Square):
-        def segment(self, frame):
-            time.sleep(0.05)
-            return super().segment(frame)
-
-    settings = SegmentationSettings(schedule="async", latency_s=0.09)
-    strict = settings.model_copy(update={"confidence": 0.95})  # its objects have less
-    stage, found = MaskScheduler(settings, ConfiguredSegmenter(Slow(), settings, "test")), []
+    strict = ASYNC.model_copy(update={"confidence": 0.95})  # its objects have less
+    stage, found = MaskScheduler(ASYNC, ConfiguredSegmenter(Square(0.05), ASYNC, "test")), []
     for index in range(8):
-        gray = scene(3 * index)[0]
-        found.append(len(stage.masks_for(frame_of(gray, index), gray, keyframe=False)))
-        stage.configure(strict if index in (1, 2, 3) else settings)
+        found.append(len(feed(stage, index)[0]))
+        stage.configure(strict if index in (1, 2, 3) else ASYNC)
     assert found == [1] * 8
 
 
 def test_beside_tracking_nothing_comes_from_the_stage_cache(tmp_path):
-    network, settings = Square(), SegmentationSettings(schedule="async", latency_s=0.09)
+    network = Square()
     cached = CachedSegmenter(lambda: network, "test", StageCache(tmp_path))
     for _ in range(2):
-        stage = MaskScheduler(settings, ConfiguredSegmenter(cached, settings, "test"))
+        stage = MaskScheduler(ASYNC, ConfiguredSegmenter(cached, ASYNC, "test"))
         for index in range(5):
-            gray = scene(3 * index)[0]
-            stage.masks_for(frame_of(gray, index), gray, keyframe=False)
+            feed(stage, index)
         stage.reset()
     assert network.calls == [0, 1, 4, 1, 4], "the first frame is segmented before it is tracked, and stored"
 
@@ -772,29 +767,19 @@ for index in range(2):
 
 
 def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken():
-    class Broken(Square):
-        def segment(self, frame):
-            if frame.index == 4:
-                raise RuntimeError("frame 4")
-            return super().segment(frame)
-
-    stage = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.09), Broken())
-    gray = scene(0)[0]
+    stage = MaskScheduler(ASYNC, Square(broken=4))
     for index in range(7):
-        stage.masks_for(frame_of(gray, index), gray, keyframe=False)
+        feed(stage, index)
     with pytest.raises(RuntimeError, match="frame 4"):
-        stage.masks_for(frame_of(gray, 7), gray, keyframe=False)
+        feed(stage, 7)
 
 
 def test_the_schedule_may_change_while_the_segmenter_runs_beside_tracking():
     """It finishes first, what it was asked before is forgotten, and masks stay those of the frame."""
-    beside, every = (SegmentationSettings(schedule=when, latency_s=0.09) for when in ("async", "every"))
-    stage = MaskScheduler(beside, Square())
-    taken = []
+    stage, taken = MaskScheduler(ASYNC, Square()), []
     for index in range(12):
-        stage.configure(every if index in (3, 4) else beside)
-        gray, truth = scene(3 * index)
-        assert iou(stage.masks_for(frame_of(gray, index), gray, keyframe=False).union(), truth) > 0.85
+        stage.configure(SegmentationSettings() if index in (3, 4) else ASYNC)
+        assert feed(stage, index)[1] > 0.85
         taken += [index] * stage.segmented
     stage.reset()
     assert taken == [0, 3, 4, 8, 11] and stage.segmenter.calls == [0, 1, 3, 4, 5, 8, 11]
@@ -804,14 +789,12 @@ def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
     segmenter = Square()
     settings = SegmentationSettings(schedule="every_nth", n=10)
     stage = MaskScheduler(settings, segmenter)
-    gray = scene(0)[0]
-
     changes = {2: settings.model_copy(update={"n": 1}), 3: settings}
     for index in range(5):
         stage.configure(changes.get(index, settings))
         if index == 4:
             stage.reset()
-        stage.masks_for(frame_of(gray, index), gray, keyframe=False)
+        feed(stage, index)
     assert segmenter.calls == [0, 2, 4]
 
 

@@ -5,11 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import FrameBundle
+from dynslam_bench.contracts import FrameBundle, Keypoints
 from dynslam_bench.core.settings import apply_overrides
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 from dynslam_bench.slam.tracking import observe

@@ -3,8 +3,7 @@
 import numpy as np
 from point_world import PointWorld, make_backend, track_all, without_depth
 
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 
 WIDTH = 2.0
 CORNER = 1.0

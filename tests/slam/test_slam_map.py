@@ -7,8 +7,7 @@ import pytest
 from point_world import make_backend, observed, track_all, without_depth
 from scipy.optimize import least_squares
 
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam import tracking
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
 from dynslam_bench.slam.local_mapping import triangulate

@@ -9,8 +9,7 @@ from point_world import PointWorld, make_backend, observed, states, track_all
 from ring_world import RingWorld, drive, position_errors, rotated
 from scipy.spatial.transform import Rotation
 
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Map
 from dynslam_bench.slam.relocalisation import (

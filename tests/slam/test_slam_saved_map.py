@@ -11,8 +11,7 @@ from point_world import PointWorld, make_backend, states, track_all
 
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.trajectory import Trajectory
+from dynslam_bench.geometry import Trajectory, se3
 from dynslam_bench.slam.atlas import packed
 from dynslam_bench.slam.backend import RgbdBackend
 from dynslam_bench.slam.map_files import HEADER, MAP_SCHEMA, read_map, write_keyframes_csv, write_ply
