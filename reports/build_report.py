@@ -320,7 +320,7 @@ def _first_page(
         sentence=headline(board),
         sentences={name: headline(some) for name, some in boards.items()},
         facts=facts,
-        categories={name: entries_of(some, board, boards, protocol, paged) for name, some in boards.items()},
+        categories={name: entries_of(some, board, boards, paged) for name, some in boards.items()},
         meanings=MEANINGS,
         reference=board.reference_name,
         explanation=how_to_read(board),
@@ -426,14 +426,11 @@ def categories_section(boards: Mapping[str, Board], protocol: Protocol) -> Secti
 
 def errors_section(board: Board, protocol: Protocol) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
-    section = Section("errors", "Tables")
     if not board.sequences:
-        return section
+        return Section("errors", "Tables")
     excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
     shortened = {board.sequence(r) for r in board.rows if part_words(r) and not r.sequence.id.startswith("synthetic/")}
     parts = sorted(excerpts | shortened)
-    if parts:
-        section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     whole = [name for name in board.sequences if name not in parts]
     lines = published_for(whole, protocol)
     published = reported_for(whole, protocol) + records_for(whole, protocol)
@@ -441,14 +438,14 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
     unsure = sorted(
         {r.sequence.id for r in board.rows if board.sequence(r) in beside and not least_length_s(r.sequence.id)}
     )
-    if unsure:
-        section.notes.append(
-            f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
-            "are of the whole recordings is not checked."
-        )
-    section.blocks += table_blocks(tables.per_sequence(board, protocol, published), folded=True)
+    notes = {
+        f"Parts of recordings, beside which no published number stands: {', '.join(parts)}.": parts,
+        f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
+        "are of the whole recordings is not checked.": unsure,
+    }
     lost = any(row.incomplete and not row.failed for row in board.rows)
-    section.blocks += table_blocks(
+    blocks = table_blocks(
+        tables.per_sequence(board, protocol, published),
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
         tables.tracked_errors(board, protocol) if lost else None,
         tables.failure_rule_table(board),
@@ -459,7 +456,7 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
         span_table(spans(lines)),
         folded=True,
     )
-    return section
+    return Section("errors", "Tables", [note for note, holds in notes.items() if holds], blocks)
 
 
 def masks_section(board: Board) -> Section:

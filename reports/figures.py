@@ -152,11 +152,15 @@ def mask_figure(board: Board) -> go.Figure | None:
     """Quality of the masks against the pose error, one point a run; None where no run has it."""
     look, traces = looks(board), []
     for key in board.trackers:
-        points = []
-        for row in board.runs(key):
-            if row.mask_iou is not None and row.score_m is not None and not row.failed:
-                words = f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}"
-                points.append((1000 * max(row.score_m, FLOOR_M), row.mask_iou, words))
+        points = [
+            (
+                1000 * max(row.score_m, FLOOR_M),
+                row.mask_iou,
+                f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}",
+            )
+            for row in board.runs(key)
+            if row.mask_iou is not None and row.score_m is not None and not row.failed
+        ]
         if len(points) > MOST_POINTS:
             points = sorted(points)[:: -(-len(points) // MOST_POINTS)]
         if points:
@@ -219,21 +223,21 @@ def bar_figure(board: Board, statistic: str) -> go.Figure | None:
     """
     look = looks(board)
     errors = medians(board, lambda row: row.metrics.get(f"ate_{statistic}_m"))
-    traces = []
-    for key in [key for key in board.trackers if any(key == measured for measured, _ in errors)]:
-        names = [name for name in board.sequences if (key, name) in errors]
-        traces.append(
-            go.Bar(
-                x=[safe(board.short[name]) for name in names],
-                y=rounded([1000 * errors[key, name] for name in names]),
-                text=[LOST_MARK * has_lost(board.cells[key][name]) for name in names],
-                textposition="outside",
-                cliponaxis=False,
-                name=wrapped(board.names[key]),
-                marker={"color": look[key]["color"], "opacity": 1.0 if key in board.ranked else 0.45},
-                hovertemplate="%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
-            )
+    measured = {key: [name for name in board.sequences if (key, name) in errors] for key in board.trackers}
+    traces = [
+        go.Bar(
+            x=[safe(board.short[name]) for name in names],
+            y=rounded([1000 * errors[key, name] for name in names]),
+            text=[LOST_MARK * has_lost(board.cells[key][name]) for name in names],
+            textposition="outside",
+            cliponaxis=False,
+            name=wrapped(board.names[key]),
+            marker={"color": look[key]["color"], "opacity": 1.0 if key in board.ranked else 0.45},
+            hovertemplate="%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
         )
+        for key, names in measured.items()
+        if names
+    ]
     return figure_of(
         traces,
         max(380, 100 + 19 * len(traces)),

@@ -14,7 +14,7 @@ from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.model.board import OVERALL, Board, Cell, compare_pairs
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Standing, Verdict
-from dynslam_bench.reports.tables.leaderboard import leaderboard, middle, rank_cell, run_link, timed
+from dynslam_bench.reports.tables.leaderboard import leaderboard_cells, middle, rank_cell, run_link, timed
 from dynslam_bench.reports.tables.table import TableCell, number
 
 _OPPOSITE: dict[Verdict, Verdict] = {"better": "worse", "worse": "better", "cannot tell": "cannot tell"}
@@ -33,7 +33,7 @@ MEANINGS = {
 
 
 def entries_of(
-    board: Board, whole: Board, boards: Mapping[str, Board], protocol: Protocol, paged: Collection[str] = ()
+    board: Board, whole: Board, boards: Mapping[str, Board], paged: Collection[str] = ()
 ) -> list[dict[str, Any]]:
     """The rows of one category, cells by the names that `board.html.j2` calls them by.
 
@@ -45,16 +45,13 @@ def entries_of(
         board: Of the category.
         whole: Of all sequences: the numbers of trackers.
         boards: Of all categories, for the column that shows them side by side.
-        protocol: How errors were computed.
         paged: Ids of the runs that have a page.
     """
     keys = [*whole.trackers, *whole.final_only]
     limits = _limits([s.ratio for s in board.standings])
-    table = leaderboard(board, protocol)
-    names = [column.name for column in table.columns]
     entries = []
-    for key, row in zip(board.trackers, table.rows, strict=True):
-        standing, cells, runs = board.placed.get(key), dict(zip(names, row, strict=True)), board.cells[key]
+    for key in board.trackers:
+        standing, cells, runs = board.placed.get(key), leaderboard_cells(board, key), board.cells[key]
         first = board.first(key)
         typical = [runs[name].typical for name in board.sequences if name in runs] or [first]
         start = next((run for run in typical if run.run_id in paged), typical[0])

@@ -447,11 +447,11 @@ def _time_figure(
         ("people (%)", [(f"share of people: {frames.share_source}", "t", "share", COLOURS[4], {"fill": "tozeroy"})]),
     ]  # fmt: skip
     columns = series | track
-    known = {
+    measured = {
         title: [line for line in lines if line[2] in columns and np.isfinite(columns[line[2]]).any()]
         for title, lines in panels
     }
-    shown = {title: lines for title, lines in known.items() if lines}
+    shown = {title: lines for title, lines in measured.items() if lines}
     if not shown:
         return {}
     traces = [

@@ -568,8 +568,8 @@ def make_cell(rows: Sequence[RunRow]) -> Cell:
 
 def mean_of(values: Iterable[float | None]) -> float | None:
     """Mean of what is known; None if nothing is."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+    present = [value for value in values if value is not None]
+    return float(np.mean(present)) if present else None
 
 
 # -- the cells that are missing, and the commands that fill them

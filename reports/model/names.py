@@ -35,12 +35,12 @@ def shortened(names: Sequence[str]) -> dict[str, str]:
     """
     if len(names) < 2:
         return {name: name for name in names}
-    folders = [_split(name)[0].split("/")[:-1] for name in names]
-    shared = len(list(takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False))))
-    common = set[str].intersection(*(set(_split(name)[1]) for name in names))
+    parts = {name: _split(name) for name in names}
+    folders = [stem.split("/")[:-1] for stem, _, _ in parts.values()]
+    shared = len(list(takewhile(lambda level: len(set(level)) == 1, zip(*folders, strict=False))))
+    common = set[str].intersection(*(set(options) for _, options, _ in parts.values()))
     short = {}
-    for name in names:
-        stem, options, part = _split(name)
+    for name, (stem, options, part) in parts.items():
         kept = "&".join(option for option in options if option not in common)
         short[name] = "/".join(stem.split("/")[shared:]) + (f"?{kept}" if kept else "") + part
     return short if len(set(short.values())) == len(names) else {name: name for name in names}

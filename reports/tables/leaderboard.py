@@ -67,8 +67,8 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         for column in COLUMNS
         if epipolar or column.name != "F skipped"
     ]
-    lines = [_leaderboard_cells(board, key, board.placed.get(key)) for key in board.trackers]
-    rows = [[cells.get(column.name, TableCell()) for column in columns] for cells in lines]
+    lines = [leaderboard_cells(board, key) for key in board.trackers]
+    rows = [[cells[column.name] for column in columns] for cells in lines]
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
     brief += ", with 95 % intervals" * any(math.isfinite(standing.ratio.low) for standing in board.standings)
     return Table(
@@ -110,7 +110,7 @@ COLUMNS = (
     Column("rows", numeric=False, latex=False),
     Column("provenance", numeric=False, latex=False),
 )
-"""The leaderboard's columns; `_leaderboard_cells` fills them."""
+"""The leaderboard's columns; `leaderboard_cells` fills them."""
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
@@ -164,15 +164,15 @@ def _hinted(rows: Iterable[RunRow]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.most_common())
 
 
-def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dict[str, TableCell]:
-    """The cells of a tracker by the names of their columns; what is not known is left out."""
-    runs = board.runs(key)
+def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
+    """The cells of a tracker by the names of their columns; what is not known is empty."""
+    runs, standing = board.runs(key), board.placed.get(key)
     ended = [row for row in runs if not row.failed]
     coverage = mean_of(row.coverage for row in runs)
     hinted = _hinted(runs)
     masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
     tracker, skipped = runs[0].tracker, mean_of(row.epipolar_skipped for row in runs)
-    cells = {
+    cells = dict.fromkeys((column.name for column in COLUMNS), TableCell()) | {
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
         "tracker": TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id),
