@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -151,7 +151,7 @@ def build_report(
     with worker_pool(sum(len(store.ids()) for store in stores)) as pool:
         loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)
         board = make_board(loaded.rows, reference, on, rank_seen=rank_seen)
-        typical = {row.run_id for name in board.sequences for row in board.typical_runs(name).values()}
+        typical = board.typical
         paged = _paged(board, typical, most_pages)
         pictured = {row.run_id for row in paged if row.failed or row.run_id in typical}
         pages = write_run_pages(
@@ -161,7 +161,7 @@ def build_report(
     on_progress(0, None, "putting the tables and figures together")
     pageless = _pageless(len(paged), len(board.rows))
     again = command or _command([store.source for store in stores], output, board, most_pages, trials=trials)
-    none_failed = [Block("list", entries=[f"None of {len(board.rows)} runs failed."])]
+    none_failed = [Block(entries=[f"None of {len(board.rows)} runs failed."])]
     boards = category_boards(board)
     sections = {
         "errors.html": [errors_section(board, protocol), categories_section(boards, protocol)],
@@ -261,7 +261,8 @@ def _write(
     write_atomic(paths.csv["runs"], csv_text(board.frame()))
     facts = facts_of(board, protocol)
     counted = ", ".join(f"{value} {name}" for value, name, _ in facts)
-    notes_text = "".join(f"> {prose(note)}\n\n" for note in [how_to_read(board), *_all_notes(notes, pages)])
+    all_notes = [*notes, *(note for sections in pages.values() for section in sections for note in section.notes)]
+    notes_text = "".join(f"> {prose(note)}\n\n" for note in [how_to_read(board), *all_notes])
     texts = "\n".join(map(to_markdown, shown.values()))
     head = f"# {prose(title)}\n\n{prose(headline(board))}\n\n{protocol.describe()}\n\n{counted}\n\n"
     write_atomic(paths.markdown, f"{head}{notes_text}{texts}\n{footer}\n")
@@ -292,10 +293,6 @@ def _write(
     return paths
 
 
-def _all_notes(notes: Sequence[str], pages: dict[str, list[Section]]) -> list[str]:
-    return [*notes, *(note for sections in pages.values() for section in sections for note in section.notes)]
-
-
 def _first_page(
     board: Board,
     boards: dict[str, Board],
@@ -323,7 +320,7 @@ def _first_page(
         sentence=headline(board),
         sentences={name: headline(some) for name, some in boards.items()},
         facts=facts,
-        categories={name: entries_of(some, board, boards, protocol, paged) for name, some in boards.items()},
+        categories={name: entries_of(some, board, boards, paged) for name, some in boards.items()},
         meanings=MEANINGS,
         reference=board.reference_name,
         explanation=how_to_read(board),
@@ -429,14 +426,11 @@ def categories_section(boards: Mapping[str, Board], protocol: Protocol) -> Secti
 
 def errors_section(board: Board, protocol: Protocol) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
-    section = Section("errors", "Tables")
     if not board.sequences:
-        return section
+        return Section("errors", "Tables")
     excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
     shortened = {board.sequence(r) for r in board.rows if part_words(r) and not r.sequence.id.startswith("synthetic/")}
     parts = sorted(excerpts | shortened)
-    if parts:
-        section.notes.append("Parts of recordings, beside which no published number stands: " + ", ".join(parts) + ".")
     whole = [name for name in board.sequences if name not in parts]
     lines = published_for(whole, protocol)
     published = reported_for(whole, protocol) + records_for(whole, protocol)
@@ -444,14 +438,14 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
     unsure = sorted(
         {r.sequence.id for r in board.rows if board.sequence(r) in beside and not least_length_s(r.sequence.id)}
     )
-    if unsure:
-        section.notes.append(
-            f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
-            "are of the whole recordings is not checked."
-        )
-    section.blocks += table_blocks(tables.per_sequence(board, protocol, published), folded=True)
+    notes = {
+        f"Parts of recordings, beside which no published number stands: {', '.join(parts)}.": parts,
+        f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
+        "are of the whole recordings is not checked.": unsure,
+    }
     lost = any(row.incomplete and not row.failed for row in board.rows)
-    section.blocks += table_blocks(
+    blocks = table_blocks(
+        tables.per_sequence(board, protocol, published),
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
         tables.tracked_errors(board, protocol) if lost else None,
         tables.failure_rule_table(board),
@@ -462,7 +456,7 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
         span_table(spans(lines)),
         folded=True,
     )
-    return section
+    return Section("errors", "Tables", [note for note, holds in notes.items() if holds], blocks)
 
 
 def masks_section(board: Board) -> Section:
@@ -490,27 +484,30 @@ def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
 
 def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
-    section = Section("provenance", "Machines, versions, commands")
-    section.blocks.append(Block("table", table=tables.machines(board)))
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
-    section.blocks.append(
-        Block(kind="code", title="The commands that reproduce it", text="\n".join([*commands, again]))
-    )
-    if missing := missing_commands(board):
-        section.blocks.append(Block(kind="code", title="The commands that fill the gaps", text="\n".join(missing)))
-    places = defaultdict[str, list[str]](list)
-    for row in board.rows:
-        for text in row.notes:
-            places[text].append(f"{board.labels[row.variant_key]} on {board.sequence(row)}, {row.repeat}")
-    notes = [f"{text}: {'; '.join(first_of(runs, 2, 'and {} more'))}" for text, runs in places.items()]
-    for title, entries, others in (
+    codes = {
+        "The commands that reproduce it": [*commands, again],
+        "The commands that fill the gaps": missing_commands(board),
+    }
+    places = grouped(((text, row) for row in board.rows for text in row.notes), itemgetter(0))
+    names = {
+        text: [f"{board.labels[row.variant_key]} on {board.sequence(row)}, {row.repeat}" for _, row in runs]
+        for text, runs in places.items()
+    }
+    notes = [f"{text}: {'; '.join(first_of(runs, 2, 'and {} more'))}" for text, runs in names.items()]
+    lists = (
         ("Left out: no valid record", loaded.unreadable, "... and {} more, which `runs list` names"),
         ("Diagnostics", notes, "... and {} more on the pages of the runs"),
-    ):
-        if entries:
-            section.blocks.append(Block("list", title, entries=first_of(entries, _MOST_NOTES, others), folded=True))
-    return section
+    )
+    blocks = table_blocks(tables.machines(board))
+    blocks += [Block(title, text="\n".join(lines)) for title, lines in codes.items() if lines]
+    blocks += [
+        Block(title, entries=first_of(entries, _MOST_NOTES, others), folded=True)
+        for title, entries, others in lists
+        if entries
+    ]
+    return Section("provenance", "Machines, versions, commands", blocks=blocks)
 
 
 def first_of(entries: list[str], most: int, others: str) -> list[str]:
@@ -606,8 +603,7 @@ def publish(
         path.unlink()
     report.markdown.replace(output / "leaderboard" / README)
     pages = [("leaderboard/index.html", "Leaderboard", report.headline)]
-    for study in studies:
-        pages.append(_publish_study(study, output))
+    pages += [_publish_study(study, output) for study in studies]
     made = f"Made by dynslam-bench report publish, version {dynslam_bench.__version__}."
     site = sections_page([], title=title, pages=pages, protocol=note, footer=made)
     write_atomic(output / "index.html", site.replace(f'="{ASSETS}/', f'="leaderboard/{ASSETS}/'))

@@ -12,9 +12,10 @@ import numpy as np
 
 from dynslam_bench.core import ReportError, setting_text, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
-from dynslam_bench.reports.html.board_page import ratio_numbers, write_runs
-from dynslam_bench.reports.html.page import render, write_side
-from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell, mean_coverage
+from dynslam_bench.reports.html.board_page import cell_content, ratio_numbers, settings_content
+from dynslam_bench.reports.html.page import render, write_assets, write_side
+from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
+from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell, mean_of
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
@@ -128,21 +129,43 @@ def _write_page(
     """Write the page: both sides of every tracker, with the pages of the runs that stand for a cell."""
     output = output.expanduser().absolute()
     cells: dict[str, dict[str, Cell]] = {}
-    ratios = []
     for name, pairs in compared.items():
-        ratios.append([len(cells), len(cells) + 1, *ratio_numbers(overall[name]), len(pairs), ""])
         cells[f"A: {name}"] = {sequence: a for sequence, a, _ in pairs}
         cells[f"B: {name}"] = {sequence: b for sequence, _, b in pairs}
     typical = {cell.typical.run_id: cell.typical for some in cells.values() for cell in some.values()}
-    shown = [row for row in typical.values() if row.folder.is_dir()]  # a report alone brings no files
-    sides = [ratio[:2] for ratio in ratios]
-    write_runs(output, cells, shown, protocol, "Comparison", words=evaluated, pairs=sides)
+    paged = {run_id: row for run_id, row in typical.items() if row.folder.is_dir()}  # a report alone brings no files
+    write_run_pages(list(paged.values()), paged, protocol, output)
+    names = sorted({name for some in cells.values() for name in some})
+    contents, runs = [], []
+    for at, some in enumerate(cells.values()):
+        for name, cell in some.items():
+            metric, run = {"key": "ate_rmse_m", "which": cell.rows[0].trajectory}, cell.typical
+            contents.append(cell_content(cell, at, names.index(name), [metric], rank_seen=True))
+            runs.append([run.run_id, at, names.index(name), run.repeat, run.ending, 3 * (run.run_id in paged)])
+    board = {
+        "protocol": evaluated,
+        "pageless": "",
+        "unlisted": 0,
+        "trackers": [
+            {"label": label, "settings": settings_content(next(iter(some.values())).rows[0])}
+            for label, some in cells.items()
+        ],
+        "sequences": [{"name": name, "short": name, "tags": []} for name in names],
+        "cells": contents,
+        "runs": runs,
+        "pairs": [[2 * at, 2 * at + 1] for at in range(len(compared))],
+    }
+    write_side(output, "board", board)
+    ratios = [
+        [2 * at, 2 * at + 1, *ratio_numbers(overall[name]), len(pairs), ""]
+        for at, (name, pairs) in enumerate(compared.items())
+    ]
     write_side(output, "ratios", ratios)
-    links = [("index.html", "Comparison")]
-    page = render(
-        "compare.html.j2", title="B against A", links=links, here="index.html", scripts=["run.js", "compare.js"]
-    )
-    write_atomic(output / "index.html", page)
+    write_assets(output)
+    shown = {"links": [("index.html", "Comparison")], "scripts": ["run.js"]}
+    write_atomic(output / RUN_PAGE, render("run.html.j2", title="Run", **shown))
+    compare_page = {"title": "B against A", "here": "index.html", "scripts": ["run.js", "compare.js"]}
+    write_atomic(output / "index.html", render("compare.html.j2", **(shown | compare_page)))
     return output / "index.html"
 
 
@@ -167,12 +190,12 @@ def _by_column(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
 
 def pair_variants(a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]]) -> list[tuple[str, str]]:
     """Variants of A and B that share a column: equal ones, then those that differ least, each at most once."""
-    candidates = []
-    for one, other in product(a, b):
-        first, second = a[one][0], b[other][0]
-        paired_otherwise = one != other and (one in b or other in a)
-        if (first.tracker.id, first.kind) == (second.tracker.id, second.kind) and not paired_otherwise:
-            candidates.append((one != other, len(_differences(first, second)), one, other))
+    candidates = [
+        (one != other, len(_differences(a[one][0], b[other][0])), one, other)
+        for one, other in product(a, b)
+        if (a[one][0].tracker.id, a[one][0].kind) == (b[other][0].tracker.id, b[other][0].kind)
+        and (one == other or (one not in b and other not in a))
+    ]
     pairs: list[tuple[str, str]] = []
     for *_, one, other in sorted(candidates, key=itemgetter(0, 1)):
         unused = all(one != pair[0] and other != pair[1] for pair in pairs)
@@ -183,12 +206,11 @@ def pair_variants(a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]]) 
 
 def _differences(first: RunRow, second: RunRow) -> list[str]:
     """The settings that set a variant of A apart from one of B, in words."""
-    words = []
-    for name in sorted({*first.variant, *second.variant}):
-        if first.variant.get(name) != second.variant.get(name):
-            value_a, value_b = (setting_text(row.variant.get(name, "default")) for row in (first, second))
-            words.append(f"{name}: {value_a} in A, {value_b} in B")
-    return words
+    names = sorted(
+        name for name in {*first.variant, *second.variant} if first.variant.get(name) != second.variant.get(name)
+    )
+    a, b = ([setting_text(row.variant.get(name, "default")) for name in names] for row in (first, second))
+    return [f"{name}: {value} in A, {other} in B" for name, value, other in zip(names, a, b, strict=True)]
 
 
 def ratio_of(_: str, a: Cell, b: Cell) -> float:
@@ -211,7 +233,7 @@ def _table(
     for name, paired in compared.items():
         separators.add(len(rows))
         for sequence, *sides in paired:
-            coverages = [mean_coverage(cell.rows) for cell in sides]
+            coverages = [mean_of(row.coverage for row in cell.rows) for cell in sides]
             rows.append(
                 [
                     TableCell(name),

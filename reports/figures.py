@@ -48,19 +48,16 @@ THEMES = {"light": _theme("#1b2430", "#e3e7ec", "#ffffff"), "dark": _theme("#e7e
 """Plotly templates by the colour scheme of the page."""
 
 
-def look_of(position: int) -> dict[str, str]:
-    """Colour, symbol and dash of the tracker at a position; the last two tell apart those of one colour."""
-    turn = position // len(COLOURS)
-    return {
-        "color": COLOURS[position % len(COLOURS)],
-        "symbol": SYMBOLS[(position + turn) % len(SYMBOLS)],
-        "dash": DASHES[turn % len(DASHES)],
-    }
-
-
 def looks(board: Board) -> dict[str, dict[str, str]]:
-    """One look for every tracker, the same in all figures."""
-    return {key: look_of(at) for at, key in enumerate([*board.trackers, *board.final_only])}
+    """Colour, symbol and dash of every tracker, the same in all figures; several may have one colour."""
+    return {
+        key: {
+            "color": COLOURS[at % len(COLOURS)],
+            "symbol": SYMBOLS[(at + at // len(COLOURS)) % len(SYMBOLS)],
+            "dash": DASHES[at // len(COLOURS) % len(DASHES)],
+        }
+        for at, key in enumerate([*board.trackers, *board.final_only])
+    }
 
 
 def packed(values: ArrayLike, kind: str = "f4") -> dict[str, str]:
@@ -88,9 +85,9 @@ def wrapped(text: str) -> str:
     return "<br>".join(map(safe, textwrap.wrap(text, 34, break_long_words=False, break_on_hyphens=False)))
 
 
-def figure_of(traces: Sequence[Any], height: int, **layout: Any) -> go.Figure:
-    """A figure in the theme of its page."""
-    return go.Figure(list(traces), go.Layout(height=height, template={}, **layout))
+def figure_of(traces: Sequence[Any], height: int, **layout: Any) -> go.Figure | None:
+    """A figure in the theme of its page; None without traces."""
+    return go.Figure(list(traces), go.Layout(height=height, template={}, **layout)) if traces else None
 
 
 def log_axis(title: str) -> dict[str, Any]:
@@ -104,28 +101,20 @@ def error_bars(interval: Any) -> dict[str, Any]:
     return {"type": "data", "symmetric": False, "array": rounded([above]), "arrayminus": rounded([below])}
 
 
-def guide(figure: go.Figure, x: float | None = None, y: float | None = None) -> None:
-    """Draw a dashed line across a figure at one value."""
-    line = {"color": NEUTRAL, "width": 1, "dash": "dash"}
-    if x is not None:
-        figure.add_vline(x, line=line, layer="below")
-    if y is not None:
-        figure.add_hline(y, line=line, layer="below")
+GUIDE: dict[str, Any] = {"line": {"color": NEUTRAL, "width": 1, "dash": "dash"}, "layer": "below"}
+"""A dashed line across a figure at one value."""
 
 
 def speed_figure(board: Board) -> go.Figure | None:
     """Accuracy against speed, the Pareto front drawn through the ranked trackers; None without timed runs."""
-    look = looks(board)
-    standings = {s.key: s for s in board.standings}
+    look, placed = looks(board), board.placed
     points = []
     for key in board.trackers:
         rows = timed([row for row in board.runs(key) if row.real_time_factor and not row.failed])
         factors = [row.real_time_factor for row in rows if row.real_time_factor]
-        if key in standings and factors and np.isfinite(standings[key].ratio.value):
+        if key in placed and factors and np.isfinite(placed[key].ratio.value):
             mark = f" {CACHED_MARK}" if any(row.cached for row in rows) else ""
-            points.append((key, float(np.median(factors)), standings[key].ratio, mark))
-    if not points:
-        return None
+            points.append((key, float(np.median(factors)), placed[key].ratio, mark))
     traces = []
     ranked = {(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked}
     front = sorted(p for p in ranked if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in ranked))
@@ -153,7 +142,9 @@ def speed_figure(board: Board) -> go.Figure | None:
         xaxis=log_axis("× real time (right is better)"),
         yaxis=log_axis("ATE ratio (down is better)"),
     )
-    guide(figure, x=1.0, y=1.0)
+    if figure is not None:
+        figure.add_vline(1.0, **GUIDE)
+        figure.add_hline(1.0, **GUIDE)
     return figure
 
 
@@ -161,11 +152,15 @@ def mask_figure(board: Board) -> go.Figure | None:
     """Quality of the masks against the pose error, one point a run; None where no run has it."""
     look, traces = looks(board), []
     for key in board.trackers:
-        points = []
-        for row in board.runs(key):
-            if row.mask_iou is not None and row.score_m is not None and not row.failed:
-                words = f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}"
-                points.append((1000 * max(row.score_m, FLOOR_M), row.mask_iou, words))
+        points = [
+            (
+                1000 * max(row.score_m, FLOOR_M),
+                row.mask_iou,
+                f"{safe(board.sequence(row))}, {row.repeat}, masks: {safe(label_text(row.segmentation))}",
+            )
+            for row in board.runs(key)
+            if row.mask_iou is not None and row.score_m is not None and not row.failed
+        ]
         if len(points) > MOST_POINTS:
             points = sorted(points)[:: -(-len(points) // MOST_POINTS)]
         if points:
@@ -180,8 +175,6 @@ def mask_figure(board: Board) -> go.Figure | None:
                     hovertemplate="%{text}<br>IoU %{x:.3f}<br>ATE %{y:.3g} mm<extra>%{fullData.name}</extra>",
                 )
             )
-    if not traces:
-        return None
     overlap = {"title": "overlap (IoU) of the mask, dilated, with the exact one", "range": [-0.02, 1.02]}
     return figure_of(
         traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=overlap, yaxis=log_axis("ATE (mm)")
@@ -212,8 +205,6 @@ def share_figure(board: Board, bins: Mapping[str, Sequence[Sequence[float | None
         for key in board.trackers
         if any(error_mm is not None for error_mm, _ in bins.get(key, []))
     ]
-    if not traces:
-        return None
     shares = {"title": "share of the image that shows people (%)", "type": "category"}
     errors = log_axis("frame-to-frame error, RMSE (mm)")
     return figure_of(traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=shares, yaxis=errors)
@@ -232,23 +223,21 @@ def bar_figure(board: Board, statistic: str) -> go.Figure | None:
     """
     look = looks(board)
     errors = medians(board, lambda row: row.metrics.get(f"ate_{statistic}_m"))
-    traces = []
-    for key in [key for key in board.trackers if any(key == measured for measured, _ in errors)]:
-        names = [name for name in board.sequences if (key, name) in errors]
-        traces.append(
-            go.Bar(
-                x=[safe(board.short[name]) for name in names],
-                y=rounded([1000 * errors[key, name] for name in names]),
-                text=[LOST_MARK * has_lost(board.cells[key][name]) for name in names],
-                textposition="outside",
-                cliponaxis=False,
-                name=wrapped(board.names[key]),
-                marker={"color": look[key]["color"], "opacity": 1.0 if key in board.ranked else 0.45},
-                hovertemplate="%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
-            )
+    measured = {key: [name for name in board.sequences if (key, name) in errors] for key in board.trackers}
+    traces = [
+        go.Bar(
+            x=[safe(board.short[name]) for name in names],
+            y=rounded([1000 * errors[key, name] for name in names]),
+            text=[LOST_MARK * has_lost(board.cells[key][name]) for name in names],
+            textposition="outside",
+            cliponaxis=False,
+            name=wrapped(board.names[key]),
+            marker={"color": look[key]["color"], "opacity": 1.0 if key in board.ranked else 0.45},
+            hovertemplate="%{x}<br>%{y:.3g} mm<extra>%{fullData.name}</extra>",
         )
-    if not traces:
-        return None
+        for key, names in measured.items()
+        if names
+    ]
     return figure_of(
         traces,
         max(380, 100 + 19 * len(traces)),

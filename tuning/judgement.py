@@ -268,32 +268,47 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None) -> tuple[Ver
         return Verdict.NOT_JUDGED, f"{name} has {ratio} on {_scenes(ratio)} only, and {FEWEST_SCENES} are the fewest"
     numbers = f"{ratio} on {_scenes(ratio)} that no trial saw"
     numbers += f" (where it was chosen {', '.join(map(str, best.on_confirm.values()))})" if best.ate_margin else ""
-    if not best.feasible:
-        return Verdict.WORSE, f"{name} violates a constraint when it is run again ({numbers})"
-    if best.recorded is not None and (best.recorded.low or 0.0) > 1:  # over starts, if need be
-        return Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"
-    if ratio.shows_loss:
-        return Verdict.WORSE, f"{name} has {100 * (ratio.ratio - 1):.1f} % more {ratio.what}: {numbers}"
     gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}: {numbers}"
+    no_better = f"the best, {name}, is not better than the baseline: {numbers}"
     unsettled = _unsettled(best)
-    if not unsettled:
-        return Verdict.PROVEN, f"{name} has {gain}"
-    luck = not best.chosen or ratio.ratio >= 1
-    if p_value is not None and p_value > MATTER_LEVEL and luck and not ratio.shows_gain:
-        return Verdict.NO_MATTER, (
-            f"the trials differ by no more than chance (F-test over trials and scenes, p = {p_value:.2f}, level "
-            f"{MATTER_LEVEL}). The best, {name}, has {numbers}"
-        )
-    if ratio.low is not None and 1 - NEGLIGIBLE < ratio.low and ratio.ratio < 1:
-        return Verdict.NO_MATTER, f"the best, {name}, gains at most {100 * (1 - ratio.low):.1f} %: {numbers}"
-    if ratio.ratio >= 1:
-        text = f"the best, {name}, is not better than the baseline: {numbers}"
-        if p_value is None:
-            return Verdict.NOT_JUDGED, f"{text}. One trial or one scene cannot tell whether settings matter"
-        return Verdict.WORSE, f"the settings matter, but {text}"
-    if ratio.ratio > 1 - NEGLIGIBLE and not best.chosen and not ratio.shows_gain:
-        return Verdict.NO_MATTER, f"the best, {name}, has perhaps {gain}. {_NOT_WORTH}"
-    return Verdict.PROMISING, f"{name} has perhaps {gain}. It is not proven: {unsettled}. {_more_scenes(best, ratio)}"
+    p, low = math.nan if p_value is None else p_value, math.nan if ratio.low is None else ratio.low
+    recorded_low = 0.0 if best.recorded is None else best.recorded.low or 0.0  # over starts, if need be
+    by_chance = p > MATTER_LEVEL and (not best.chosen or ratio.ratio >= 1) and not ratio.shows_gain
+    small = ratio.ratio > 1 - NEGLIGIBLE and not best.chosen and not ratio.shows_gain
+    verdicts = (
+        (not best.feasible, Verdict.WORSE, f"{name} violates a constraint when it is run again ({numbers})"),
+        (recorded_low > 1, Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"),
+        (
+            ratio.shows_loss,
+            Verdict.WORSE,
+            f"{name} has {100 * (ratio.ratio - 1):.1f} % more {ratio.what}: {numbers}",
+        ),
+        (not unsettled, Verdict.PROVEN, f"{name} has {gain}"),
+        (
+            by_chance,
+            Verdict.NO_MATTER,
+            f"the trials differ by no more than chance (F-test over trials and scenes, p = {p:.2f}, level "
+            f"{MATTER_LEVEL}). The best, {name}, has {numbers}",
+        ),
+        (
+            1 - NEGLIGIBLE < low and ratio.ratio < 1,
+            Verdict.NO_MATTER,
+            f"the best, {name}, gains at most {100 * (1 - low):.1f} %: {numbers}",
+        ),
+        (
+            ratio.ratio >= 1 and p_value is None,
+            Verdict.NOT_JUDGED,
+            f"{no_better}. One trial or one scene cannot tell whether settings matter",
+        ),
+        (ratio.ratio >= 1, Verdict.WORSE, f"the settings matter, but {no_better}"),
+        (small, Verdict.NO_MATTER, f"the best, {name}, has perhaps {gain}. {_NOT_WORTH}"),
+        (
+            True,
+            Verdict.PROMISING,
+            f"{name} has perhaps {gain}. It is not proven: {unsettled}. {_more_scenes(best, ratio)}",
+        ),
+    )
+    return next((verdict, text) for holds, verdict, text in verdicts if holds)
 
 
 _NOT_WORTH = f"A gain below {100 * NEGLIGIBLE:.0f} % is not worth more scenes"
@@ -327,13 +342,19 @@ def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate 
 
 def _unsettled(best: Candidate) -> str:
     """Why the best candidate is not proven; empty if it is."""
-    if not best.nothing_lost(best.on_confirm) or not best.nothing_lost(best.on_held_out or best.on_confirm):
-        return f"it is not shown to be as accurate (the bound has to lie below {1 + (best.ate_margin or 0.0):.2f})"
-    if not best.chosen:
-        return f"its upper bound {_bound(best.confirm):.3f} where it was chosen is not below 1"
-    if best.held_out is None or best.held_out.sequences < FEWEST_SCENES:
-        return f"fewer than {FEWEST_SCENES} held-out scenes were given to prove it on"
-    return "" if best.held_out.shows_gain else "the interval is not below 1"
+    as_accurate = best.nothing_lost(best.on_confirm) and best.nothing_lost(best.on_held_out or best.on_confirm)
+    held = best.held_out
+    reasons = {
+        f"it is not shown to be as accurate (the bound has to lie below {1 + (best.ate_margin or 0.0):.2f})": (
+            not as_accurate
+        ),
+        f"its upper bound {_bound(best.confirm):.3f} where it was chosen is not below 1": not best.chosen,
+        f"fewer than {FEWEST_SCENES} held-out scenes were given to prove it on": (
+            held is None or held.sequences < FEWEST_SCENES
+        ),
+        "the interval is not below 1": held is not None and not held.shows_gain,
+    }
+    return next((reason for reason, holds in reasons.items() if holds), "")
 
 
 def _scenes(ratio: Ratio) -> str:
@@ -498,14 +519,14 @@ def preset_text(
         judged_on: Instances that judged.
     """
     fixed = spec.space.fixed
-    remarks = [remark]
-    if tuned_on:
-        remarks.append(f"Tuned on {_listed(tuned_on)}.")
-    if judged_on:
-        remarks.append(f"Judged on {_listed(judged_on)}.")
-    if fixed:
-        remarks.append(f"Fixed in that study, not part of these settings: {', '.join(_lines(fixed))}.")
-    head = [f"settings of {spec.tracker}", *(line for text in remarks for line in textwrap.wrap(text, 100))]
+    remarks = {
+        remark: True,
+        f"Tuned on {_listed(tuned_on)}.": tuned_on,
+        f"Judged on {_listed(judged_on)}.": judged_on,
+        f"Fixed in that study, not part of these settings: {', '.join(_lines(fixed))}.": fixed,
+    }
+    shown = (line for text, holds in remarks.items() if holds for line in textwrap.wrap(text, 100))
+    head = [f"settings of {spec.tracker}", *shown]
     settings = {name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed}
     return "\n".join(
         [*(f"# {line}" for line in head), "", f"status = {json.dumps(status)}", "", "[settings]", *_lines(settings), ""]

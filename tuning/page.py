@@ -14,7 +14,7 @@ from optuna.trial import TrialState
 from dynslam_bench.core import read_text, setting_text, write_atomic
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.reports.build_report import sections_page
-from dynslam_bench.reports.figures import COLOURS, NEUTRAL, figure_of, guide
+from dynslam_bench.reports.figures import COLOURS, GUIDE, NEUTRAL
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
 from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
@@ -55,11 +55,11 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     sections = [
         Section(
             "result", "Tried, confirmed, held out", [note] if (note := seen_note(summary.seen)) else [],
-            [*figure_blocks(_funnel_figure(tuner, summary), caption), Block("table", table=candidates)],
+            [*figure_blocks(_funnel_figure(tuner, summary), caption), Block(table=candidates)],
         ),
         Section("preset", "Settings: baseline, best trial, range", [], _preset(tuner, summary, settings)),
         Section("course", "How it went", [*warnings_of(tuner), _importance_note(summary)], _plots(tuner, summary)),
-        Section("trials", "All trials", [], [Block("table", "All trials", trials, folded=True)]),
+        Section("trials", "All trials", [], [Block("All trials", trials, folded=True)]),
     ]  # fmt: skip
     html = sections_page(
         sections,
@@ -136,12 +136,12 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
 
 def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]:
     """The best settings with their status, and how to use them only if they are proven."""
-    shown, text = Block("table", table=settings), read_text(tuner.folder / "best.toml")
+    shown, text = Block(table=settings), read_text(tuner.folder / "best.toml")
     if summary.verdict != Verdict.PROVEN or summary.keeps_default:
         why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
-        return [shown, Block("code", title=f"best.toml, not recommended: {why}", text=text)]
+        return [shown, Block(title=f"best.toml, not recommended: {why}", text=text)]
     command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
-    return [shown, Block("code", text=text), Block("code", title="Use them", text=command)]
+    return [shown, Block(text=text), Block(title="Use them", text=command)]
 
 
 def _importance_note(summary: StudySummary) -> str:
@@ -191,8 +191,9 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
             )
         )  # fmt: skip
     axis = {"tickvals": list(range(len(stages))), "ticktext": stages, "range": [-0.5, len(stages) - 0.5]}
-    figure = figure_of(traces, 420, showlegend=False, xaxis=axis, yaxis={"title": "ratio to the baseline"})
-    guide(figure, y=1.0)
+    layout = {"height": 420, "template": {}, "showlegend": False, "xaxis": axis}
+    figure = go.Figure(traces, go.Layout(yaxis={"title": "ratio to the baseline"}, **layout))
+    figure.add_hline(1.0, **GUIDE)
     return figure
 
 
@@ -209,22 +210,18 @@ def fewer_starts(design: Design) -> str:
 
 def warnings_of(tuner: Study) -> list[str]:
     """What a reader of the course should know, in sentences."""
-    notes = []
     complete = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if len(complete) < 20:
-        notes.append(f"Only {len(complete)} trials were finished: the best value is partly luck.")
     infeasible = sum(not is_feasible(trial) for trial in complete)
-    if infeasible:
-        notes.append(
-            f"{infeasible} of {len(complete)} trials violate a constraint. They are candidates only where all do, and "
-            "then have to fulfil it on unseen instances."
-        )
-    if "speed" in tuner.spec.objectives:
-        notes.append(
-            "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On "
-            "the instances of the choice and the held-out ones baseline and candidates ran in turn: those count."
-        )
-    return notes
+    notes = {
+        f"Only {len(complete)} trials were finished: the best value is partly luck.": len(complete) < 20,
+        f"{infeasible} of {len(complete)} trials violate a constraint. They are candidates only where all do, and "
+        "then have to fulfil it on unseen instances.": infeasible,
+        "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On the "
+        "instances of the choice and the held-out ones baseline and candidates ran in turn: those count.": (
+            "speed" in tuner.spec.objectives
+        ),
+    }
+    return [note for note, holds in notes.items() if holds]
 
 
 def _candidates(summary: StudySummary) -> Table:

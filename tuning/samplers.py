@@ -21,11 +21,6 @@ from dynslam_bench.tuning.study_file import PrunerName, SamplerName, StudySpec
 _STARTUP_TRIALS = 8
 
 
-def build_sampler(spec: StudySpec) -> StreamedSampler:
-    """The sampler of a study."""
-    return StreamedSampler(lambda seed: _build(spec, seed), spec.sampler_seed)
-
-
 class StreamedSampler(optuna.samplers.BaseSampler):
     """Makes a sampler for each trial, seeded by the study's seed and the trial's number.
 
@@ -33,16 +28,18 @@ class StreamedSampler(optuna.samplers.BaseSampler):
     a study with one worker gives the same trials again. `Study.ask` draws all settings of a trial before the next.
 
     Args:
-        build: Makes a sampler with a seed; what it knows of earlier trials it reads from the study.
-        seed: Of the study.
+        spec: The study; what a sampler knows of earlier trials it reads from Optuna's study.
     """
 
-    def __init__(self, build: Callable[[int], optuna.samplers.BaseSampler], seed: int) -> None:
-        self._build, self._seed = build, seed
+    def __init__(self, spec: StudySpec) -> None:
+        self._spec = spec
 
     def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
         """Make the trial's sampler."""
-        self._sampler = self._build(int(stream(self._seed, "sampler", trial.number).integers(2**31)))
+        seed = int(stream(self._spec.sampler_seed, "sampler", trial.number).integers(2**31))
+        with warnings.catch_warnings():  # TPE's `constant_liar` counts as experimental
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            self._sampler = _SAMPLERS[self._spec.sampler](self._spec, seed)
         self._sampler.before_trial(study, trial)
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
@@ -70,12 +67,6 @@ _SAMPLERS: dict[SamplerName, Callable[[StudySpec, int], optuna.samplers.BaseSamp
     "nsga2": lambda spec, seed: optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed),
     "gp": lambda spec, seed: optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed),
 }
-
-
-def _build(spec: StudySpec, seed: int) -> optuna.samplers.BaseSampler:
-    with warnings.catch_warnings():  # TPE's `constant_liar` counts as experimental
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        return _SAMPLERS[spec.sampler](spec, seed)
 
 
 def is_feasible(trial: FrozenTrial) -> bool:

@@ -249,12 +249,13 @@ def source_of_masks(settings: Settings, sequences: PySequence[str]) -> str:
 
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
-    names_seen = []
-    for split in ("tune", "confirm", "held_out"):
-        names = {instance.sequence for instance in getattr(design, split)}
-        if any(seen_in_training(source_of_masks(settings, [name]), name) for name in names):
-            names_seen.append(split)
-    return names_seen
+    splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
+    names = {split: {instance.sequence for instance in instances} for split, instances in splits.items()}
+    return [
+        split
+        for split, sequences in names.items()
+        if any(seen_in_training(source_of_masks(settings, [name]), name) for name in sequences)
+    ]
 
 
 def seen_note(splits: PySequence[str]) -> str:

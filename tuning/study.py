@@ -43,7 +43,7 @@ from dynslam_bench.tuning.objectives import (
     violations,
 )
 from dynslam_bench.tuning.plan import Plan, distributions, starting_point
-from dynslam_bench.tuning.samplers import build_pruner, build_sampler
+from dynslam_bench.tuning.samplers import StreamedSampler, build_pruner
 from dynslam_bench.tuning.splits import design_of
 from dynslam_bench.tuning.storage import (
     EARLIER,
@@ -108,10 +108,6 @@ class Evaluation:
     values: list[float] | None = None
 
 
-Callback = Callable[[optuna.Study, FrozenTrial], object]
-"""Called after each trial, as Optuna's own."""
-
-
 class Study(Plan):
     """A study to be run: at once, or trial by trial with `ask`, `evaluate` and `tell`.
 
@@ -143,7 +139,7 @@ class Study(Plan):
         *,
         objective: str | Cost | Sequence[str | Cost] | None = None,
         sampler: optuna.samplers.BaseSampler | None = None,
-        callbacks: Iterable[Callback] = (),
+        callbacks: Iterable[Callable[[optuna.Study, FrozenTrial], object]] = (),
         **fields: Any,
     ) -> None:
         base = read_study(spec) if isinstance(spec, Path | str) else spec
@@ -155,7 +151,6 @@ class Study(Plan):
             base = validated(StudySpec, {"name": "study", **values, **changes}, "the study", StudyError)
         super().__init__(base, results, objectives=objectives)
         self._callbacks = tuple(callbacks)
-        sampler = build_sampler(base) if sampler is None else sampler
         self.store.prepare()
         self.folder = study_folder(self.results, base)
         self._identity = self._identify()
@@ -163,7 +158,7 @@ class Study(Plan):
         self._interrupted = threading.Event()
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
-        self.study = self._open(sampler, list(self._beginnings()))
+        self.study = self._open(sampler or StreamedSampler(base), list(self._beginnings()))
         self._heartbeats = Heartbeats(self.study)
         if self.extension["scenes"]:
             self.design = design_of(base, further=self.extension["scenes"])

@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -58,13 +58,15 @@ class ProblemInstance:
         name, _, query = self.sequence.partition("?")
         first, last = self.frames or (0, None)
         part = "" if self.frames is None else f"[{first}:{'' if last is None else last}]"
-        options = [query] if query else []
-        options += [f"offsets={self.offset}"]
-        options += [f"stride={self.stride}"] if self.stride > 1 else []
-        options += [f"seeds={self.seed}"] if self.seed else []
-        if self.degradation:
-            options.append("degrade=" + ",".join(f"{kind}:{strength:g}" for kind, strength in self.degradation))
-        return f"{name}{part}?{'&'.join(options)}"
+        degradation = ",".join(f"{kind}:{strength:g}" for kind, strength in self.degradation)
+        options = (
+            query,
+            f"offsets={self.offset}",
+            f"stride={self.stride}" if self.stride > 1 else "",
+            f"seeds={self.seed}" if self.seed else "",
+            f"degrade={degradation}" if degradation else "",
+        )
+        return f"{name}{part}?{'&'.join(filter(None, options))}"
 
     @property
     def scene(self) -> str:
@@ -188,18 +190,17 @@ def further_scenes(
     Raises:
         StudyError: None of the instances is rendered, or the numbers are used up.
     """
-    taken, models = set(taken), dict[str, list[ProblemInstance]]()
-    for group in scenes(instances).values():
-        if group[0].sequence.startswith("synthetic/"):
-            models.setdefault(parse_synthetic_id(group[0].sequence).name, group)
-    added: list[list[ProblemInstance]] = []
-    for number, group in product(numbers, models.values()):
-        moved = [
+    rendered = [group for group in scenes(instances).values() if group[0].sequence.startswith("synthetic/")]
+    by_name = grouped(rendered, lambda group: parse_synthetic_id(group[0].sequence).name)
+    moved = (
+        [
             replace(instance, sequence=str(replace(parse_synthetic_id(instance.sequence), scene=number)))
             for instance in group
         ]
-        if len(added) < count and moved[0].scene not in taken:
-            added.append(moved)
+        for number, (group, *_) in product(numbers, by_name.values())
+    )
+    used = set(taken)
+    added = list(islice((group for group in moved if group[0].scene not in used), count))
     if len(added) < count:
         raise StudyError(
             f"{count} further scenes cannot be made, only {len(added)}",

@@ -4,21 +4,17 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
-from dynslam_bench.core import setting_text, write_atomic
+from dynslam_bench.core import setting_text
 from dynslam_bench.evaluation import Protocol
 from dynslam_bench.reports.figures import significant
-from dynslam_bench.reports.html.page import render, write_assets, write_side
-from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
-from dynslam_bench.reports.model.board import Board, Cell, compare_pairs
+from dynslam_bench.reports.model.board import OVERALL, Board, Cell, compare_pairs
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Standing, Verdict
-from dynslam_bench.reports.tables.leaderboard import leaderboard, middle, rank_cell, run_link, timed
+from dynslam_bench.reports.tables.leaderboard import leaderboard_cells, middle, rank_cell, run_link, timed
 from dynslam_bench.reports.tables.table import TableCell, number
 
 _OPPOSITE: dict[Verdict, Verdict] = {"better": "worse", "worse": "better", "cannot tell": "cannot tell"}
@@ -37,7 +33,7 @@ MEANINGS = {
 
 
 def entries_of(
-    board: Board, whole: Board, boards: Mapping[str, Board], protocol: Protocol, paged: Collection[str] = ()
+    board: Board, whole: Board, boards: Mapping[str, Board], paged: Collection[str] = ()
 ) -> list[dict[str, Any]]:
     """The rows of one category, cells by the names that `board.html.j2` calls them by.
 
@@ -49,17 +45,13 @@ def entries_of(
         board: Of the category.
         whole: Of all sequences: the numbers of trackers.
         boards: Of all categories, for the column that shows them side by side.
-        protocol: How errors were computed.
         paged: Ids of the runs that have a page.
     """
     keys = [*whole.trackers, *whole.final_only]
-    standings = {standing.key: standing for standing in board.standings}
     limits = _limits([s.ratio for s in board.standings])
-    table = leaderboard(board, protocol)
-    names = [column.name for column in table.columns]
     entries = []
-    for key, row in zip(board.trackers, table.rows, strict=True):
-        standing, cells, runs = standings.get(key), dict(zip(names, row, strict=True)), board.cells[key]
+    for key in board.trackers:
+        standing, cells, runs = board.placed.get(key), leaderboard_cells(board, key), board.cells[key]
         first = board.first(key)
         typical = [runs[name].typical for name in board.sequences if name in runs] or [first]
         start = next((run for run in typical if run.run_id in paged), typical[0])
@@ -78,7 +70,7 @@ def entries_of(
                 "kind": kind,
                 "rank": TableCell("–") if standing is None else rank_cell(standing),
                 "ratio": _ratio_cell(board, key, standing),
-                "bar": Markup("") if standing is None else interval_bar(standing.ratio, limits),
+                "bar": {} if standing is None else _bar(standing.ratio, limits),
                 "verdict": TableCell("not ranked", why) if (why := board.unranked_why(key)) else cells["better?"],
                 "success": cells["success"],
                 "coverage": cells["coverage"],
@@ -109,45 +101,25 @@ def _limits(ratios: Sequence[Interval]) -> tuple[float, float]:
     return math.log(max(low, 0.02)), math.log(min(high, 20.0))
 
 
-def interval_bar(ratio: Interval, limits: tuple[float, float]) -> Markup:
-    """A ratio with its interval on a logarithmic axis, and a line at 1."""
-    if not math.isfinite(ratio.value):
-        return Markup("")
-
-    def x(value: float) -> str:
-        share = (math.log(max(value, FLOOR_M)) - limits[0]) / (limits[1] - limits[0])
-        return f"{4 + 112 * min(max(share, 0.0), 1.0):.1f}"
-
-    better = "worse" if ratio.value >= 1 else "better"
-    line = ""
-    if math.isfinite(ratio.low):
-        line = f'<line x1="{x(ratio.low)}" x2="{x(ratio.high)}" y1="8" y2="8" class="{better}"/>'
-    dot = f'<circle cx="{x(ratio.value)}" cy="8" r="3.6" class="{better}"/>'
-    one = f'<line x1="{x(1.0)}" x2="{x(1.0)}" y1="0" y2="16" class="one"/>'
-    return Markup(f'<svg class="bar" viewBox="0 0 120 16" aria-hidden="true">{one}{line}{dot}</svg>')
+def _bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:
+    """Places of a ratio, of the ends of its interval and of 1 on a logarithmic axis, in pixels; none of what is nan."""
+    values = {"at": ratio.value, "low": ratio.low, "high": ratio.high, "one": 1.0}
+    shares = {
+        name: (math.log(max(value, FLOOR_M)) - limits[0]) / (limits[1] - limits[0])
+        for name, value in values.items()
+        if math.isfinite(value)
+    }
+    return {name: 4 + 112 * min(max(share, 0.0), 1.0) for name, share in shares.items()}
 
 
-def _by_category(key: str, boards: Mapping[str, Board]) -> Markup:
-    """A dot a category: its height is the ratio there, the line in the middle is 1; empty for a single category."""
-    ratios = [
-        (name, standing.ratio.value)
-        for name, board in list(boards.items())[1:]
-        for standing in board.standings
-        if standing.key == key and math.isfinite(standing.ratio.value)
+def _by_category(key: str, boards: Mapping[str, Board]) -> list[tuple[str, float, float]]:
+    """A dot a category: its name, the ratio there, and the height of a ratio from 1/8 to 8 in pixels from above."""
+    ratios = {name: board.placed[key].ratio.value for name, board in boards.items() if key in board.placed}
+    return [
+        (name, ratio, 12 - 8 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0))
+        for name, ratio in ratios.items()
+        if math.isfinite(ratio) and name != OVERALL
     ]
-    if not ratios:
-        return Markup("")
-    words = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios)
-    dots = []
-    for at, (_, ratio) in enumerate(ratios):
-        y = 12 + 8 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0)
-        kind = "worse" if ratio >= 1 else "better"
-        dots.append(f'<circle cx="{8 + 14 * at}" cy="{24 - y:.1f}" r="3.6" class="{kind}"/>')
-    width = 14 * len(ratios) + 4
-    one = f'<line x1="0" x2="{width}" y1="12" y2="12" class="one"/>'
-    shape = f'<svg class="spark" viewBox="0 0 {width} 24" style="width: {width}px" role="img"'
-    title = Markup("<title>{}</title>").format(words)
-    return Markup(f"{shape}>{title}{one}{''.join(dots)}</svg>")
 
 
 # -- what the pages of errors, runs and comparisons read
@@ -185,7 +157,10 @@ def side_content(
         "reference": board.reference_name,
         "referenceAt": None if board.reference is None else place[board.reference],
         "metrics": metrics,
-        "trackers": [_tracker(board, key) for key in keys],
+        "trackers": [
+            {"label": board.names[key], "ranked": key in board.ranked, "settings": settings_content(board.first(key))}
+            for key in keys
+        ],
         "sequences": [
             {"name": name, "short": board.short.get(name, name), "tags": sorted(tags[name]),
              "static": significant(board.static_camera.get(name))}
@@ -238,23 +213,23 @@ def cell_content(
     return [*place, medians, cell.typical.run_id, [significant(value) for value in quartiles]]
 
 
-def _tracker(board: Board, key: str) -> dict[str, Any]:
-    first = board.first(key)
-    return {
-        "label": board.names[key],
-        "ranked": key in board.ranked,
-        "settings": {name: setting_text(value) for name, value in first.variant.items()},
-    }
+def settings_content(row: RunRow) -> dict[str, str]:
+    """What sets a run's tracker apart from other variants of it."""
+    return {name: setting_text(value) for name, value in row.variant.items()}
 
 
 def _metrics(protocol: Protocol) -> list[dict[str, str]]:
     """The numbers to choose from, the one that ranks first."""
-    numbers = [("ATE", "m", "ate_rmse_m")]
-    for spec in protocol.rpe:
-        numbers.append((f"RPE over {spec.describe()}", "m/s" if spec.rate else "m", spec.metric("trans")))
-    for spec in protocol.rpe:
-        numbers.append((f"RPE over {spec.describe()}, rotation", "deg/s" if spec.rate else "deg", spec.metric("rot")))
-    numbers.append(("absolute rotation", "deg", "ape_rot_rmse_deg"))
+    parts = (("", "m", "trans"), (", rotation", "deg", "rot"))
+    numbers = [
+        ("ATE", "m", "ate_rmse_m"),
+        *(
+            (f"RPE over {spec.describe()}{words}", f"{unit}{'/s' * spec.rate}", spec.metric(part))
+            for words, unit, part in parts
+            for spec in protocol.rpe
+        ),
+        ("absolute rotation", "deg", "ape_rot_rmse_deg"),
+    ]
     return [
         {"name": name, "unit": unit, "key": key, "which": which}
         for which in dict.fromkeys([protocol.trajectory, "final"])
@@ -269,51 +244,3 @@ def _value(row: RunRow, metric: Mapping[str, str]) -> float | None:
     if metric["key"] == "ate_rmse_m":
         return row.score_m
     return None if row.failed else row.metrics.get(metric["key"])
-
-
-def write_runs(
-    output: Path,
-    cells: Mapping[str, Mapping[str, Cell]],
-    shown: Sequence[RunRow],
-    protocol: Protocol,
-    home: str,
-    *,
-    words: str = "",
-    **more: Any,
-) -> None:
-    """Write the page that shows some runs, and what it reads.
-
-    Args:
-        output: Folder of the page.
-        cells: Label, of a tracker or a trial, to sequence to its runs.
-        shown: Runs that have a page.
-        protocol: How errors are computed.
-        home: What ``index.html`` is called.
-        words: The protocol in words; empty for its own.
-        **more: What ``data/board.js`` holds besides.
-    """
-    paged = {row.run_id for row in shown}
-    write_run_pages(shown, paged, protocol, output)
-    names = sorted({name for some in cells.values() for name in some})
-    trackers, contents, runs = [], [], []
-    for at, (label, some) in enumerate(cells.items()):
-        settings = next(iter(some.values())).rows[0].variant
-        trackers.append({"label": label, "settings": {name: setting_text(value) for name, value in settings.items()}})
-        for name, cell in some.items():
-            metric = {"key": "ate_rmse_m", "which": cell.rows[0].trajectory}
-            contents.append(cell_content(cell, at, names.index(name), [metric], rank_seen=True))
-            for row in [row for row in cell.rows if row.run_id in paged] or [cell.typical]:
-                runs.append([row.run_id, at, names.index(name), row.repeat, row.ending, 3 * (row.run_id in paged)])
-    board = {
-        "protocol": words or protocol.describe(),
-        "pageless": "",
-        "unlisted": 0,
-        "trackers": trackers,
-        "sequences": [{"name": name, "short": name, "tags": []} for name in names],
-        "cells": contents,
-        "runs": runs,
-    }
-    write_side(output, "board", board | more)
-    write_assets(output)
-    page = render("run.html.j2", title="Run", links=[("index.html", home)], scripts=["run.js"])
-    write_atomic(output / RUN_PAGE, page)

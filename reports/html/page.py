@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import plotly.graph_objects as go
 from jinja2 import Environment, FunctionLoader
@@ -24,20 +24,18 @@ _SCRIPTS = ("page.js", "board.js", "errors.js", "run.js", "compare.js")
 
 @dataclass
 class Block:
-    """Something in a section.
+    """Something in a section: a table, a figure, code or a list.
 
     Attributes:
-        kind: Which of the other attributes count.
         title: Heading above it, or what is seen of it when it is closed.
-        table: For ``table``.
-        figure: For ``figure``.
+        table: The table.
+        figure: The figure.
         caption: Below the figure.
-        text: For ``code``.
-        entries: For ``list``.
+        text: The code.
+        entries: Of the list.
         folded: Whether it is closed at first, behind its title.
     """
 
-    kind: Literal["table", "figure", "code", "list"]
     title: str = ""
     table: Table | None = None
     figure: go.Figure | None = None
@@ -66,12 +64,12 @@ class Section:
 
 def table_blocks(*tables: Table | None, folded: bool = False) -> list[Block]:
     """Blocks that show the tables that there are; folded ones are closed at first, behind their titles."""
-    return [Block("table", t.title if folded else "", t, folded=folded) for t in tables if t is not None]
+    return [Block(t.title if folded else "", t, folded=folded) for t in tables if t is not None]
 
 
 def figure_blocks(figure: go.Figure | None, caption: str = "", title: str = "") -> list[Block]:
     """A block that shows a figure; none for no figure."""
-    return [] if figure is None else [Block("figure", title, figure=figure, caption=caption)]
+    return [] if figure is None else [Block(title, figure=figure, caption=caption)]
 
 
 def render(template: str, **values: Any) -> str:

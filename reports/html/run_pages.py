@@ -25,7 +25,7 @@ from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
 from dynslam_bench.reports.html.page import read_remark, write_side
-from dynslam_bench.reports.model.load import JOB, run_jobs
+from dynslam_bench.reports.model.load import run_jobs
 from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.model.summary import reservations
 from dynslam_bench.reports.tables.table import mm, significant_text
@@ -94,55 +94,49 @@ def write_run_pages(
     """
     newest = sorted(sorted(rows, key=lambda row: row.started, reverse=True), key=lambda row: row.offset)
     shares = {column: exact_shares(runs) for column, runs in grouped(newest, lambda row: row.column_id).items()}
-    jobs = []
-    for column, runs in grouped(rows, lambda row: row.column_id).items():
-        for first in range(0, len(runs), JOB):
-            jobs.append((runs[first : first + JOB], pictured, shares[column], protocol, output))
+    jobs = [
+        (row, row.run_id in pictured, shares[column], protocol, output)
+        for column, runs in grouped(rows, lambda row: row.column_id).items()
+        for row in runs
+    ]
     pages: list[RunPage] = []
-    for written in run_jobs(pool, _write_pages, jobs):
-        pages += written
+    for page in run_jobs(pool, _write_page, jobs):
+        pages.append(page)
         progress(len(pages), len(rows))
     return pages
 
 
-def _write_pages(
-    rows: Sequence[RunRow], pictured: Collection[str], share: Mapping[int, float], protocol: Protocol, output: Path
-) -> list[RunPage]:
-    """Write the pages of some runs of one column, whose frames have these exact shares of dynamic pixels.
+def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protocol: Protocol, output: Path) -> RunPage:
+    """Write the page of a run whose frames have these exact shares of dynamic pixels.
 
     A page whose inputs are as they were stays as it is.
     """
-    pages, common = [], digest([package_digest(_CODE), protocol.digest(), *share.items()])
-    for row in rows:
-        name, files = f"run-{row.run_id}", _files(row, output)
-        stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
-        state = row.store.index.state(row.run_id, row.sequence.part)
-        made_of = digest([common, state, stamps, files, row.run_id in pictured, row.notes, row.failed])
-        earlier = read_remark(output, name)
-        if earlier and earlier[0] == made_of:
-            pages.append(RunPage(row.variant_key, *earlier[1:]))
-            continue
-        record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
-        pictures = _copy_pictures(row, output) if row.run_id in pictured else []
-        content = run_content(row, record, frames, protocol, pictures)
-        exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share)
-        exact &= (frames.share_source == EXACT) & (not row.failed)
-        sums = share_sums(frames.share[exact], frames.errors_m[exact])
-        write_side(output, name, content | {"files": files}, remark=[made_of, *sums])
-        pages.append(RunPage(row.variant_key, *sums))
-    return pages
+    name, files = f"run-{row.run_id}", _files(row, output)
+    stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
+    state = row.store.index.state(row.run_id, row.sequence.part)
+    code = [package_digest(_CODE), protocol.digest(), *share.items()]
+    made_of = digest([code, state, stamps, files, pictured, row.notes, row.failed])
+    earlier = read_remark(output, name)
+    if earlier and earlier[0] == made_of:
+        return RunPage(row.variant_key, *earlier[1:])
+    record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
+    content = run_content(row, record, frames, protocol, _copy_pictures(row, output) if pictured else [])
+    exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share)
+    exact &= (frames.share_source == EXACT) & (not row.failed)
+    sums = share_sums(frames.share[exact], frames.errors_m[exact])
+    write_side(output, name, content | {"files": files}, remark=[made_of, *sums])
+    return RunPage(row.variant_key, *sums)
 
 
 def _copy_pictures(row: RunRow, output: Path) -> list[int]:
     """Copy the pictures of a run beside its page; returns their frames."""
-    frames = []
-    for source in sorted(row.folder.glob("frame_*.webp")):
-        target = output / "frames" / row.run_id / source.name
-        if not target.is_file():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
-        frames.append(int(source.stem.removeprefix("frame_")))
-    return frames
+    sources, target = sorted(row.folder.glob("frame_*.webp")), output / "frames" / row.run_id
+    if sources:
+        target.mkdir(parents=True, exist_ok=True)
+    for source in sources:
+        if not (target / source.name).is_file():
+            shutil.copyfile(source, target / source.name)
+    return [int(source.stem.removeprefix("frame_")) for source in sources]
 
 
 def _files(row: RunRow, output: Path) -> list[tuple[str, str]]:
@@ -256,7 +250,6 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
     error = "No ground truth" if score is None else f"ATE {mm(score)} mm"
     if score is not None and static:
         error += f", {significant_text(100 * score / static, 2)} % of a static camera's"
-    lost = row.n_frames - row.n_tracked
     if score is not None and static and score >= static and not row.fixed_camera:
         return "amber", f"No better than a static camera: {error}"
     if row.incomplete:
@@ -264,15 +257,13 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
         return "amber", f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}" + f". {loss}" * bool(loss)
     if row.hints:
         return "amber", f"{error}, but the trajectory is probably faulty: {row.hints[0]}"
-    return "green", f"All {row.n_frames} frames tracked: {error}" if not lost else f"Tracked: {error}"
+    tracked = "Tracked" if row.n_tracked < row.n_frames else f"All {row.n_frames} frames tracked"
+    return "green", f"{tracked}: {error}"
 
 
 def _loss(frames: RunFrames, length: str) -> str:
     """When tracking was lost first, and what the frame showed; empty where it was not."""
-    if not frames.columns:
-        return ""
-    states = frames.columns["state"]
-    lost = np.flatnonzero(states == "lost")
+    lost = np.flatnonzero(frames.columns.get("state", np.array([], str)) == "lost")
     if not len(lost):
         return ""
     at = int(lost[0])
@@ -456,33 +447,38 @@ def _time_figure(
         ("people (%)", [(f"share of people: {frames.share_source}", "t", "share", COLOURS[4], {"fill": "tozeroy"})]),
     ]  # fmt: skip
     columns = series | track
-    shown = [
-        (title, drawn)
+    measured = {
+        title: [line for line in lines if line[2] in columns and np.isfinite(columns[line[2]]).any()]
         for title, lines in panels
-        if (drawn := [line for line in lines if line[2] in columns and np.isfinite(columns[line[2]]).any()])
-    ]
+    }
+    shown = {title: lines for title, lines in measured.items() if lines}
     if not shown:
         return {}
     traces = [
         _line(name, x, y, colour, axis, **more, **unit)
-        for axis, (_, lines) in enumerate(shown, 1)
+        for axis, lines in enumerate(shown.values(), 1)
         for name, x, y, colour, more in lines
     ]
-    height = 1 / len(shown)
-    layout: dict[str, Any] = {
+    spans, times = list(lost), columns.get("t", columns.get("track_t"))
+    if row.failed and times is not None and row.n_processed < row.n_frames:  # the rest was never seen
+        spans.append((float(times[-1]), row.sequence.duration_s))
+    layout = {
         "height": 60 + 150 * len(shown),
         "hovermode": "x",
         "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom"},
-        "xaxis": {"title": {"text": "time (s)"}, "anchor": f"y{len(shown) if len(shown) > 1 else ''}"},
-        "shapes": [_shade(*span) for span in lost],
+        "shapes": [_shade(*span) for span in spans],
     }
-    for at, (title, _) in enumerate(shown):
-        domain = [1 - (at + 1) * height + 0.02, 1 - at * height - 0.02]
-        layout[f"yaxis{at + 1 if at else ''}"] = {"title": {"text": title}, "domain": domain, "rangemode": "tozero"}
-    times = columns.get("t", columns.get("track_t"))
-    if row.failed and times is not None and row.n_processed < row.n_frames:  # the rest was never seen
-        layout["shapes"].append(_shade(float(times[-1]), row.sequence.duration_s))
-    return {"data": traces, "layout": layout}
+    return {"data": traces, "layout": layout | _axes([*shown], 0.02, rangemode="tozero")}
+
+
+def _axes(titles: Sequence[str], gap: float, **more: Any) -> dict[str, Any]:
+    """Axes of panels below each other, with these titles, over one time axis."""
+    last, count = len(titles) if len(titles) > 1 else "", len(titles)
+    axes: dict[str, Any] = {"xaxis": {"title": {"text": "time (s)"}, "anchor": f"y{last}"}}
+    for at, title in enumerate(titles):
+        domain = [1 - (at + 1) / count + gap, 1 - at / count - gap]
+        axes[f"yaxis{at + 1 if at else ''}"] = {"title": {"text": title}, "domain": domain} | more
+    return axes
 
 
 def _shade(start: float, end: float) -> dict[str, Any]:
@@ -503,9 +499,7 @@ HEAT = {
 
 def _track_figure(track: Series) -> dict[str, Any]:
     """The track in space, coloured by its error, beside the true path."""
-    data = []
-    if "true_t" in track:
-        data.append(_path("true path", "true", {"color": NEUTRAL, "width": 3}))
+    data = [_path("true path", "true", {"color": NEUTRAL, "width": 3})] if "true_t" in track else []
     if "track_t" in track:
         track["track_heat"] = np.log10(np.maximum(track["track_error"], 1e-3))
         measured = bool(np.isfinite(track["track_error"]).any())
@@ -533,28 +527,25 @@ def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
     parts = {"x": "x (m)", "y": "y (m)", "z": "z (m)"}
     parts |= {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"} if row.rotation_reliable else {}
     data = []
-    time = {"title": {"text": "time (s)"}, "anchor": f"y{len(parts)}"}
-    layout: dict[str, Any] = {"height": 130 * len(parts), "xaxis": time, "showlegend": False}
-    for at, (part, title) in enumerate(parts.items(), 1):
+    for at, part in enumerate(parts, 1):
         if "true_t" in track:
             data.append(_line("truth", "true_t", f"true_{part}", NEUTRAL, at, line={"dash": "dash"}))
         data.append(_line("estimate", "track_t", f"track_{part}", COLOURS[0], at))
-        domain = [1 - at / len(parts) + 0.01, 1 - (at - 1) / len(parts) - 0.01]
-        layout[f"yaxis{at if at > 1 else ''}"] = {"title": {"text": title}, "domain": domain}
+    layout = {"height": 130 * len(parts), "showlegend": False} | _axes([*parts.values()], 0.01)
     return {"data": data, "layout": layout}
 
 
 def _stages_figure(series: Series) -> dict[str, Any]:
     """Time of every frame, stage upon stage."""
     stages = [name for name in series if name.endswith("_s")]
+    if not stages:
+        return {}
     data = [
         _line(
             name.removesuffix("_s"), "t", name, COLOURS[at % len(COLOURS)], 1, stackgroup="stages", line={"width": 0.5}
         )
         for at, name in enumerate(stages)
     ]
-    if not data:
-        return {}
     total = np.nansum([series[name] for name in stages], axis=0)
     top = min(float(total.max()), 2.5 * float(np.quantile(total, 0.8))) or 1.0
     axes = {"xaxis": {"title": {"text": "time (s)"}}, "yaxis": {"title": {"text": "ms"}, "range": [0, 1.05 * top]}}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -139,6 +139,17 @@ class Board:
         groups = [self.groups[name] for name in self.common] if self.category == OVERALL else [""] * len(self.common)
         return dict(zip(self.common, group_weights(groups).tolist(), strict=True))
 
+    @property
+    def placed(self) -> dict[str, Standing]:
+        """Variant key to its standing, in order."""
+        return {standing.key: standing for standing in self.standings}
+
+    @property
+    def emphasised(self) -> set[str]:
+        """Variant keys of those that may be first, unless that is most of them: then it would say nothing."""
+        first = {s.key for s in self.standings if s.group is not None and s.group[0] == 1}
+        return first if 2 * len(first) <= len(self.ranked) else set()
+
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
         return self.columns[row.column_id]
@@ -195,10 +206,11 @@ class Board:
         """The sequences on which a tracker has a score."""
         return [name for name in self.sequences if name in self.cells[key] and self.cells[key][name].scores]
 
-    def typical_runs(self, sequence: str) -> dict[str, RunRow]:
-        """Of each tracker that succeeded on a sequence the run that stands for it, see `Cell.typical`."""
-        cells = {key: self.cells[key][sequence] for key in self.trackers if sequence in self.cells[key]}
-        return {key: cell.typical for key, cell in cells.items() if cell.succeeded}
+    @property
+    def typical(self) -> set[str]:
+        """Ids of the runs that stand for the cells with a success and ground truth, see `Cell.typical`."""
+        cells = (cell for key in self.trackers for cell in self.cells[key].values())
+        return {cell.typical.run_id for cell in cells if cell.succeeded}
 
     def frame(self) -> pd.DataFrame:
         """All rows as a pandas frame.
@@ -304,9 +316,10 @@ def category_boards(board: Board) -> dict[str, Board]:
 def _completed(board: Board) -> Board:
     """The board of rows with labels, ordered and ranked."""
     _order_sequences(board)
-    for key in board.labels:
-        cells = grouped(board.runs(key), board.sequence)
-        board.cells[key] = {name: make_cell(runs) for name, runs in cells.items()}
+    by_tracker = {key: grouped(board.runs(key), board.sequence) for key in board.labels}
+    board.cells = {
+        key: {name: make_cell(runs) for name, runs in by_name.items()} for key, by_name in by_tracker.items()
+    }
     board.final_only = [
         key
         for key in board.labels  # imports and batch programs without the trajectory that the protocol asks for
@@ -331,12 +344,9 @@ def _final_only(row: RunRow) -> bool:
 
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
     """The plainest variant of a tracker that was run on all common sequences, if there is one."""
-    candidates = []
-    for key in scored:
-        row = board.first(key)
-        plain = row.is_current and not row.imported and not row.realtime and "map" not in row.variant
-        if row.tracker.id == tracker and plain and set(board.common) <= set(board.scored(key)):
-            candidates.append(key)
+    everywhere = [board.first(key) for key in scored if set(board.common) <= set(board.scored(key))]
+    rows = [row for row in everywhere if row.tracker.id == tracker and row.is_current and not row.imported]
+    candidates = [row.variant_key for row in rows if not row.realtime and "map" not in row.variant]
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
         board.reference_name = board.names[board.reference]
@@ -432,14 +442,16 @@ def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
 
 def _order_sequences(board: Board) -> None:
     """Name the sequences and their groups, static ones first; note what a static camera scores on each."""
-    for name, rows in grouped(board.rows, board.sequence).items():
-        errors = [row.static_camera_ate_rmse_m for row in rows if row.static_camera_ate_rmse_m is not None]
-        if errors:
-            board.static_camera[name] = median(errors)
-        else:
-            board.unscored.append(name)
-        board.tags[name] = {tag for row in rows for tag in row.sequence.tags}
-        board.tags[name].add("rendered" if rows[0].sequence.id.startswith("synthetic/") else "recorded")
+    by_name = grouped(board.rows, board.sequence)
+    errors = {
+        name: [row.static_camera_ate_rmse_m for row in rows if row.static_camera_ate_rmse_m is not None]
+        for name, rows in by_name.items()
+    }
+    board.static_camera = {name: median(values) for name, values in errors.items() if values}
+    board.unscored = [name for name, values in errors.items() if not values]
+    for name, rows in by_name.items():
+        place = "rendered" if rows[0].sequence.id.startswith("synthetic/") else "recorded"
+        board.tags[name] = {place, *(tag for row in rows for tag in row.sequence.tags)}
         board.groups[name] = group_of(board.tags[name])
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
@@ -554,16 +566,10 @@ def make_cell(rows: Sequence[RunRow]) -> Cell:
     return Cell(tuple(ordered), tuple(kept))
 
 
-def mean_coverage(rows: Sequence[RunRow]) -> float | None:
-    """Mean over runs of the share of tracked frames; None if no run's is known."""
-    shares = [row.coverage for row in rows if row.coverage is not None]
-    return float(np.mean(shares)) if shares else None
-
-
-def mean_skipped(rows: Sequence[RunRow]) -> float | None:
-    """Mean over runs of the share of frames on which the fundamental matrix was not used; None if none has it."""
-    shares = [row.epipolar_skipped for row in rows if row.epipolar_skipped is not None]
-    return sum(shares) / len(shares) if shares else None
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Mean of what is known; None if nothing is."""
+    present = [value for value in values if value is not None]
+    return float(np.mean(present)) if present else None
 
 
 # -- the cells that are missing, and the commands that fill them
@@ -613,10 +619,10 @@ def missing_commands(board: Board) -> list[str]:
         repeats = ["--seed", *map(str, seeds)] if seeds != [0] else []
         repeats += ["--offset", *map(str, offsets)] if offsets != [0] else []
         others = grouped((by_sequence[name][0] for name in names), lambda row: tuple(part_options(row)))
-        for part, rows in others.items():
-            commands.append(
-                command_with(board.first(key), [*[row.place or row.sequence.id for row in rows], *part, *repeats])
-            )
+        commands += [
+            command_with(board.first(key), [*[row.place or row.sequence.id for row in rows], *part, *repeats])
+            for part, rows in others.items()
+        ]
     return commands
 
 

@@ -35,8 +35,8 @@ OnProgress = Callable[[float, float | None, str], None]
 MANY = 250
 """Runs from which on worker processes save more time than they need to start."""
 MOST_WORKERS = 8
-JOB = 40
-"""Runs of one job of a worker, at most."""
+_AT_ONCE = 40
+"""Jobs that a worker takes at once."""
 _CODE = ("evaluation", "geometry", "reports/model", "runs")
 
 
@@ -91,7 +91,7 @@ def run_jobs(pool: Executor | None, function: Callable[..., T], jobs: Sequence[t
         yield from starmap(function, jobs)
         return
     with _without_main():
-        answers = pool.map(function, *zip(*jobs, strict=True))
+        answers = pool.map(function, *zip(*jobs, strict=True), chunksize=_AT_ONCE)
     with raising(InfrastructureError, "a worker process of the report ended early", of=BrokenProcessPool):
         yield from answers
 
@@ -108,10 +108,6 @@ def _without_main() -> Iterator[None]:
 
 
 # -- rows of unchanged runs
-
-
-Scored = tuple[list[tuple[RunRow, str]], list[str]]
-"""Rows with the states of their run's files, and the folders without a valid record, with reasons."""
 
 
 def _place(protocol: Protocol) -> tuple[str, str]:
@@ -131,17 +127,13 @@ def _unchanged_rows(store: RunStore, protocol: Protocol, run_ids: Sequence[str])
     return rows
 
 
-def _score_runs(store: RunStore, protocol: Protocol, run_ids: Sequence[str]) -> Scored:
-    """Read some runs and score them."""
-    rows = []
-    unreadable = []
-    for run_id in run_ids:
-        try:
-            record, state = store.read_with_state(run_id)
-            rows.append((make_row(store, record, protocol), state))
-        except DynslamError as error:
-            unreadable.append(f"{store.place(run_id)}: {error}")
-    return rows, unreadable
+def _score_run(store: RunStore, protocol: Protocol, run_id: str) -> tuple[RunRow, str] | str:
+    """Read a run and score it: its row and the state of its files, or its folder and why that holds no valid record."""
+    try:
+        record, state = store.read_with_state(run_id)
+        return make_row(store, record, protocol), state
+    except DynslamError as error:
+        return f"{store.place(run_id)}: {error}"
 
 
 def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow, str]]) -> None:
@@ -247,16 +239,14 @@ def rows_of(
     """
     rows = _unchanged_rows(store, protocol, run_ids)
     unread = [run_id for run_id in run_ids if run_id not in rows]
-    size = 1 if pool is None else JOB
-    jobs = [(store, protocol, unread[first : first + size]) for first in range(0, len(unread), size)]
     scored: list[tuple[RunRow, str]] = []
-    done = 0
-    for new_rows, unreadable in run_jobs(pool, _score_runs, jobs):
-        scored += new_rows
-        loaded.unreadable += unreadable
-        done += len(new_rows) + len(unreadable)
-        last = f"scoring {scored[-1][0].tracker.id} on {scored[-1][0].sequence.id}" if new_rows else ""
-        on_progress(done, len(unread), last)
+    for done, answer in enumerate(run_jobs(pool, _score_run, [(store, protocol, run_id) for run_id in unread]), 1):
+        if isinstance(answer, str):
+            loaded.unreadable.append(answer)
+            on_progress(done, len(unread), "")
+        else:
+            scored.append(answer)
+            on_progress(done, len(unread), f"scoring {answer[0].tracker.id} on {answer[0].sequence.id}")
     _keep_rows(store, protocol, scored)
     return [*rows.values(), *(row for row, _ in scored)]
 

@@ -2,7 +2,9 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 from dynslam_bench.core import label_text, setting_text
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
@@ -33,14 +35,12 @@ def shortened(names: Sequence[str]) -> dict[str, str]:
     """
     if len(names) < 2:
         return {name: name for name in names}
-    folders = [_split(name)[0].split("/")[:-1] for name in names]
-    shared = 0
-    while all(len(parts) > shared and parts[shared] == folders[0][shared] for parts in folders):
-        shared += 1
-    common = set[str].intersection(*(set(_split(name)[1]) for name in names))
+    parts = {name: _split(name) for name in names}
+    folders = [stem.split("/")[:-1] for stem, _, _ in parts.values()]
+    shared = len(list(takewhile(lambda level: len(set(level)) == 1, zip(*folders, strict=False))))
+    common = set[str].intersection(*(set(options) for _, options, _ in parts.values()))
     short = {}
-    for name in names:
-        stem, options, part = _split(name)
+    for name, (stem, options, part) in parts.items():
         kept = "&".join(option for option in options if option not in common)
         short[name] = "/".join(stem.split("/")[shared:]) + (f"?{kept}" if kept else "") + part
     return short if len(set(short.values())) == len(names) else {name: name for name in names}
@@ -121,17 +121,18 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
         shown[tracker] = {*ALWAYS, *differing, *(named[tracker] - OF_ALL - elsewhere)}
     texts = {setting_text(value) for row in variants.values() for value in row.variant.values()}
     counts = Counter(map(label_text, texts))
+
+    def spelled(value: Any) -> str:
+        """The short form of a value, unless two values have the same."""
+        text = setting_text(value)
+        return label_text(text) if counts[label_text(text)] == 1 else text
+
     labels = {}
     for key, row in variants.items():
         tracker = row.tracker.id
-        parts = []
-        for name, value in sorted(row.variant.items()):
-            text = setting_text(value)
-            if name in shown[tracker]:  # the short form of a value, unless two values have the same
-                parts.append(f"{name}={label_text(text) if counts[label_text(text)] == 1 else text}")
+        parts = [f"{name}={spelled(value)}" for name, value in sorted(row.variant.items()) if name in shown[tracker]]
         parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
-        if row.imported and not all(other.imported for other in by_tracker[tracker]):
-            parts.append("imported")
+        parts += ["imported"] * (row.imported and not all(other.imported for other in by_tracker[tracker]))
         name = f"{row.label} <{tracker}>" if len({other.tracker.id for other in by_label[row.label]}) > 1 else row.label
         labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
     return labels

@@ -93,9 +93,7 @@ def published_for(sequences: Sequence[str], protocol: Protocol | None = None) ->
     facts = frame.sort_values("metric").drop_duplicates(key)[[*key, "by", "year", "alignment", "hardware", "remarks"]]
     values = frame.pivot(index=key, columns="metric", values="value").astype("Float64")
     lines = facts.join(values.reindex(columns=METRICS), on=key).sort_values(["sequence", METRICS[0], "system"])
-    if protocol is None:
-        return lines
-    return lines.loc[[scored_as(p.alignment, p.sequence, protocol) for p in lines_of(lines)]]
+    return lines.loc[[protocol is None or scored_as(p.alignment, p.sequence, protocol) for p in lines_of(lines)]]
 
 
 def spans(lines: pd.DataFrame) -> pd.DataFrame:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import ConfigDict, Field
 
@@ -18,14 +18,12 @@ from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
-from dynslam_bench.runs.store import RunStore, score
+from dynslam_bench.runs.store import RunStore, Which, score
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.sequences.tags import FIXED_CAMERA
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
-Which = Literal["online", "final"]
-"""Which of a run's two trajectories."""
 SEEN = "§"
 """Behind trackers and numbers whose masks come from a network that was trained on the scene."""
 HINTED = "‡"
@@ -208,17 +206,16 @@ class RunRow(RunRecord):
     @property
     def machine_words(self) -> str:
         """Computer and versions in words."""
-        machine, git = self.machine, self.git
-        versions = dict(self.versions)
+        machine, git, versions = self.machine, self.git, dict(self.versions)
         if git is not None and "dynslam-bench" in versions:  # a checkout is older than its code: git's revision holds
             versions["dynslam-bench"] = versions["dynslam-bench"].partition("+")[0]
-        parts = [f"{name} {version}" for name, version in versions.items()]
-        if machine is not None:
-            hardware = f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}"
-            parts = [hardware, *filter(None, [machine.gpu]), *parts]
-        if git is not None:
-            parts.append(f"git {git.revision[:10]}{' (changed)' if git.dirty else ''}")
-        return "; ".join(parts)
+        parts = [
+            f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}" if machine else "",
+            machine.gpu if machine else "",
+            *(f"{name} {version}" for name, version in versions.items()),
+            f"git {git.revision[:10]}{' (changed)' if git.dirty else ''}" if git else "",
+        ]
+        return "; ".join(filter(None, parts))
 
 
 def grouped(rows: Iterable[V], key: Callable[[V], K]) -> dict[K, list[V]]:

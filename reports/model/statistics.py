@@ -69,21 +69,6 @@ class Standing:
     sequences: int
 
 
-@dataclass(frozen=True)
-class MeanRanks:
-    """Friedman's test with Nemenyi's critical difference (Demsar 2006): ranks on every sequence, weights do not count.
-
-    Attributes:
-        ranks: Tracker to the mean of its ranks, the best first.
-        p_value: Of Friedman's test that all trackers are alike.
-        critical_difference: Mean ranks that differ by more are different at 5 %.
-    """
-
-    ranks: dict[str, float]
-    p_value: float
-    critical_difference: float
-
-
 def standings(
     cells: Cells,
     reference: Mapping[str, Sequence[float]],
@@ -223,22 +208,22 @@ def rank_groups(logs: Mapping[str, Array], weights: Array) -> dict[str, tuple[in
     return {key: (1 + better[key], len(logs) - worse[key]) for key in logs}
 
 
-def mean_rank_test(logs: Mapping[str, Array]) -> MeanRanks | None:
-    """Friedman's test and Nemenyi's critical difference; None for fewer than three trackers or `FEWEST` sequences.
+def mean_rank_test(logs: Mapping[str, Array]) -> tuple[float, float] | None:
+    """Friedman's test with Nemenyi's critical difference (Demsar 2006): ranks on every sequence, weights do not count.
 
     Args:
         logs: As in `separable`.
+
+    Returns:
+        The p value of all trackers being alike, and the difference above which two mean ranks are different at 5 %;
+        None for fewer than three trackers or `FEWEST` sequences.
     """
     trackers, sequences = len(logs), len(next(iter(logs.values()), ()))
     if trackers < 3 or sequences < FEWEST:
         return None
-    ranks = _mean_ranks(logs)
     quantile = scipy.stats.studentized_range.ppf(0.95, trackers, np.inf) / math.sqrt(2.0)
-    return MeanRanks(
-        dict(sorted(ranks.items(), key=lambda item: item[1])),
-        float(scipy.stats.friedmanchisquare(*logs.values()).pvalue),
-        float(quantile * math.sqrt(trackers * (trackers + 1) / (6.0 * sequences))),
-    )
+    difference = float(quantile * math.sqrt(trackers * (trackers + 1) / (6.0 * sequences)))
+    return float(scipy.stats.friedmanchisquare(*logs.values()).pvalue), difference
 
 
 def holm(p_values: Sequence[float] | Array) -> Array:

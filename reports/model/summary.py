@@ -90,9 +90,10 @@ def mean_rank_note(board: Board) -> str:
     test = mean_rank_test(common_logs(board, board.ranked)[0])
     if test is None:
         return ""
+    p_value, difference = test
     return (
-        f"Mean ranks: Friedman's test gives p = {test.p_value:.2g}; two mean ranks that differ by more than "
-        f"{test.critical_difference:.2f} are different at 5 % (Nemenyi)."
+        f"Mean ranks: Friedman's test gives p = {p_value:.2g}; two mean ranks that differ by more than "
+        f"{difference:.2f} are different at 5 % (Nemenyi)."
     )
 
 

@@ -10,7 +10,7 @@ from statistics import median
 import numpy as np
 
 from dynslam_bench.core import label_text
-from dynslam_bench.evaluation import Protocol
+from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.reports.model.board import (
     OVERALL,
@@ -18,8 +18,7 @@ from dynslam_bench.reports.model.board import (
     Board,
     Cell,
     compare_pairs,
-    mean_coverage,
-    mean_skipped,
+    mean_of,
     rank,
 )
 from dynslam_bench.reports.model.published import ReportedCell
@@ -62,24 +61,20 @@ SEEN_NOTE = (
 
 def leaderboard(board: Board, protocol: Protocol) -> Table:
     """Ranking with what the data leave open, success, coverage, speed and provenance."""
-    standings = {standing.key: standing for standing in board.standings}
     epipolar = any(row.epipolar_skipped is not None for row in board.rows)
     columns = [
         replace(column, meaning=column.meaning.replace("{reference}", board.reference_name))
         for column in COLUMNS
         if epipolar or column.name != "F skipped"
     ]
-    rows = []
-    for key in board.trackers:
-        cells = _leaderboard_cells(board, key, standings.get(key))
-        rows.append([cells.get(column.name, TableCell()) for column in columns])
-    caption = _caption(board, protocol, epipolar)
+    lines = [leaderboard_cells(board, key) for key in board.trackers]
+    rows = [[cells[column.name] for column in columns] for cells in lines]
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
     brief += ", with 95 % intervals" * any(math.isfinite(standing.ratio.low) for standing in board.standings)
     return Table(
         "leaderboard",
         "Leaderboard",
-        caption,
+        _caption(board, protocol, epipolar),
         columns,
         rows,
         board.unranked_rows(board.trackers),
@@ -115,7 +110,7 @@ COLUMNS = (
     Column("rows", numeric=False, latex=False),
     Column("provenance", numeric=False, latex=False),
 )
-"""The leaderboard's columns; `_leaderboard_cells` fills them."""
+"""The leaderboard's columns; `leaderboard_cells` fills them."""
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
@@ -169,15 +164,15 @@ def _hinted(rows: Iterable[RunRow]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.most_common())
 
 
-def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dict[str, TableCell]:
-    """The cells of a tracker by the names of their columns; what is not known is left out."""
-    runs = board.runs(key)
+def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
+    """The cells of a tracker by the names of their columns; what is not known is empty."""
+    runs, standing = board.runs(key), board.placed.get(key)
     ended = [row for row in runs if not row.failed]
-    coverage = mean_coverage(runs)
+    coverage = mean_of(row.coverage for row in runs)
     hinted = _hinted(runs)
     masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
-    tracker, skipped = runs[0].tracker, mean_skipped(runs)
-    cells = {
+    tracker, skipped = runs[0].tracker, mean_of(row.epipolar_skipped for row in runs)
+    cells = dict.fromkeys((column.name for column in COLUMNS), TableCell()) | {
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
         "tracker": TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id),
@@ -196,14 +191,10 @@ def _leaderboard_cells(board: Board, key: str, standing: Standing | None) -> dic
         return cells | {"ATE ratio": TableCell("nothing succeeded", emphasis="failed")}
     if standing is None:
         return cells
-    # bold for those that may be first, unless that is most of them: then it would say nothing
-    first = [other.key for other in board.standings if other.group is not None and other.group[0] == 1]
-    best = key in first and 2 * len(first) <= len(board.ranked)
-    ratio = interval_cell(standing.ratio, ".2f", "best" if best else "")
+    ratio = interval_cell(standing.ratio, ".2f", "best" if key in board.emphasised else "")
     if standing.sequences < len(board.common):
-        ratio = TableCell(
-            ratio.text, f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip(), ratio.value
-        )
+        small = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
+        ratio = TableCell(ratio.text, small, ratio.value)
     wins = TableCell(f"{standing.wins} of {standing.sequences}", value=standing.wins)
     return cells | {
         "#": TableCell("–", why) if (why := board.unranked_why(key)) else rank_cell(standing),
@@ -232,23 +223,17 @@ def category_table(boards: Mapping[str, Board]) -> Table | None:
     if len(boards) < 2:
         return None
     overall = boards[OVERALL]
-    standings = {name: {s.key: s for s in board.standings} for name, board in boards.items()}
-    best = {
-        name: {s.key for s in board.standings if s.group is not None and s.group[0] == 1}
-        for name, board in boards.items()
-    }
-    rows = []
-    for key in overall.trackers:
-        cells = [TableCell(overall.labels[key])]
-        for name, board in boards.items():
-            standing = standings[name].get(key)
-            if standing is None:
-                cells.append(TableCell())
-                continue
-            few = 2 * len(best[name]) <= len(board.ranked)
-            cell = interval_cell(standing.ratio, ".2f", "best" if few and key in best[name] else "")
-            cells.append(replace(cell, shade=verdict_cell(board, standing).shade, tip=standing.verdict))
-        rows.append(cells)
+
+    def shown(board: Board, key: str) -> TableCell:
+        standing = board.placed.get(key)
+        if standing is None:
+            return TableCell()
+        cell = interval_cell(standing.ratio, ".2f", "best" if key in board.emphasised else "")
+        return replace(cell, shade=verdict_cell(board, standing).shade, tip=standing.verdict)
+
+    rows = [
+        [TableCell(overall.labels[key]), *(shown(board, key) for board in boards.values())] for key in overall.trackers
+    ]
     columns = [
         Column(name, meaning=f"{_count(len(board.common), 'sequence')}, against {board.reference_name}")
         for name, board in boards.items()
@@ -266,24 +251,18 @@ def pair_table(board: Board) -> Table | None:
     """Every ranked tracker against every other; None below `FEWEST` sequences or for fewer than three trackers."""
     if len(board.common) < FEWEST or len(board.ranked) < 3:
         return None
-    pairs = {}
-    for pair in compare_pairs(board, board.ranked):
-        pairs[pair.one, pair.other] = pair.ratio.value, pair
-        pairs[pair.other, pair.one] = 1.0 / pair.ratio.value, pair
-    rows = []
-    for key in board.ranked:
-        cells = [TableCell(board.labels[key])]
-        for other in board.ranked:
-            if other == key:
-                cells.append(TableCell("–", emphasis="muted"))
-                continue
-            ratio, pair = pairs[key, other]
-            apart = pair.verdict != "cannot tell"
-            colour = shade(0.5 if ratio < 1 else 2.0) if apart else None
-            cells.append(
-                TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {pair.p_value:.3f}")
-            )
-        rows.append(cells)
+    pairs = {frozenset((pair.one, pair.other)): pair for pair in compare_pairs(board, board.ranked)}
+
+    def shown(key: str, other: str) -> TableCell:
+        if other == key:
+            return TableCell("–", emphasis="muted")
+        pair = pairs[frozenset((key, other))]
+        ratio = pair.ratio.value if pair.one == key else 1.0 / pair.ratio.value
+        apart = pair.verdict != "cannot tell"
+        colour = shade(0.5 if ratio < 1 else 2.0) if apart else None
+        return TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {pair.p_value:.3f}")
+
+    rows = [[TableCell(board.labels[key]), *(shown(key, other) for other in board.ranked)] for key in board.ranked]
     caption = (
         "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart (paired "
         "t tests of the log errors over sequences, Holm-corrected over all pairs); '?': they cannot."
@@ -302,10 +281,10 @@ def speed_cell(ended: Sequence[RunRow]) -> TableCell:
     """Real-time factor and frame time, marked where they come from the stage cache."""
     rows = timed(ended)
     factor, frame_ms = middle(row.real_time_factor for row in rows), middle(row.frame_ms for row in rows)
+    if factor is None:
+        return TableCell()
     mark, tip = (CACHED_MARK, CACHED_NOTE) if any(row.cached for row in rows) else ("", "")
     small = "" if frame_ms is None else f"{frame_ms:.1f} ms{mark}"
-    if factor is None:
-        return TableCell(small=small, tip=tip)
     return TableCell((f"{factor:.2f}" if factor < 100 else f"{factor:.0f}") + mark, small, factor, tip=tip)
 
 
@@ -369,17 +348,21 @@ def metric_table(
     values = medians(board, value)
     if not values:
         return None
-    doubts = {(key, sequence): doubt(board.cells[key][sequence]) for key, sequence in values}
+    doubtful: dict[tuple[str, str], Emphasis] = {(k, s): "muted" for k, s in values if doubt(board.cells[k][s])}
     sign = -1.0 if larger_is_better else 1.0
-    marks = column_marks(board, {place: sign * number for place, number in values.items() if not doubts[place]})
-
-    def shown(cell: Cell, place: tuple[str, str], _: str) -> TableCell:
-        words = text(values[place]) + DOUBT * bool(doubts[place]) + SEEN * cell.in_training
-        mark: Emphasis = "muted" if doubts[place] else marks.get(place, "")
-        tip = doubts[place] or (SEEN_NOTE if cell.in_training else cell.ending)
-        return TableCell(words, value=values[place], emphasis=mark, tip=tip)
-
-    return _sequence_table(board, {"": values}, shown, name, title, caption, f"{title} ({unit})")
+    compared = {place: sign * number for place, number in values.items() if place not in doubtful}
+    return _sequence_table(
+        board,
+        {"": values},
+        name,
+        title,
+        caption,
+        f"{title} ({unit})",
+        text=text,
+        behind=lambda cell: DOUBT * bool(doubt(cell)) + SEEN * cell.in_training,
+        tip=lambda cell: doubt(cell) or (SEEN_NOTE if cell.in_training else cell.ending),
+        marks={"": column_marks(board, compared) | doubtful},
+    )
 
 
 Values = Mapping[tuple[str, str], float]
@@ -389,38 +372,47 @@ Values = Mapping[tuple[str, str], float]
 def _sequence_table(
     board: Board,
     measures: Mapping[str, Values],
-    shown: Callable[[Cell, tuple[str, str], str], TableCell],
     name: str,
     title: str,
     caption: str,
     brief: str,
+    *,
+    text: Callable[[float], str] = mm,
+    behind: Callable[[Cell], str] = lambda cell: "",
+    tip: Callable[[Cell], str] = lambda cell: "",
+    marks: Mapping[str, Mapping[tuple[str, str], Emphasis]] | None = None,
 ) -> Table:
     """A row a tracker that has any of the numbers, a column a sequence and kind of number.
 
     Args:
         board: The board.
         measures: The numbers of each kind; ``""`` for the only one.
-        shown: The cell of a number, from its runs, its place and its kind.
         name: Id of the table.
         title: Heading.
         caption: How to read it.
         brief: Caption where there is little room.
+        text: How a number is written.
+        behind: What stands behind the numbers of a cell.
+        tip: The tip of a cell.
+        marks: Emphasis of the numbers of each kind; None for the best and second best of every column.
     """
+    marks = {kind: column_marks(board, values) for kind, values in measures.items()} if marks is None else marks
     measured = {key for values in measures.values() for key, _ in values}
     keys = [key for key in (*board.trackers, *board.final_only) if key in measured]
-    rows = []
-    for key in keys:
-        cells = [TableCell(board.labels[key])]
-        for place in ((key, sequence) for sequence in board.sequences):
-            runs = board.cells[key].get(place[1])
-            for kind, values in measures.items():
-                if runs is not None and not runs.success:
-                    cells.append(TableCell(emphasis="failed", tip=runs.ending))
-                elif runs is None or place not in values:
-                    cells.append(TableCell())
-                else:
-                    cells.append(shown(runs, place, kind))
-        rows.append(cells)
+
+    def shown(place: tuple[str, str], kind: str) -> TableCell:
+        cell, value = board.cells[place[0]].get(place[1]), measures[kind].get(place)
+        if cell is not None and not cell.success:
+            return TableCell(emphasis="failed", tip=cell.ending)
+        if cell is None or value is None:
+            return TableCell()
+        mark = marks.get(kind, {}).get(place, "")
+        return TableCell(text(value) + behind(cell), value=value, emphasis=mark, tip=tip(cell))
+
+    rows = [
+        [TableCell(board.labels[key]), *(shown((key, name), kind) for name in board.sequences for kind in measures)]
+        for key in keys
+    ]
     muted = board.unranked_rows(keys)
     ranked = len(keys) - len(muted)
     separators = {ranked} if 0 < ranked < len(rows) else set()
@@ -430,13 +422,13 @@ def _sequence_table(
 
 def medians(board: Board, value: Value) -> dict[tuple[str, str], float]:
     """Median of a number over the runs that count and succeeded, by tracker and sequence."""
-    of_cell = {}
-    for key, cells in board.cells.items():
-        for name, cell in cells.items():
-            middle_value = middle(value(row) for row in cell.kept if not row.failed)
-            if middle_value is not None and name in board.sequences:
-                of_cell[key, name] = middle_value
-    return of_cell
+    of_cell = {
+        (key, name): middle(value(row) for row in cell.kept if not row.failed)
+        for key, cells in board.cells.items()
+        for name, cell in cells.items()
+        if name in board.sequences
+    }
+    return {place: number for place, number in of_cell.items() if number is not None}
 
 
 def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis]:
@@ -465,8 +457,9 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     )
     rows = []
     for key in board.trackers:
-        cells = [_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences]
-        rows.append([TableCell(board.labels[key], tag="imported" * board.first(key).imported), *cells])
+        name_cell = TableCell(board.labels[key], tag="imported" * board.first(key).imported)
+        errors = (_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences)
+        rows.append([name_cell, *errors])
     rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
     separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
     for (name, tag), published in grouped(reported, lambda cell: (cell.system, cell.tag)).items():
@@ -538,24 +531,23 @@ def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
 
 def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
     """One table for each relative error of the protocol and each of its parts."""
-    tables = []
-    for spec in protocol.rpe:
-        for part, unit, name in (("trans", "m", "translation"), ("rot", "deg", "rotation")):
-            metric = spec.metric(part)
-            per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 or spec.rate else ""
-            table = metric_table(
-                board,
-                lambda row, metric=metric: row.metrics.get(metric),  # type: ignore[misc]
-                f"rpe_{spec.key}_{part}",
-                f"Relative pose error over {spec.describe()}: {name}",
-                f"RMSE in {'mm' if unit == 'm' else '°'}{per}, median over the runs that succeeded, on the frames that "
-                f"they tracked. {protocol.describe()}.",
-                unit=f"RMSE, {'mm' if unit == 'm' else '°'}{per}",
-                text=mm if unit == "m" else significant_text,
-            )
-            if table is not None:
-                tables.append(table)
-    return tables
+
+    def table(spec: RPESpec, part: str, unit: str, name: str) -> Table | None:
+        per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 or spec.rate else ""
+        return metric_table(
+            board,
+            lambda row: row.metrics.get(spec.metric(part)),
+            f"rpe_{spec.key}_{part}",
+            f"Relative pose error over {spec.describe()}: {name}",
+            f"RMSE in {unit}{per}, median over the runs that succeeded, on the frames that they tracked. "
+            f"{protocol.describe()}.",
+            unit=f"RMSE, {unit}{per}",
+            text=mm if unit == "mm" else significant_text,
+        )
+
+    parts = (("trans", "mm", "translation"), ("rot", "°", "rotation"))
+    tables = [table(spec, *part) for spec in protocol.rpe for part in parts]
+    return [table for table in tables if table is not None]
 
 
 def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -588,16 +580,10 @@ def false_motion(board: Board, protocol: Protocol) -> Table | None:
     if not farthest:
         return None
     values = {"farthest": farthest, "path": medians(board, lambda row: row.metrics.get("false_motion_path_m"))}
-    marks = {kind: column_marks(board, numbers) for kind, numbers in values.items()}
     still = {name for _, name in farthest}
-
-    def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
-        return TableCell(mm(values[kind][place]), value=values[kind][place], emphasis=marks[kind].get(place, ""))
-
     return _sequence_table(
         replace(board, sequences=[name for name in board.sequences if name in still]),
         values,
-        shown,
         "false_motion",
         "False motion before a fixed camera",
         "Of the estimated poses of a camera that stands still: the largest distance from the first one, and the length "
@@ -633,7 +619,7 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
     cell = board.cells[key].get(sequence)
     if cell is None:
         return TableCell("–", emphasis="muted", tip="not run")
-    coverage = f"coverage {coverage_text(mean_coverage(cell.rows))}"
+    coverage = f"coverage {coverage_text(mean_of(row.coverage for row in cell.rows))}"
     link = run_link(cell.typical)
     count = "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
     if not cell.success:
@@ -641,10 +627,11 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
     if cell.median is None:
         return TableCell("", emphasis="muted")
+    skipped = mean_of(row.epipolar_skipped for row in cell.rows)
     notes = [
         _spread(cell),
         count,
-        skipped_words(cell),
+        "" if skipped is None else f"F skipped {percent(skipped)}",
         "no better than a static camera" * board.no_better_than_static(key, sequence),
         f"{cell.success}/{len(cell.rows)} succeeded" if cell.failed else "",
     ]
@@ -696,14 +683,17 @@ def failure_rule_table(board: Board) -> Table | None:
         "failures left out too": lambda row: None if row.failed else _tracked_error(row),
     }
     columns = [*texts("tracker"), *(column for name in rules for column in numbers("#", "ATE ratio", group=name))]
-    rows = [[TableCell(board.labels[key])] for key in board.ranked]
-    for rule in rules.values():
-        standings = {standing.key: standing for standing in rank(board, board.ranked, board.ranked, rule)}
-        for key, cells in zip(board.ranked, rows, strict=True):
-            if key in standings:
-                cells += [rank_cell(standings[key]), interval_cell(standings[key].ratio, ".2f")]
-            else:
-                cells += [TableCell(), TableCell()]
+    placed = [{s.key: s for s in rank(board, board.ranked, board.ranked, rule)} for rule in rules.values()]
+
+    def shown(standing: Standing | None) -> list[TableCell]:
+        if standing is None:
+            return [TableCell(), TableCell()]
+        return [rank_cell(standing), interval_cell(standing.ratio, ".2f")]
+
+    rows = [
+        [TableCell(board.labels[key]), *(cell for standings in placed for cell in shown(standings.get(key)))]
+        for key in board.ranked
+    ]
     return Table(
         "failure_rules",
         "Sensitivity to the rule for lost frames and failures",
@@ -787,10 +777,8 @@ def _spread_cells(board: Board, key: str) -> list[TableCell]:
     counts = [TableCell(board.labels[key]), number(len(several)), number(copies)]
     if not several:
         return [*counts, *[TableCell()] * 4] if copies else []
-    spreads = {}
-    for name, cell in several.items():
-        errors = [row.score_m or 0.0 for row in cell.succeeded]
-        spreads[name] = max(errors) / max(min(errors), FLOOR_M)
+    errors = {name: [row.score_m or 0.0 for row in cell.succeeded] for name, cell in several.items()}
+    spreads = {name: max(values) / max(min(values), FLOOR_M) for name, values in errors.items()}
     widest = max(spreads, key=lambda name: (spreads[name], name))
     size = f"{median(len(cell.succeeded) for cell in several.values()):g}"
     ratios = [number(median(spreads.values()), ".2f"), number(spreads[widest], ".2f")]
@@ -859,18 +847,15 @@ def time_table(board: Board) -> Table | None:
         "not define its own; its numbers are 100 times one minus the standard deviation in metres.) Time: median of a "
         "frame, segmentation included, decoding excluded. Runs that succeeded."
     )
-
-    def shown(_: Cell, place: tuple[str, str], kind: str) -> TableCell:
-        return number(measures[kind][place], ".1f")
-
     return _sequence_table(
         board,
         measures,
-        shown,
         "paper_accuracy",
         "Accuracy, error and time",
         caption,
         "Error in percent of a static camera, accuracy, and time of a frame",
+        text="{:.1f}".format,
+        marks={},
     )
 
 
@@ -889,24 +874,14 @@ def _statistics_table(
     }
     if not errors["rmse"]:
         return None
-    marks = {kind: column_marks(board, values) for kind, values in errors.items()}
-
-    def shown(cell: Cell, place: tuple[str, str], kind: str) -> TableCell:
-        error = errors[kind][place]
-        return TableCell(
-            mm(error) + SEEN * cell.in_training + LOST_MARK * has_lost(cell),
-            value=error,
-            emphasis=marks[kind].get(place, ""),
-        )
-
     table = _sequence_table(
         board,
         errors,
-        shown,
         name,
         title,
         f"{source} Millimetres (metres in the CSV), median over the runs that succeeded.",
         brief,
+        behind=lambda cell: SEEN * cell.in_training + LOST_MARK * has_lost(cell),
     )
     if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
         table.caption += f" {LOST_NOTE}"
@@ -920,14 +895,15 @@ def _statistics_table(
         "the other tracker."
     )
     table.separators |= {len(table.rows)}
+
+    def gain(other: str, sequence: str, values: Values) -> float | None:
+        ours, theirs = values.get((subject, sequence)), values.get((other, sequence))
+        return None if ours is None or not theirs else 100 * (theirs - ours) / theirs
+
     for other in others:
-        cells = [TableCell(f"improvement on {board.labels[other]}")]
-        for sequence in board.sequences:
-            for values in errors.values():
-                ours, theirs = values.get((subject, sequence)), values.get((other, sequence))
-                gain = None if ours is None or not theirs else 100 * (theirs - ours) / theirs
-                cells.append(number(gain, ".1f", " %"))
-        table.rows.append(cells)
+        gains = (gain(other, sequence, values) for sequence in board.sequences for values in errors.values())
+        name_cell = TableCell(f"improvement on {board.labels[other]}")
+        table.rows.append([name_cell, *(number(percents, ".1f", " %") for percents in gains)])
     return table
 
 
@@ -942,12 +918,6 @@ def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]
         for name in board.sequences
         for kind in kinds
     ]
-
-
-def skipped_words(cell: Cell) -> str:
-    """On which share of the frames the fundamental matrix was not used, e.g. ``F skipped 98 %``; empty for none."""
-    share = mean_skipped(cell.rows)
-    return "" if share is None else f"F skipped {percent(share)}"
 
 
 def has_lost(cell: Cell | None) -> bool:

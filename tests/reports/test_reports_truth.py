@@ -103,16 +103,11 @@ def uneven():
     return [*rows, row("a", "v", 0.1), row("new", "s", 0.05, frames=(0, 60))]
 
 
-def test_one_more_sequence_takes_nobodys_rank():
+def test_one_more_sequence_takes_nobodys_rank_and_missing_cells_are_named_with_the_commands_that_fill_them():
     board = make_board(uneven())
     assert [board.labels[k] for k in board.ranked] == ["A", "B", "ORB-SLAM2"]
-    assert board.common == ["s", "t", "u"]
-    assert board.reference_name == "ORB-SLAM2"
+    assert (board.common, board.reference_name) == (["s", "t", "u"], "ORB-SLAM2")
     assert make_board(uneven(), on="all").ranked == []
-
-
-def test_missing_cells_are_named_with_the_commands_that_fill_them():
-    board = make_board(uneven())
     note = missing_note(board)
     assert note.startswith("The ranking stands on the 3 of 5 sequences that all ranked trackers have.")
     assert "others' sequences: NEW." in note and "B on s [0:60], v" in note
@@ -325,19 +320,6 @@ def test_what_is_no_better_than_not_moving_is_named():
     assert not any("no better" in text for name in ("GOOD", "CONTROL", "FLAKY") for text in small[name])
 
 
-def test_recordings_that_share_a_folders_name_keep_their_columns(store, tmp_path):
-    for place, error in (("/data/chess/seq-01", 0.01), ("/data/fire/seq-01", 0.2)):
-        for tracker in ("a", "b"):
-            add_run(store, tracker, "folder/seq-01", error=error, content=place, block=place[6:11], place=place)
-    paths = build_report(store, tmp_path / "report")
-    table = {r["tracker"]: r for r in rows_of(paths.csv["per_sequence"])}
-    assert float(table["a"]["chess/seq-01"]) < 0.05 < float(table["a"]["fire/seq-01"])
-    assert len(rows_of(paths.csv["runs"])) == 4
-    assert "Left out" not in paths.markdown.read_text()
-    found = compare(store, store)
-    assert {cells[1].text for cells in found.table.rows} == {"chess/seq-01", "fire/seq-01", "all 2 sequences"}
-
-
 def test_columns_of_two_cameras_are_named_by_them(store):
     right = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0}
     add_run(store, "a", "folder/s", camera=right, block="right")
@@ -542,14 +524,6 @@ def seen(tmp_path):
 )
 def test_what_the_embedded_network_was_trained_on(source, sequence, seen):
     assert seen_in_training(source, sequence) is seen
-
-
-def test_such_cells_do_not_rank_unless_asked_for(seen):
-    board = load_board(seen)
-    names = {board.first(key).tracker.id: key for key in board.labels}
-    assert board.common == [NEW] and set(board.ranked) == set(names.values())
-    everything = load_board(seen, rank_seen=True)
-    assert set(everything.common) == {OLD, NEW} and len(everything.ranked) == 4
 
 
 def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ranked(tmp_path):

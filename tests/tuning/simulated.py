@@ -45,6 +45,19 @@ def make_spec(**changes: object) -> StudySpec:
     return StudySpec.model_validate({**values, **changes})
 
 
+def toy_spec(**changes: object) -> StudySpec:
+    """A study of a few real runs on recordings, each from one start."""
+    values = {
+        "name": "toy",
+        "trials": 2,
+        "held_out": [],
+        "space": {"include": ["gain"]},
+        "offsets": [0],
+        "pruner": "none",
+    }
+    return make_spec(**values | changes)
+
+
 def nothing(settings: Mapping[str, Any]) -> float:
     """No setting is better or worse than another."""
     return 0.0

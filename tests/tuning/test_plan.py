@@ -15,7 +15,7 @@ import pytest
 import simulated
 import toy_tracker
 from optuna.trial import TrialState
-from simulated import SimulatedTuner, make_spec, valley
+from simulated import TRACKER, SimulatedTuner, make_spec, toy_spec, valley
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core.errors import DynslamError, StudyError
@@ -36,16 +36,15 @@ from dynslam_bench.tuning.study_file import (
     scenes,
 )
 
-TRACKER = f"{toy_tracker.__file__}:SPEC"
-
 
 def make(folders: list[str], **changes: object) -> StudySpec:
-    values: dict[str, object] = {
-        "name": "toy", "tracker": TRACKER, "tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:],
-        "trials": 2, "space": {"include": ["gain"]}, "offsets": [0], "pruner": "none", "min_coverage": None,
-        "recorded": [], "sampler": "random",
-    }  # fmt: skip
-    return StudySpec.model_validate({**values, **changes})
+    splits = {"tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:]}
+    return toy_spec(**splits | changes)
+
+
+def check(tune: list[str], held_out: list[str]) -> None:
+    study = toy_spec(tune=tune, held_out=held_out)
+    check_splits(study.name, {"tune": study.instances(*study.tune), "held_out": study.instances(*study.held_out)})
 
 
 def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(folders: list[str], tmp_path: Path) -> None:
@@ -194,20 +193,6 @@ def test_any_trial_is_a_preset(tmp_path: Path) -> None:
         read_preset_text(spec, tmp_path, trial=9)
 
 
-def test_a_pruned_trial_is_a_preset_too(folders: list[str], tmp_path: Path) -> None:
-    spec = make(folders, trials=2, start=[{"gain": 3.0}], tune=folders[:5], confirm=[], held_out=[], pruner="wilcoxon")
-    trial = run_study(spec, results=tmp_path).study.get_trials()[1]
-    assert trial.state == TrialState.PRUNED and trial.params == {"gain": 3.0}
-    text = read_preset_text(spec, tmp_path, trial=1)
-    assert "gain = 3.0" in text and 'status = "not judged"' in text
-
-
-def test_a_baseline_that_crashes_is_one_clear_line(folders: list[str], tmp_path: Path) -> None:
-    (tmp_path / "crash.toml").write_text('mode = "crash"\n')
-    with pytest.raises(StudyError, match=r"the baseline fails: .*the toy broke"):
-        run_study(make(folders, baseline=str(tmp_path / "crash.toml")), results=tmp_path)
-
-
 def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_path: Path) -> None:
     spec = make(folders, trials=2, start=[{"mode": "crash"}], space={"include": ["mode"]})
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -262,31 +247,11 @@ def test_a_baseline_that_crashes_where_it_judges_is_one_clear_line(tmp_path: Pat
 WALK = "synthetic/walking_xyz"
 
 
-def spec(tune: list[str], held_out: list[str], **changes: object) -> StudySpec:
-    values: dict[str, object] = {
-        "name": "toy", "tracker": TRACKER, "tune": tune, "held_out": held_out, "trials": 2, "top": 1,
-        "space": {"include": ["gain"]}, "pruner": "none", "min_coverage": None, "offsets": [0], "recorded": [],
-    }  # fmt: skip
-    return StudySpec.model_validate({**values, **changes})
-
-
-def check(tune: list[str], held_out: list[str]) -> None:
-    study = spec(tune, held_out)
-    check_splits(study.name, {"tune": study.instances(*study.tune), "held_out": study.instances(*study.held_out)})
-
-
 @pytest.mark.parametrize("other", ["?scene=0", "?scene=000", "@0", "?scene=0&frames=50", "?frames=10&noise=3", ""])
 def test_rendered_sequences_overlap_in_every_spelling(other: str) -> None:
     with pytest.raises(StudyError, match=r"^[^\n]*are the same sequence") as caught:
         check([WALK], [f"{WALK}{other}"])
     assert f"'{WALK}'" in str(caught.value), "both spellings"
-
-
-def test_a_path_is_a_spelling_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    toy_tracker.make_sequence(tmp_path / "toys" / "a", 0.3)
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(StudyError, match="are the same sequence"):
-        check(["./toys/a"], [str(tmp_path / "toys" / ".." / "toys" / "a")])
 
 
 def test_a_copy_is_the_same_recording(tmp_path: Path) -> None:

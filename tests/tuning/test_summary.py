@@ -15,12 +15,11 @@ import numpy as np
 import optuna
 import pytest
 import simulated
-import toy_tracker
 from optuna.trial import TrialState
 from reports_browser import Browser, needs_browser
 from scipy import stats
 from scipy.stats import mstats
-from simulated import SimulatedTuner, make_spec
+from simulated import SimulatedTuner, make_spec, toy_spec
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core.errors import StudyError
@@ -56,7 +55,6 @@ from dynslam_bench.tuning.page import fewer_starts, settings_table, warnings_of
 from dynslam_bench.tuning.splits import Design, with_more_starts
 from dynslam_bench.tuning.storage import FEWEST_TRIALS, importances, open_storage
 
-TRACKER = f"{toy_tracker.__file__}:SPEC"
 CONFIRM = Ratio(ratio=0.7, low=0.6, high=0.82, n=8, sequences=4, bound=0.85)
 
 
@@ -222,11 +220,10 @@ def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
 
 
 def test_a_study_is_a_frame(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    spec = StudySpec.model_validate({
-        "name": "toy", "tracker": TRACKER, "tune": folders[:1], "held_out": folders[1:5], "trials": 5, "top": 1,
-        "sampler": "random", "sampler_seed": 3, "pruner": "none", "min_coverage": 0.5, "recorded": [],
-        "space": {"include": ["gain", "mode", "anger"], "fixed": {"wobble": 0}},
-    })  # fmt: skip
+    spec = toy_spec(
+        tune=folders[:1], held_out=folders[1:5], trials=5, top=1, sampler_seed=3, min_coverage=0.5, offsets=[0, 3],
+        space={"include": ["gain", "mode", "anger"], "fixed": {"wobble": 0}},
+    )  # fmt: skip
     tuner = run_study(spec, results=tmp_path)
     summary = finish(tuner)
     tuner.study.set_user_attr("command", ["/home/x/venv/bin/dynslam-bench", "tune", "run", "my study.toml"])
@@ -249,12 +246,6 @@ def test_a_study_is_a_frame(folders: list[str], tmp_path: Path, capsys: pytest.C
     assert frame["params.gain"].tolist() == [trial.params["gain"] for trial in trials]
     complete = frame["state"] == "complete"
     assert frame["feasible"].notna().tolist() == complete.tolist() == frame["reason"].isna().tolist()
-
-
-def test_a_study_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
-    for study in (StudySpec(name="none", tune=("a",)), tmp_path):
-        with pytest.raises(StudyError, match="no study"):
-            Study.open(study, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -20,13 +20,12 @@ from unittest.mock import patch
 import numpy as np
 import optuna
 import pytest
-import toy_tracker
 from optuna.trial import FrozenTrial, TrialState
-from simulated import SimulatedTuner, make_spec, nothing, valley
+from simulated import SimulatedTuner, make_spec, nothing, toy_spec, valley
 from sqlalchemy.exc import OperationalError
 
 from dynslam_bench.core.errors import StudyError
-from dynslam_bench.tuning import ProblemInstance, Study, StudySpec, Verdict, finish, parse_instances, run_study, storage
+from dynslam_bench.tuning import ProblemInstance, Study, Verdict, finish, parse_instances, storage
 from dynslam_bench.tuning.objectives import ACCURACY
 from dynslam_bench.tuning.storage import Heartbeats, PatientStorage, open_database, worker_name
 from dynslam_bench.tuning.study import CRASHED_WORKER, StudyEvent
@@ -38,14 +37,6 @@ storage.HEARTBEAT_S, storage.GRACE_S = 0.5, 4.0
 if __name__ == "__main__":
     run_study(StudySpec.model_validate_json(sys.argv[1]), results=sys.argv[2])
 """
-
-
-@pytest.fixture
-def spec(folders: list[str]) -> StudySpec:
-    return StudySpec(
-        name="toy", tracker=f"{toy_tracker.__file__}:SPEC", tune=folders[:1], confirm=folders[1:2], trials=3,
-        space={"include": ["gain"]}, offsets=[0], pruner="none", min_coverage=None, recorded=[],
-    )  # fmt: skip
 
 
 @pytest.fixture
@@ -83,11 +74,9 @@ def test_a_worker_elsewhere_is_dead_once_it_counts_no_more(quick: None, monkeypa
     assert dead_after(2.5) == {alive.number, silent.number, nameless.number}
 
 
-def test_running_trials_are_shown_with_their_workers(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_running_trials_are_shown_with_their_workers(quick: None, dead: str, monkeypatch: pytest.MonkeyPatch) -> None:
     study = optuna.create_study()
-    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
-        pass
-    names = [worker_name(), f"{worker_name().rpartition(':')[0]}:{ended.pid}", "there:1", "there:2"]
+    names = [worker_name(), dead, "there:1", "there:2"]
     for name in names:
         running(study, name)
     heartbeats = Heartbeats(study)
@@ -98,23 +87,6 @@ def test_running_trials_are_shown_with_their_workers(quick: None, monkeypatch: p
         states = heartbeats.running()
     ends = zip(names, ("alive", "dead", "alive", "silent"), strict=True)
     assert states == {number: f"{name}, {end}" for number, (name, end) in enumerate(ends)}
-
-
-def test_a_worker_here_is_dead_with_its_process() -> None:
-    study = optuna.create_study()
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    trials = [running(study, worker_name()), running(study, f"{worker_name().rpartition(':')[0]}:{child.pid}")]
-    child.wait()
-    heartbeats = Heartbeats(study)
-    assert [heartbeats.is_dead(study.trials[trial.number]) for trial in trials] == [False, True]
-
-
-def test_the_trial_of_a_worker_that_died_elsewhere_is_made_again(spec: StudySpec, tmp_path: Path, quick: None) -> None:
-    lost = Study(spec, tmp_path).ask()
-    lost.set_user_attr("worker", "elsewhere:7")
-    trials = run_study(spec, results=tmp_path).study.get_trials()
-    assert [trial.state for trial in trials] == [TrialState.FAIL, *[TrialState.COMPLETE] * 3]
-    assert trials[0].user_attrs["reason"] == CRASHED_WORKER
 
 
 @pytest.mark.parametrize("answers_after", [2, None])
@@ -175,9 +147,9 @@ def postgres() -> Iterator[Postgres]:
 
 
 def test_a_killed_worker_and_a_restarted_database_lose_no_trial(
-    spec: StudySpec, tmp_path: Path, postgres: Postgres
+    folders: list[str], tmp_path: Path, postgres: Postgres
 ) -> None:
-    spec = spec.model_copy(update={"storage": postgres.url, "trials": 10})
+    spec = toy_spec(tune=folders[:1], confirm=folders[1:2], storage=postgres.url, trials=10)
     (tmp_path / "worker.py").write_text(WORKER)
     command = [sys.executable, str(tmp_path / "worker.py"), spec.model_dump_json()]
     elsewhere = ["unshare", "--uts", "--pid", "--fork", "--kill-child", "--mount-proc", "sh", "-c"]
