@@ -1,7 +1,7 @@
 """Gymnasium environments, wrappers and rendering.
 
 Importing this package registers ``dynslam/<sequence>-v0`` for every listed sequence, ``dynslam/Sequence-v0``, and the
-benchmarks ``dynslam/masks-v0`` and ``dynslam/features-v0``; in worker processes write
+benchmarks ``dynslam/masks-v0``, ``dynslam/features-v0`` and ``dynslam/budget-v0``; in worker processes write
 ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequence=...)``.
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -135,7 +135,13 @@ _BENCHMARKS = (
         stride=2,
     ),
 )
-CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType({each.id: each for each in _BENCHMARKS})
+_FALLING = replace(
+    _BENCHMARKS[1],
+    id="budget-v0",
+    summary=f"{_BENCHMARKS[1].summary}, and keypoints cost five times as much at the end",
+    reward=AccuracyMinusCost(weight=0.001, cost="keypoints", growth=4 / 119),
+)
+CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType({b.id: b for b in (*_BENCHMARKS, _FALLING)})
 """The benchmarks by id."""
 
 

@@ -58,18 +58,24 @@ class AccuracyMinusCost:
     """``neg_rpe`` minus what the frame cost.
 
     Attributes:
-        weight: Metres that one unit of the cost counts as.
+        weight: Metres that one unit of the cost counts as on the episode's first frame.
         cost: ``network_calls``: 1 where the segmentation network ran (``segmented`` of the tracker's stats);
             ``keypoints``: thousands of extracted keypoints (``keypoints``), which processor time grows with; both are
             the same on every machine. ``processor_s``: seconds of processor time, which differ from run to run.
+        growth: Share of `weight` that is added to it with every frame: the budget of a frame falls.
     """
 
     weight: float = 0.001
     cost: Literal["network_calls", "keypoints", "processor_s"] = "network_calls"
+    growth: float = 0.0
 
     def __call__(self, episode: Episode) -> float:
         """What the newest frame earns."""
-        return neg_rpe(episode) - self.weight * self.cost_of(episode.outcomes[-1])
+        return neg_rpe(episode) - self.charge(episode.outcomes[-1])
+
+    def charge(self, outcome: FrameOutcome) -> float:
+        """Metres that a frame's cost counts as."""
+        return self.weight * (1.0 + self.growth * outcome.index) * self.cost_of(outcome)
 
     def cost_of(self, outcome: FrameOutcome) -> float:
         """What a frame cost, in units of the cost."""
