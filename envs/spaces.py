@@ -123,12 +123,11 @@ class ActionMap:
 def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]:
     if isinstance(control, str):
         raise SettingsError(f"control is the string '{control}'", "give a list of setting names")
-    tunable = {parameter.name: parameter for parameter in parameters(type(settings))}
-    online = {name: parameter for name, parameter in tunable.items() if parameter.online}
+    online = {parameter.name: parameter for parameter in parameters(type(settings), online_only=True)}
     chosen = []
     for name in control:
         if name not in online:
-            if name in tunable or name in flatten(settings):
+            if name in flatten(settings):
                 raise SettingsError(f"setting '{name}' may not change in mid-episode", did_you_mean(name, online))
             hint = did_you_mean(name, online) or "this tracker has no online settings"
             raise SettingsError(f"unknown setting '{name}' in control", hint)

@@ -170,7 +170,8 @@ class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
     """Makes the action the choice of one of a few settings, ``Discrete(n)``.
 
     "Segment now?" is ``[{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}]`` with a setting
-    ``segmentation.n`` that no episode reaches.
+    ``segmentation.n`` that no episode reaches. "Keyframe now?" is ``[{"backend.keyframes.schedule": "none"},
+    {"backend.keyframes.schedule": "every"}]``: the frame of the step becomes one if it is tracked.
 
     Args:
         env: A `SlamEnv`, wrapped or not, made with ``control``.

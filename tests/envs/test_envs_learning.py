@@ -396,20 +396,21 @@ def test_every_reward_passes_the_checker(reward: Any) -> None:
 # Choices.
 
 
-def test_segment_now_or_not_is_an_action() -> None:
-    env = DiscreteActions(
-        SlamEnv(
-            "synthetic/sitting_xyz?frames=9",
-            "mask-rcnn",
-            settings={"segmentation.source": "oracle", "segmentation.n": 1000},
-            control=["segmentation.schedule"],
-        ),
-        [{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}],
-    )
+@pytest.mark.parametrize(
+    ("setting", "choices", "stat"),
+    [
+        ("segmentation.schedule", ("every_nth", "every"), "segmented"),
+        ("backend.keyframes.schedule", ("none", "every"), "keyframe"),
+    ],
+)
+def test_segment_now_and_keyframe_now_are_actions(setting: str, choices: tuple[str, str], stat: str) -> None:
+    settings = {"segmentation.source": "oracle", "segmentation.n": 1000}
+    inner = SlamEnv("synthetic/sitting_xyz?frames=9", "mask-rcnn", settings=settings, control=[setting])
+    env = DiscreteActions(inner, [{setting: choice} for choice in choices])
     assert env.action_space == gym.spaces.Discrete(2)
     env.reset(seed=0)
     actions = [0, 1, 0, 0, 1, 1, 0, 0]
-    assert [int(env.step(action)[4]["stats"]["segmented"]) for action in actions] == actions
+    assert [int(env.step(action)[4]["stats"][stat]) for action in actions] == actions
 
 
 def test_a_choice_leaves_what_it_does_not_name() -> None:
