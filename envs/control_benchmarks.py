@@ -10,6 +10,7 @@ from typing import Any, Literal
 import gymnasium as gym
 
 from dynslam_bench.core import SettingsError
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.envs.rewards import AccuracyMinusCost
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler
@@ -50,6 +51,7 @@ class ControlBenchmark:
     frames: tuple[int, int]
     stride: int
 
+    @names_wrong_arguments
     def make(
         self, split: Split = "train", index: int | Sequence[int] | None = None, **arguments: Any
     ) -> gym.Env[Any, Any]:
@@ -145,6 +147,7 @@ CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType({b.id: b f
 """The benchmarks by id."""
 
 
+@names_wrong_arguments
 def control_benchmark(id: str) -> ControlBenchmark:
     """The benchmark of an id.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Camera, Frame, TrackResult
 from dynslam_bench.core import SettingsError, did_you_mean
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.core.settings import (
     Parameter,
     Scalar,
@@ -48,6 +49,7 @@ class ActionMap:
             with these settings, or has a value outside the range that actions span.
     """
 
+    @names_wrong_arguments
     def __init__(self, settings: Settings, control: Sequence[str]) -> None:
         self.base = settings
         self.parameters: tuple[Parameter, ...] = _select(settings, control)

@@ -324,10 +324,10 @@ def _explain(cls: type[Settings], error: ValidationError) -> SettingsError:
     if first["type"] == "extra_forbidden":
         return SettingsError(f"unknown setting '{name}'", did_you_mean(name, field_names(cls)))
     message = first["msg"][0].lower() + first["msg"][1:]
-    return SettingsError(f"setting '{name}' is {_shown(first['input'])}: {message}")
+    return SettingsError(f"setting '{name}' is {shown(first['input'])}: {message}")
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """A value for a message; one of thousands of digits or characters is cut short."""
     try:
         text = repr(value)
