@@ -58,9 +58,7 @@ class TrackingSettings(Settings):
 class KeyframeSettings(Settings):
     """When a frame becomes a keyframe, and when a keyframe is redundant."""
 
-    schedule: Literal["rule", "every", "none"] = online_choice(
-        "rule", meaning="tracked frames that become keyframes: the rule's, all, or none once the map has begun"
-    )
+    schedule: Literal["rule", "every", "none"] = online_choice("rule", meaning="tracked frames that become keyframes")
     max_gap: int = tunable(
         30,
         low=10,
