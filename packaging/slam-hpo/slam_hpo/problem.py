@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 
 from slam_hpo.real import run
-from slam_hpo.spaces import FRAMES, SEQUENCES, SPLITS, STARTS, SlamHpoError, defaults, known
+from slam_hpo.spaces import FRAMES, SEQUENCES, SPLITS, STARTS, SlamHpoError, defaults, known, whole
 from slam_hpo.table import METRICS, load, natural
 
 Source = Literal["surrogate", "run"]
@@ -59,7 +59,7 @@ class Problem(optunahub.benchmarks.BaseProblem):
 
     def reseed(self, seed: int | None = None) -> None:
         """Draw the noise from another stream."""
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(None if seed is None else whole("seed", seed))
 
     @property
     def search_space(self) -> dict[str, BaseDistribution]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,6 +103,17 @@ def known(name: str, value: Any, choices: Iterable[Any]) -> Any:
         there = f"0 to {every[-1]}" if isinstance(choices, range) else ", ".join(map(str, every))
         raise SlamHpoError(f"{name} {value!r} is not in the benchmark, which has {there}")
     return every[every.index(value)]
+
+
+def whole(name: str, value: Any, least: int = 0) -> int:
+    """The value as an int.
+
+    Raises:
+        SlamHpoError: It is no whole number, or below the least.
+    """
+    if not isinstance(value, Integral) or value < least:
+        raise SlamHpoError(f"{name} {value!r} is no whole number >= {least}")
+    return int(value)
 
 
 def defaults(system: str) -> dict[str, Value]:

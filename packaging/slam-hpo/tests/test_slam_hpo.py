@@ -69,6 +69,9 @@ def test_what_is_not_in_the_benchmark_is_named_with_what_is():
         (lambda: bench.configuration(129), "configuration 129 is not in the benchmark, which has 0 to 128"),
         (lambda: bench.noise(61), "frames 61 is not in the benchmark, which has 20, 40, 60"),
         (lambda: bench.noise(60, "rpe"), "metric 'rpe' is not in the benchmark, which has ate_m"),
+        (lambda: Problem(seed="x"), "seed 'x' is no whole number >= 0"),
+        (lambda: MothFlameSampler(n_trials=2.5), "n_trials 2.5 is no whole number >= 1"),
+        (lambda: MothFlameSampler(population=1), "population 1 is no whole number >= 2"),
         (lambda: bench.units(5), "the settings are 5: give a value for each of features.n_features"),
     ):
         with pytest.raises(slam_hpo.SlamHpoError, match=message):
