@@ -468,6 +468,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     @names_wrong_arguments
     def _use_settings(self, settings: Mapping[str, Any] | Settings | None, before: Settings | None = None) -> None:
+        if before is not None and not isinstance(settings, Settings):
+            settings = apply_overrides(before, settings or {})
         if isinstance(settings, Settings):
             if not isinstance(settings, self.tracker_spec.settings):
                 raise SettingsError(
@@ -476,8 +478,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 )
             settings.verify()
             self.settings: Settings = settings
-        elif before is not None:
-            self.settings = apply_overrides(before, settings or {})
         else:
             self.settings = resolve_settings(self.tracker_spec, settings)
         self._actions = ActionMap(self.settings, self._control)

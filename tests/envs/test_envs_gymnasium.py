@@ -16,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 import dynslam_bench.envs
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.envs import (
+    CONTROL_BENCHMARKS,
     GENERIC_ID,
     REWARDS,
     AccuracyMinusCost,
@@ -66,7 +67,7 @@ def test_all_listed_sequences_are_registered_and_registering_again_changes_nothi
     assert dict(gym.registry) == before
     assert ids[0] == "dynslam/Sequence-v0"
     assert {"dynslam/tum-fr3-walking_xyz-v0", "dynslam/synthetic-walking_xyz-v0", "dynslam/bonn-crowd-v0"} <= set(ids)
-    assert len(ids) == len(set(ids)) == 3 + len(sequence_ids())
+    assert len(ids) == len(set(ids)) == 1 + len(CONTROL_BENCHMARKS) + len(sequence_ids())
     assert all(gym.spec(name).max_episode_steps is None for name in ids)
 
 
