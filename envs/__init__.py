@@ -1,13 +1,14 @@
 """Gymnasium environments, wrappers and rendering.
 
 Importing this package registers ``dynslam/<sequence>-v0`` for every listed sequence, ``dynslam/Sequence-v0``, and the
-benchmarks ``dynslam/masks-v0`` and ``dynslam/features-v0``; in worker processes write
+benchmarks ``dynslam/masks-v0``, ``dynslam/features-v0`` and ``dynslam/budget-v0``; in worker processes write
 ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequence=...)``.
 """
 
 import gymnasium as gym
 
 from dynslam_bench.contracts import TrackerContractError
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.envs.arguments import resolve_device
 from dynslam_bench.envs.control_benchmarks import (
     CONTROL_BENCHMARKS,
@@ -65,6 +66,7 @@ __all__ = [
 GENERIC_ID = "dynslam/Sequence-v0"
 
 
+@names_wrong_arguments
 def env_id(sequence: str) -> str:
     """The environment id of a listed sequence, e.g. ``dynslam/tum-fr3-walking_xyz-v0``."""
     return f"dynslam/{sequence.replace('/', '-')}-v0"

@@ -9,6 +9,7 @@ import numpy as np
 
 from dynslam_bench.contracts import Sequence, timestamps_ns
 from dynslam_bench.core import SequenceError, SettingsError
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry import refuse_close
 from dynslam_bench.sequences import PreprocessingSettings, SequenceView, open_sequence
@@ -111,7 +112,8 @@ def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
     return group if isinstance(group, PreprocessingSettings) else None
 
 
-def resolve_device(name: str = "auto") -> str:
+@names_wrong_arguments
+def resolve_device(device: str = "auto") -> str:
     """``cpu`` or ``cuda:N`` for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
 
     ``auto`` is the first CUDA device, or the CPU where there is none. Torch is imported only if a driver is present.
@@ -119,18 +121,20 @@ def resolve_device(name: str = "auto") -> str:
     Raises:
         SettingsError: The name is not understood, or the machine has no such device.
     """
-    if name == "cpu":
+    if device == "cpu":
         return "cpu"
-    if name != "auto" and not re.fullmatch(r"cuda(:\d+)?", name):
-        raise SettingsError(f"unknown device '{name}'", "write auto, cpu, cuda or cuda:N")
+    if device != "auto" and not re.fullmatch(r"cuda(:\d+)?", device):
+        raise SettingsError(f"unknown device '{device}'", "write auto, cpu, cuda or cuda:N")
     count = 0
     if any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")):
         import torch
 
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if name == "auto":
+    if device == "auto":
         return "cuda:0" if count else "cpu"
-    index = int(name.partition(":")[2] or 0)
+    index = int(device.partition(":")[2] or 0)
     if index >= count:
-        raise SettingsError(f"device '{name}' was asked for, this machine has {count} CUDA devices", "use --device cpu")
+        raise SettingsError(
+            f"device '{device}' was asked for, this machine has {count} CUDA devices", "use --device cpu"
+        )
     return f"cuda:{index}"

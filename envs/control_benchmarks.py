@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
 import gymnasium as gym
 
 from dynslam_bench.core import SettingsError
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.envs.rewards import AccuracyMinusCost
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler
@@ -50,6 +51,7 @@ class ControlBenchmark:
     frames: tuple[int, int]
     stride: int
 
+    @names_wrong_arguments
     def make(
         self, split: Split = "train", index: int | Sequence[int] | None = None, **arguments: Any
     ) -> gym.Env[Any, Any]:
@@ -135,10 +137,17 @@ _BENCHMARKS = (
         stride=2,
     ),
 )
-CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType({each.id: each for each in _BENCHMARKS})
+_FALLING = replace(
+    _BENCHMARKS[1],
+    id="budget-v0",
+    summary=f"{_BENCHMARKS[1].summary}, and keypoints cost five times as much at the end",
+    reward=AccuracyMinusCost(weight=0.001, cost="keypoints", growth=4 / 119),
+)
+CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType({b.id: b for b in (*_BENCHMARKS, _FALLING)})
 """The benchmarks by id."""
 
 
+@names_wrong_arguments
 def control_benchmark(id: str) -> ControlBenchmark:
     """The benchmark of an id.
 

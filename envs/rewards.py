@@ -1,15 +1,21 @@
 """Rewards: what the newest frame of an episode earns, by name or as a callable of the user's."""
 
+import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from dynslam_bench.core import SettingsError
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.envs.episode import Episode, FrameOutcome
 from dynslam_bench.geometry import se3
 
 Reward = Callable[[Episode], float]
+Cost = Literal["network_calls", "keypoints", "processor_s"]
+COSTS: tuple[str, ...] = get_args(Cost)
 RewardKind = Literal["neg_rpe", "neg_pose_error", "neg_window_error", "accuracy_minus_cost"]
 
 
@@ -30,6 +36,7 @@ def neg_pose_error(episode: Episode) -> float:
     return -min(error.trans_m, error.way_m) if error.tracked else -error.way_m
 
 
+@names_wrong_arguments
 @dataclass(frozen=True)
 class NegWindowError:
     """Minus the translational error of the motion over the last `frames` frames, metres.
@@ -43,6 +50,10 @@ class NegWindowError:
 
     frames: int = 30
 
+    def __post_init__(self) -> None:
+        if operator.index(self.frames) < 1:
+            raise SettingsError(f"a window has {self.frames} frames", "give 1 or more")
+
     def __call__(self, episode: Episode) -> float:
         """What the newest frame earns."""
         now, before = episode.outcomes[-1].error, episode.outcomes[-1 - self.frames :][0].error
@@ -53,23 +64,36 @@ class NegWindowError:
         return -float(np.linalg.norm((se3.inverse(moved) @ estimated)[:3, 3]))
 
 
+@names_wrong_arguments
 @dataclass(frozen=True)
 class AccuracyMinusCost:
     """``neg_rpe`` minus what the frame cost.
 
     Attributes:
-        weight: Metres that one unit of the cost counts as.
+        weight: Metres that one unit of the cost counts as on the episode's first frame.
         cost: ``network_calls``: 1 where the segmentation network ran (``segmented`` of the tracker's stats);
             ``keypoints``: thousands of extracted keypoints (``keypoints``), which processor time grows with; both are
             the same on every machine. ``processor_s``: seconds of processor time, which differ from run to run.
+        growth: Share of `weight` that is added to it with every frame: the budget of a frame falls.
     """
 
     weight: float = 0.001
-    cost: Literal["network_calls", "keypoints", "processor_s"] = "network_calls"
+    cost: Cost = "network_calls"
+    growth: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.cost not in COSTS:
+            raise SettingsError(f"unknown cost '{self.cost}'", f"choose {', '.join(COSTS)}")
+        if not math.isfinite(self.weight * self.growth):
+            raise SettingsError(f"weight {self.weight} and growth {self.growth} are no finite numbers")
 
     def __call__(self, episode: Episode) -> float:
         """What the newest frame earns."""
-        return neg_rpe(episode) - self.weight * self.cost_of(episode.outcomes[-1])
+        return neg_rpe(episode) - self.charge(episode.outcomes[-1])
+
+    def charge(self, outcome: FrameOutcome) -> float:
+        """Metres that a frame's cost counts as."""
+        return self.weight * (1.0 + self.growth * outcome.index) * self.cost_of(outcome)
 
     def cost_of(self, outcome: FrameOutcome) -> float:
         """What a frame cost, in units of the cost."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
@@ -27,6 +28,7 @@ from dynslam_bench.core import (
     TrackerError,
     stage_cache_folder,
 )
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
@@ -138,6 +140,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     """Which frames of `sequence`, as it was opened, they are: the first and one past the last."""
     _whole: FrameSequence
 
+    @names_wrong_arguments
     def __init__(
         self,
         sequence: str | FrameSequence,
@@ -168,7 +171,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if not callable(reward) and reward not in REWARDS:
             raise SettingsError(f"unknown reward '{reward}'", f"choose {' or '.join(REWARDS)}, or give a callable")
         for title, number, least in (("lost_after", lost_after, 1), ("threads", threads, 1), ("window", window, 2)):
-            if number is not None and number < least:
+            if number is not None and operator.index(number) < least:
                 raise SettingsError(f"{title} is {number}", f"give a number >= {least}")
         self.render_mode = render_mode
         self.protocol = get_protocol(protocol)
@@ -211,6 +214,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """Seconds by stage of every frame so far: ``read``, ``total`` and the tracker's stages (see `FrameOutcome`)."""
         return [dict(outcome.timings) for outcome in self.episode.outcomes]
 
+    @names_wrong_arguments
     def action_of(self, values: Mapping[str, Any]) -> NDArray[np.float32]:
         """The action that asks for values of controlled settings, by dotted name; all others stay as they are.
 
@@ -260,6 +264,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         with tracker_code():
             save(Path(path), made_by)
 
+    @names_wrong_arguments
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode and track frame 0.
 
@@ -322,6 +327,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.episode.over = terminated or truncated
         return self._observe(), float(reward), terminated, truncated, self._info()
 
+    @names_wrong_arguments
     def drop_frames(self, count: int) -> float:
         """Let the next `count` frames pass without tracking them, as a camera does while the tracker is busy.
 
@@ -353,6 +359,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         parts = {name: vars(self)[name] for name in _OF_AN_EPISODE}
         return EpisodeState(self._origin(), self._copied(parts, {}))
 
+    @names_wrong_arguments
     def restore_state(self, state: EpisodeState) -> None:
         """Go back to a copied episode; the steps that follow are equal to the bit to those that followed the copy.
 
@@ -459,7 +466,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             ) from error
         return deepcopy(dict(parts), memo)
 
-    def _use_settings(self, settings: Mapping[str, Any] | Settings | None) -> None:
+    @names_wrong_arguments
+    def _use_settings(self, settings: Mapping[str, Any] | Settings | None, before: Settings | None = None) -> None:
+        if before is not None and not isinstance(settings, Settings):
+            settings = apply_overrides(before, settings or {})
         if isinstance(settings, Settings):
             if not isinstance(settings, self.tracker_spec.settings):
                 raise SettingsError(
@@ -472,6 +482,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self.settings = resolve_settings(self.tracker_spec, settings)
         self._actions = ActionMap(self.settings, self._control)
 
+    @names_wrong_arguments
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
         opened = open_frames(sequence, *self._part, preprocessing_of(self.settings), memory_map=self._memory_map)
         check_frames(opened)
@@ -513,9 +524,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self.close()  # the next tracker is built for other settings or another sequence
         preprocessing, camera = preprocessing_of(self.settings), self.sequence.camera
         if "settings" in options:
-            changes = options["settings"]
-            complete = isinstance(changes, Settings)
-            self._use_settings(changes if complete else apply_overrides(self.settings, changes or {}))
+            self._use_settings(options["settings"], self.settings)
             if preprocessing_of(self.settings) != preprocessing:
                 options = {"sequence": self._source, **options}
         if "sequence" in options:

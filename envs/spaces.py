@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Camera, Frame, TrackResult
 from dynslam_bench.core import SettingsError, did_you_mean
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.core.settings import (
     Parameter,
     Scalar,
@@ -48,6 +49,7 @@ class ActionMap:
             with these settings, or has a value outside the range that actions span.
     """
 
+    @names_wrong_arguments
     def __init__(self, settings: Settings, control: Sequence[str]) -> None:
         self.base = settings
         self.parameters: tuple[Parameter, ...] = _select(settings, control)
@@ -123,12 +125,11 @@ class ActionMap:
 def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]:
     if isinstance(control, str):
         raise SettingsError(f"control is the string '{control}'", "give a list of setting names")
-    tunable = {parameter.name: parameter for parameter in parameters(type(settings))}
-    online = {name: parameter for name, parameter in tunable.items() if parameter.online}
+    online = {parameter.name: parameter for parameter in parameters(type(settings), online_only=True)}
     chosen = []
     for name in control:
         if name not in online:
-            if name in tunable or name in flatten(settings):
+            if name in flatten(settings):
                 raise SettingsError(f"setting '{name}' may not change in mid-episode", did_you_mean(name, online))
             hint = did_you_mean(name, online) or "this tracker has no online settings"
             raise SettingsError(f"unknown setting '{name}' in control", hint)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, stage_seconds
 from dynslam_bench.core import SettingsError
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.spaces import MAX_DEPTH_M
@@ -109,6 +111,7 @@ class RecordTrajectory(SlamWrapper):
         return outcome
 
 
+@names_wrong_arguments
 class SequenceSampler(SlamWrapper):
     """Begins every episode on another sequence of a list, for training agents and for evaluation.
 
@@ -166,11 +169,13 @@ class SequenceSampler(SlamWrapper):
         return chosen
 
 
+@names_wrong_arguments
 class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
     """Makes the action the choice of one of a few settings, ``Discrete(n)``.
 
     "Segment now?" is ``[{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}]`` with a setting
-    ``segmentation.n`` that no episode reaches.
+    ``segmentation.n`` that no episode reaches. "Keyframe now?" is ``[{"backend.keyframes.schedule": "none"},
+    {"backend.keyframes.schedule": "every"}]``: the frame of the step becomes one if it is tracked.
 
     Args:
         env: A `SlamEnv`, wrapped or not, made with ``control``.
@@ -196,6 +201,7 @@ class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
         return self._base.action_of(self._actions[int(action)])
 
 
+@names_wrong_arguments
 class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
     """Makes ``rgbd`` observations small 8-bit images, colour and depth, as stable-baselines3 expects images.
 
@@ -251,6 +257,7 @@ class DegradeFrames(SlamWrapper):
         self._base.frame_transforms.append(Degradation(**strengths))
 
 
+@names_wrong_arguments
 @dataclasses.dataclass(frozen=True)
 class Degradation:
     """Degrades frames, the same way for the same index.
@@ -275,6 +282,8 @@ class Degradation:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if operator.index(self.seed) < 0:
+            raise SettingsError(f"the seed of the degradation is {self.seed}, expected a whole number >= 0")
         for name, value in vars(self).items():
             if name != "seed" and not 0.0 <= value <= 1.0:
                 raise SettingsError(f"degradation '{name}' is {value}, expected a strength in [0, 1]")
@@ -347,6 +356,7 @@ WARM_UP_FRAMES = 12
 """Tracked off the clock: enough for keyframes and bundle adjustment, so every kernel and network has run once."""
 
 
+@names_wrong_arguments
 class DropFrames(SlamWrapper):
     """Feeds the tracker only the frames that a live camera would have left it, or drops frames at random.
 

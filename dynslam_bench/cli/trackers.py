@@ -90,15 +90,16 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
         "parameters": parameter_facts(spec.settings),
         "reported": reported,
     }
-    tunable = parameters(spec.settings)
-    fixed = len(flatten(spec.settings())) - len(tunable)
+    shown = parameters(spec.settings)
+    shown += [parameter for parameter in parameters(spec.settings, online_only=True) if not parameter.tunable]
+    fixed = len(flatten(spec.settings())) - len(shown)
     sources = [f"{source} ({count})" for source, count in Counter(row["source"] for row in reported).items()]
-    rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in tunable]
+    rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in shown]
     present(
         facts | details,
         fields(facts | {f"preset {name}": ", ".join(assignments(values)) for name, values in spec.presets.items()}),
         *([table(("setting", "default", "range", "unit", "online", "meaning"), rows)] if rows else []),
-        *([f"and {fixed} settings that no study tunes: see --json"] if fixed else []),
+        *([f"and {fixed} more settings that no study tunes: see --json"] if fixed else []),
         *([wrapped(f"numbers reported in: {', '.join(sources)}; --json lists them")] if sources else []),
     )
 
@@ -111,12 +112,12 @@ def range_text(parameter: Parameter) -> str:
 
 
 def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
-    """Every setting with its default; the tunable ones also with range, scale, unit and meaning."""
+    """Every setting with its default; those tunable or online also with range, scale, unit and meaning."""
     from dynslam_bench.core.settings import flatten, parameters
 
-    tunable = {parameter.name: asdict(parameter) for parameter in parameters(settings)}
+    described = {p.name: asdict(p) for p in (*parameters(settings), *parameters(settings, online_only=True))}
     return [
-        {"name": name, "default": default, "tunable": name in tunable, "online": False} | tunable.get(name, {})
+        {"name": name, "default": default, "tunable": False, "online": False} | described.get(name, {})
         for name, default in flatten(settings()).items()
     ]
 

@@ -75,6 +75,7 @@ class Parameter:
         choices: The values of a categorical.
         unit: Physical unit, empty for none.
         online: Whether it may change in mid-episode.
+        tunable: Whether studies tune it.
         meaning: One line.
     """
 
@@ -87,6 +88,7 @@ class Parameter:
     choices: tuple[Scalar, ...] = ()
     unit: str = ""
     online: bool = False
+    tunable: bool = True
     meaning: str = ""
 
 
@@ -118,6 +120,13 @@ def tunable(
     annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online}
     least, most = (low, high) if limits is None else limits
     return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most)
+
+
+def online_choice(default: Any, *, meaning: str) -> Any:
+    """A field with choices that may change in mid-episode but that no study tunes: a decision for single frames."""
+    field = tunable(default, meaning=meaning, online=True)
+    field.json_schema_extra[_KEY]["tunable"] = False
+    return field
 
 
 def names(default: str, kind: Literal["file", "features", "flow"], *, meaning: str, otherwise: str = "") -> Any:
@@ -215,8 +224,8 @@ def field_names(cls: type[Settings]) -> list[str]:
 
 
 def parameters(cls: type[Settings], *, online_only: bool = False) -> list[Parameter]:
-    """The tunable fields of a settings class, in order of definition."""
-    return [parameter for parameter in _parameters(cls) if parameter.online or not online_only]
+    """The tunable fields of a settings class, or all online ones, in order of definition."""
+    return [parameter for parameter in _parameters(cls) if (parameter.online if online_only else parameter.tunable)]
 
 
 @cache
@@ -226,7 +235,7 @@ def _parameters(cls: type[Settings]) -> tuple[Parameter, ...]:
 
 def settings_table(cls: type[Settings]) -> str:
     """Markdown table of every leaf field: name, default, range, unit, online, meaning."""
-    described = {parameter.name: parameter for parameter in parameters(cls)}
+    described = {parameter.name: parameter for parameter in _parameters(cls)}
     rows = ["| setting | default | range | unit | online | meaning |", "| --- | --- | --- | --- | --- | --- |"]
     for name, field, default in _leaves(cls):
         p = described.get(name)
@@ -315,10 +324,10 @@ def _explain(cls: type[Settings], error: ValidationError) -> SettingsError:
     if first["type"] == "extra_forbidden":
         return SettingsError(f"unknown setting '{name}'", did_you_mean(name, field_names(cls)))
     message = first["msg"][0].lower() + first["msg"][1:]
-    return SettingsError(f"setting '{name}' is {_shown(first['input'])}: {message}")
+    return SettingsError(f"setting '{name}' is {shown(first['input'])}: {message}")
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """A value for a message; one of thousands of digits or characters is cut short."""
     try:
         text = repr(value)

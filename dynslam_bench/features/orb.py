@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -61,30 +59,31 @@ class OrbExtractor:
     """
 
     def __init__(self, settings: FeatureSettings | None = None) -> None:
-        self.settings = settings or FeatureSettings()
-        s = self.settings
+        s = settings or FeatureSettings()
         if s.fast_threshold_min > s.fast_threshold:
             raise SettingsError(
                 f"fast_threshold_min is {s.fast_threshold_min}, above fast_threshold {s.fast_threshold}",
                 "lower fast_threshold_min",
             )
-        self._detector = cv2.FastFeatureDetector.create(s.fast_threshold_min, True)
-        self._describer = cv2.ORB.create(
-            nfeatures=s.n_features, scaleFactor=s.scale_factor, nlevels=s.levels, edgeThreshold=EDGE,
-            firstLevel=0, WTA_K=2, patchSize=2 * PATCH_RADIUS + 1, fastThreshold=s.fast_threshold_min,
-        )  # fmt: skip
-        self._half_widths = patch_half_widths(PATCH_RADIUS)
+        self.__setstate__(s)
 
     def configure(self, settings: FeatureSettings) -> None:
         """Use other FAST thresholds and numbers; with a second threshold above the first, the second alone applies."""
         self.settings = settings
         self._detector.setThreshold(settings.fast_threshold_min)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> OrbExtractor:
-        """An extractor of the same settings: OpenCV's detectors cannot be copied, and store nothing of an image."""
-        copied = copy(self)
-        copied._detector = cv2.FastFeatureDetector.create(self._detector.getThreshold(), True)
-        return copied
+    def __getstate__(self) -> FeatureSettings:
+        """The settings alone: OpenCV's detectors cannot be copied or pickled, and store nothing of an image."""
+        return self.settings
+
+    def __setstate__(self, s: FeatureSettings) -> None:
+        self.settings = s
+        self._detector = cv2.FastFeatureDetector.create(s.fast_threshold_min, True)
+        self._describer = cv2.ORB.create(
+            nfeatures=s.n_features, scaleFactor=s.scale_factor, nlevels=s.levels, edgeThreshold=EDGE,
+            firstLevel=0, WTA_K=2, patchSize=2 * PATCH_RADIUS + 1, fastThreshold=s.fast_threshold_min,
+        )  # fmt: skip
+        self._half_widths = patch_half_widths(PATCH_RADIUS)
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from typing import Any
 
 import cv2
@@ -97,9 +96,9 @@ class DisFlow(LucasKanadeFlow):
         super().__init__(settings)
         self._dis = cv2.DISOpticalFlow.create(PRESETS[self.settings.dis_preset])
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> DisFlow:
-        """A flow of the same settings: OpenCV's object cannot be copied, and stores nothing of an image."""
-        return copy(self)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied and pickled by its settings: OpenCV's object cannot be, and stores nothing of an image."""
+        return DisFlow, (self.settings,)
 
     def dense(self, reference: Image, target: Image) -> NDArray[np.float32]:
         """Flow of every pixel, float32 ``[H, W, 2]``."""

@@ -6,6 +6,7 @@ sub-pixel refinement, then a forward-backward check.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,9 +73,9 @@ class SparseDaisyFlow:
         self.workers = Workers(threads)
         self._buffers: Buffers = []
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> SparseDaisyFlow:
-        """A flow of the same settings with threads of its own: nothing is stored between frames."""
-        return SparseDaisyFlow(self.settings, threads=self.workers.threads)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied and pickled by its settings: threads cannot be, and nothing is stored between frames."""
+        return partial(SparseDaisyFlow, threads=self.workers.threads), (self.settings,)
 
     def configure(self, settings: FlowSettings) -> None:
         """Use other settings from the next call on."""

@@ -63,10 +63,17 @@ class _Request:
         x, y = columns + self.flow[:, :, 0], rows + self.flow[:, :, 1]
         self.flow = self.flow + np.asarray(cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> _Request:
-        """One that shares the answer, which is waited for and never changed."""
+    def __getstate__(self) -> dict[str, Any]:
+        """With the answer, which is waited for: a thread can be neither copied nor pickled."""
         wait([self.answer])
-        return replace(self)
+        return vars(self) | {"answer": self.answer.exception() or self.answer.result()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, answer=Future())
+        if isinstance(state["answer"], BaseException):
+            self.answer.set_exception(state["answer"])
+        else:
+            self.answer.set_result(state["answer"])
 
 
 class MaskScheduler:
@@ -98,14 +105,14 @@ class MaskScheduler:
         """Put other settings with the same source into force."""
         self._settings = settings
         if settings.schedule != "async":
-            self._drop_request()
+            self.settle()
         self._missed.limit = settings.compensate
         if isinstance(self.segmenter, ConfiguredSegmenter):
             self.segmenter.settings = settings
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget the masks of the previous sequence."""
-        self._drop_request()
+        self.settle()
         self._missed.reset()
         self._instances = Instances.empty(0, 0)
         self._gray = np.zeros((0, 0), np.uint8)
@@ -113,11 +120,11 @@ class MaskScheduler:
         self.segmented = False
         self.beside_s = 0.0
 
-    def _drop_request(self) -> None:
-        """Wait for the segmenter, which works on one frame at a time, and forget its answer."""
-        if self._request is not None:
-            wait([self._request.answer])
-        self._request = None
+    def settle(self) -> None:
+        """Wait for the segmenter, which works on one frame at a time, and forget its answer; an error is raised."""
+        request, self._request = self._request, None
+        if request is not None:
+            request.answer.result()
 
     def masks_for(self, frame: Frame, gray: NDArray[np.uint8], *, keyframe: bool) -> Instances:
         """The objects in the frame: segmented, or carried over from the previous frame.
@@ -150,6 +157,7 @@ class MaskScheduler:
             request.follow(flow)
         taken = request is not None and frame.timestamp >= request.due - STAMP_TOLERANCE_S
         if request is not None and taken:
+            self._request = None  # an error is raised once
             instances, self.beside_s = request.answer.result()
             self._instances = carry_dense(self._missed.update(instances, request.since), request.flow)
         else:

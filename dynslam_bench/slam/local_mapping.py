@@ -314,8 +314,10 @@ class KeyframePolicy:
         matched = tracked.point >= 0
         inliers = int(np.count_nonzero(matched))
         self._most_inliers = max(self._most_inliers, inliers)
-        if inliers <= MIN_KEYFRAME_INLIERS:
+        if s.schedule == "none" or inliers <= MIN_KEYFRAME_INLIERS:
             return False
+        if s.schedule == "every":
+            return True
         few_close = np.count_nonzero(close & matched) < MIN_CLOSE
         if np.count_nonzero(close & ~matched) > NEW_CLOSE and (few_close or gap >= s.max_gap):
             return True

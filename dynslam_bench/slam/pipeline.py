@@ -288,6 +288,11 @@ class SlamPipeline:
         """
         self._started().save_map(path, made_by)
 
+    def close(self) -> None:
+        """Wait for the segmenter beside tracking; its error, which no frame met, is raised."""
+        if self._masks is not None:
+            self._masks.settle()
+
     def configure(self, settings: Settings) -> None:
         """Put other values of online settings into force from the next frame on; `reset` undoes it.
 

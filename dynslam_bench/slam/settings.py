@@ -6,11 +6,12 @@ Thresholds that few users need to change are constants beside the rule that uses
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import Settings, names, tunable
+from dynslam_bench.core.settings import Settings, names, online_choice, tunable
 
 NO_DEPTH = "no effect: there is no depth"
 
@@ -57,6 +58,7 @@ class TrackingSettings(Settings):
 class KeyframeSettings(Settings):
     """When a frame becomes a keyframe, and when a keyframe is redundant."""
 
+    schedule: Literal["rule", "every", "none"] = online_choice("rule", meaning="tracked frames that become keyframes")
     max_gap: int = tunable(
         30,
         low=10,

@@ -22,7 +22,7 @@ from rule import rule
 from splice import spliced
 
 from dynslam_bench.core import DynslamError
-from dynslam_bench.envs import ControlBenchmark, control_benchmark
+from dynslam_bench.envs import CONTROL_BENCHMARKS, ControlBenchmark, control_benchmark
 
 Agent = Callable[[gym.Env], Policy]
 
@@ -190,7 +190,7 @@ def print_curves(curves: dict[tuple[str, int], list[tuple[int, float]]], scores:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("id", choices=["masks-v0", "features-v0"])
+    parser.add_argument("id", choices=list(CONTROL_BENCHMARKS))
     for name, value in (("steps", 5000), ("seeds", 5), ("scenes", 6)):
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--test", type=int, help="held-out scenes; all by default")

@@ -32,6 +32,7 @@ from dynslam_bench.core.settings import (
     field_names,
     flatten,
     names,
+    online_choice,
     parameters,
     parse_assignments,
     settings_table,
@@ -49,13 +50,14 @@ class Root(Settings):
     epipolar: Epipolar = Epipolar()
     features: int = tunable(1000, low=200, high=4000, meaning="keypoints")
     method: Literal["orb", "fast"] = tunable("orb", meaning="detector")
+    when: Literal["rule", "now"] = online_choice("rule", meaning="keyframes")
     name: str = "plain"
     maybe: float | None = None
 
 
 def test_defaults_and_names():
     assert field_names(Root) == [
-        "epipolar.enabled", "epipolar.threshold_px", "epipolar.wide", "features", "method", "name", "maybe",
+        "epipolar.enabled", "epipolar.threshold_px", "epipolar.wide", "features", "method", "when", "name", "maybe",
     ]  # fmt: skip
     assert flatten(Root())["epipolar.threshold_px"] == 1.0
     assert build(Root, {"epipolar": {"threshold_px": 2}}).epipolar.threshold_px == 2.0
@@ -69,7 +71,9 @@ def test_parameters_describe_the_search_space():
     assert by_name["features"].kind == "int"
     assert by_name["epipolar.enabled"].choices == (False, True)
     assert by_name["method"].choices == ("orb", "fast")
-    assert [p.name for p in parameters(Root, online_only=True)] == ["epipolar.threshold_px"]
+    online = parameters(Root, online_only=True)
+    assert [(p.name, p.tunable) for p in online] == [("epipolar.threshold_px", True), ("when", False)]
+    assert online[1].choices == ("rule", "now") and "`rule`, `now` |  | yes |" in settings_table(Root)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from sequence_folders import SHARED, needs_shared
 
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.envs import CONTROL_BENCHMARKS, control_benchmark
+from dynslam_bench.envs import CONTROL_BENCHMARKS, FrameOutcome, control_benchmark
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.synthetic.families import Ramp
@@ -90,15 +90,24 @@ def test_the_first_action_is_the_default() -> None:
 
 
 def test_a_call_of_the_network_and_keypoints_cost_their_weight() -> None:
-    for id, stat, unit in (("masks-v0", "segmented", 1.0), ("features-v0", "keypoints", 1000.0)):
+    cases = ("masks-v0", "segmented", 1.0), ("features-v0", "keypoints", 1000.0), ("budget-v0", "keypoints", 1000.0)
+    for id, stat, unit in cases:
         benchmark = short(id)
         free = dataclasses.replace(benchmark, reward=dataclasses.replace(benchmark.reward, weight=0.0))
         rewards = [played(each.make("test", 0), 3) for each in (benchmark, free)]
         env = benchmark.make("test", 0)
         played(env, 3)
         costs = [outcome.stats[stat] / unit for outcome in env.unwrapped.episode.outcomes[1:]]
-        np.testing.assert_allclose(rewards[0], np.subtract(rewards[1], benchmark.reward.weight * np.array(costs)))
+        weights = benchmark.reward.weight * (1 + benchmark.reward.growth * np.arange(1, 8))
+        np.testing.assert_allclose(rewards[0], np.subtract(rewards[1], weights * np.array(costs)))
         assert max(costs) > 0
+
+
+def test_the_budget_of_a_frame_falls_to_a_fifth() -> None:
+    reward = control_benchmark("budget-v0").reward
+    outcome = FrameOutcome(0, 0.0, "ok", None, {"keypoints": 500.0}, {}, None)
+    charges = [reward.charge(dataclasses.replace(outcome, index=index)) for index in range(120)]
+    assert charges[0] == 0.0005 and charges[-1] == pytest.approx(0.0025) and np.mean(charges) == pytest.approx(0.0015)
 
 
 @pytest.mark.parametrize(

@@ -16,13 +16,19 @@ from gymnasium.envs.registration import EnvSpec
 import dynslam_bench.envs
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.envs import (
+    CONTROL_BENCHMARKS,
     GENERIC_ID,
     REWARDS,
+    AccuracyMinusCost,
     DegradeFrames,
+    DropFrames,
     Episode,
     FrameOutcome,
+    NegWindowError,
+    SequenceSampler,
     SlamEnv,
     TrackerContractError,
+    control_benchmark,
     env_id,
     register_envs,
 )
@@ -61,7 +67,7 @@ def test_all_listed_sequences_are_registered_and_registering_again_changes_nothi
     assert dict(gym.registry) == before
     assert ids[0] == "dynslam/Sequence-v0"
     assert {"dynslam/tum-fr3-walking_xyz-v0", "dynslam/synthetic-walking_xyz-v0", "dynslam/bonn-crowd-v0"} <= set(ids)
-    assert len(ids) == len(set(ids)) == 3 + len(sequence_ids())
+    assert len(ids) == len(set(ids)) == 1 + len(CONTROL_BENCHMARKS) + len(sequence_ids())
     assert all(gym.spec(name).max_episode_steps is None for name in ids)
 
 
@@ -315,6 +321,15 @@ def test_a_tracker_that_breaks_its_contract(mode: str, message: str) -> None:
         ({"frames": (5, 2)}, SequenceError, "5:2"),
         ({"frames": (1, 2, 3)}, SequenceError, "no range of frames"),
         ({"sequence": "tum/fr3/walkingxyz"}, SequenceError, "did you mean 'tum/fr3/walking_xyz'"),
+        ({"sequence": 5}, SettingsError, r"sequence is 5 \(give str \| FrameSequence\)"),
+        ({"tracker": 5}, SettingsError, r"tracker is 5 \(give str \| TrackerSpec\)"),
+        ({"settings": 5}, SettingsError, r"settings is 5 \(give Mapping\[str, Any\] \| Settings \| None\)"),
+        ({"settings": {1: 2}}, SettingsError, "settings is {1: 2}"),
+        ({"control": [1]}, SettingsError, r"control is \(1,\) \(give Sequence\[str\]\)"),
+        ({"protocol": None}, SettingsError, r"protocol is None \(give str \| Protocol\)"),
+        ({"window": 2.5}, SettingsError, r"window is 2.5 \(give int \| None\)"),
+        ({"stride": "x"}, SettingsError, r"stride is 'x' \(give int\)"),
+        ({"device": 0}, SettingsError, r"device is 0 \(give str\)"),
     ],
 )
 def test_bad_input_is_one_clear_line(kwargs: dict, error: type, message: str) -> None:
@@ -322,6 +337,37 @@ def test_bad_input_is_one_clear_line(kwargs: dict, error: type, message: str) ->
     with pytest.raises(error, match=message) as caught:
         SlamEnv(**arguments)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda env: env.reset(options={"sequence": 5}), "sequence is 5"),
+        (lambda env: env.reset(options={"settings": 5}), "settings is 5"),
+        (lambda env: env.reset(options=5), r"options is 5 \(give dict\[str, Any\] \| None\)"),
+        (lambda env: env.reset(seed="x"), r"seed is 'x' \(give int \| None\)"),
+        (lambda env: env.action_of([1]), r"values is \[1\] \(give Mapping\[str, Any\]\)"),
+        (lambda env: env.drop_frames("x"), r"count is 'x' \(give int\)"),
+        (lambda env: env.restore_state(5), r"state is 5 \(give EpisodeState\)"),
+        (lambda env: DropFrames(env, speed="x"), r"speed is 'x' \(give float\)"),
+        (lambda env: SequenceSampler(env, 5), r"sequences is 5 \(give Sequence\[str\]\)"),
+        (lambda env: DegradeFrames(env, blur="x"), r"blur is 'x' \(give float\)"),
+        (lambda env: DegradeFrames(env, seed=-1), "seed of the degradation is -1"),
+        (lambda env: AccuracyMinusCost(weight="x"), r"weight is 'x' \(give float\)"),
+        (lambda env: AccuracyMinusCost(cost="x"), "unknown cost 'x'.*network_calls, keypoints, processor_s"),
+        (lambda env: AccuracyMinusCost(growth=float("nan")), "no finite numbers"),
+        (lambda env: NegWindowError(0), "a window has 0 frames"),
+        (lambda env: control_benchmark([]), r"id is \[\] \(give str\)"),
+        (lambda env: control_benchmark("masks-v0").make([]), r"split is \[\] \(give Split\)"),
+    ],
+)
+def test_arguments_of_a_wrong_type_are_named_with_what_they_should_be(call, message: str) -> None:
+    env = SlamEnv(ToySequence(6), TARGET)
+    env.reset(seed=0)
+    with pytest.raises(SettingsError, match=message) as caught:
+        call(env)
+    assert "\n" not in str(caught.value)
+    assert len(play(env)[0]) == 5
 
 
 def test_steps_out_of_order() -> None:

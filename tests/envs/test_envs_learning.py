@@ -100,23 +100,42 @@ def test_a_window_longer_than_the_sequence() -> None:
 # Copies of an episode.
 
 
-@pytest.mark.parametrize(
-    "tracker", ["orb-slam2", "emfoa-oft?masks=none", "never-move", "dynaslam-g", "opencv-odometry", "mask-rcnn"]
-)
+COPIED = "orb-slam2 emfoa-oft?masks=none never-move dynaslam-g opencv-odometry mask-rcnn mask-rcnn+async".split()
+
+
+@pytest.mark.parametrize("tracker", COPIED)
 def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
-    sequence = "synthetic/walking_xyz?scene=0&frames=8" if tracker == "mask-rcnn" else CornerSequence(8)
-    env = stepped(SlamEnv(sequence, tracker, threads=2), 3)
+    sequence = "synthetic/walking_xyz?scene=0&frames=8" if tracker.startswith("mask-rcnn") else CornerSequence(8)
+    tracker, _, beside = tracker.partition("+")
+    settings = {"segmentation.schedule": "async", "segmentation.latency_s": 0.06} if beside else {}
+    env = stepped(SlamEnv(sequence, tracker, threads=2, settings=settings), 3)
     state, duplicate = env.clone_state(), copy.deepcopy(env)
     first = rest(env)
     assert rest(duplicate) == first and len(first[0]) == 4
     finals = [each.final_trajectory() for each in (env, duplicate)]
     assert finals == [None, None] or np.array_equal(finals[0].T_world_cam, finals[1].T_world_cam)
-    for _ in range(2):
-        env.restore_state(state)
+    states = [state] if tracker == "opencv-odometry" else [state, pickle.loads(pickle.dumps(state))]
+    for again in states:
+        env.restore_state(again)
         assert env.episode.next_index == 4 and rest(env) == first
     following = env.reset()[0].tobytes()
     env.restore_state(state)
     assert rest(env) == first and env.reset()[0].tobytes() == following, "random numbers are restored, too"
+
+
+def test_what_fails_beside_tracking_on_the_last_frames_is_raised_when_the_environment_is_closed() -> None:
+    class Broken:
+        def segment(self, frame: Frame) -> None:
+            raise ValueError(f"no masks of frame {frame.index}")
+
+    settings = {"segmentation.source": "oracle", "segmentation.schedule": "async"}
+    env = SlamEnv("synthetic/walking_xyz?scene=0&frames=3", "mask-rcnn", settings=settings)
+    env.reset(seed=0)
+    env._tracker._masks.segmenter = Broken()
+    env.step(0)
+    with pytest.raises(ValueError, match="no masks of frame 1"):
+        env.close()
+    env.close()
 
 
 @pytest.mark.parametrize("tracker", ["mask-rcnn", "emfoa-oft", "dynaslam", "ds-slam"])
@@ -377,20 +396,21 @@ def test_every_reward_passes_the_checker(reward: Any) -> None:
 # Choices.
 
 
-def test_segment_now_or_not_is_an_action() -> None:
-    env = DiscreteActions(
-        SlamEnv(
-            "synthetic/sitting_xyz?frames=9",
-            "mask-rcnn",
-            settings={"segmentation.source": "oracle", "segmentation.n": 1000},
-            control=["segmentation.schedule"],
-        ),
-        [{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}],
-    )
+@pytest.mark.parametrize(
+    ("setting", "choices", "stat"),
+    [
+        ("segmentation.schedule", ("every_nth", "every"), "segmented"),
+        ("backend.keyframes.schedule", ("none", "every"), "keyframe"),
+    ],
+)
+def test_segment_now_and_keyframe_now_are_actions(setting: str, choices: tuple[str, str], stat: str) -> None:
+    settings = {"segmentation.source": "oracle", "segmentation.n": 1000}
+    inner = SlamEnv("synthetic/sitting_xyz?frames=9", "mask-rcnn", settings=settings, control=[setting])
+    env = DiscreteActions(inner, [{setting: choice} for choice in choices])
     assert env.action_space == gym.spaces.Discrete(2)
     env.reset(seed=0)
     actions = [0, 1, 0, 0, 1, 1, 0, 0]
-    assert [int(env.step(action)[4]["stats"]["segmented"]) for action in actions] == actions
+    assert [int(env.step(action)[4]["stats"][stat]) for action in actions] == actions
 
 
 def test_a_choice_leaves_what_it_does_not_name() -> None:

@@ -1,5 +1,7 @@
 """Sparse flow: accuracy, budgets, determinism, and input that says nothing."""
 
+import pickle
+from copy import deepcopy
 from functools import lru_cache
 
 import cv2
@@ -335,6 +337,16 @@ def cases() -> list[tuple[str, str, tuple[object, ...]]]:
 def test_a_setting_acts_in_its_flow(kind: str, name: str, values: tuple[object, ...]) -> None:
     tried = {output(BASES[kind].model_copy(update={name: value})) for value in values}
     assert tried | {output(BASES[kind])} != {output(BASES[kind])}
+
+
+@pytest.mark.parametrize("settings", BASES.values(), ids=BASES)
+def test_copied_and_pickled_flows_find_the_same(settings) -> None:
+    flow = build_flow(settings, threads=2)
+    images = [flow.prepare(image) for image in pair()]
+    found = [
+        each.track(*images, POINTS, seed=5).xy for each in (flow, deepcopy(flow), pickle.loads(pickle.dumps(flow)))
+    ]
+    np.testing.assert_array_equal(found[1:], [found[0]] * 2)
 
 
 def test_the_dense_flow_reads_its_field_at_the_points() -> None:

@@ -1,6 +1,7 @@
 """The Mask R-CNN: its building blocks against slow references, its checkpoints, its behaviour as a segmenter."""
 
 import copy
+import pickle
 import re
 from copy import deepcopy
 from pathlib import Path
@@ -568,7 +569,8 @@ def test_a_written_network_runs_through_opencv(tmp_path):
         found = segmenter.segment(picture(np.zeros(shape, np.uint8)))
         assert found.masks.shape == (1, *shape[:2])
         assert found.masks.mean() == pytest.approx(20 * 20 / (60 * 80), rel=0.35)
-        assert (deepcopy(segmenter).segment(picture(np.zeros(shape, np.uint8))).masks == found.masks).all()
+        for other in (deepcopy(segmenter), pickle.loads(pickle.dumps(segmenter))):
+            assert (other.segment(picture(np.zeros(shape, np.uint8))).masks == found.masks).all()
 
 
 @pytest.mark.parametrize(

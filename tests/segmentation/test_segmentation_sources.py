@@ -766,12 +766,21 @@ for index in range(2):
     assert (done.returncode, done.stdout) == (0, "0\n1\n"), done.stderr
 
 
-def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken():
+@pytest.mark.parametrize("end", ["masks are taken", "settle", "reset", "configure", "a copy's settle"])
+def test_an_error_of_the_segmenter_beside_tracking_is_raised_once_at_the_latest_at_the_end(end):
     stage = MaskScheduler(ASYNC, Square(broken=4))
     for index in range(7):
         feed(stage, index)
+    if end.startswith("a copy"):
+        stage = deepcopy(stage)
+    ends = {
+        "masks are taken": lambda: feed(stage, 7),
+        "configure": lambda: stage.configure(SegmentationSettings()),
+        "reset": stage.reset,
+    }
     with pytest.raises(RuntimeError, match="frame 4"):
-        feed(stage, 7)
+        ends.get(end, stage.settle)()
+    stage.settle()
 
 
 def test_the_schedule_may_change_while_the_segmenter_runs_beside_tracking():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from point_world import PointWorld, errors, make_backend, observed, states, track_all, without_depth
 
+from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam import map as slam_map
 from dynslam_bench.slam.motion_model import MAX_GAP_S, CameraVelocity, compensate_rolling_shutter
@@ -236,6 +237,27 @@ def test_both_ends_of_a_range_give_other_results(room, name, ends, frames, other
     results = [track_all(make_backend(room, **others, **{name: end}), frames(room)) for end in ends]
     one, other = ([(r.state, r.keyframe, np.nan_to_num(r.T_world_cam).tobytes()) for r in run] for run in results)
     assert one != other
+
+
+@pytest.mark.parametrize("monocular", [False, True])
+def test_a_frame_becomes_a_keyframe_exactly_when_it_is_told_to(room, monocular):
+    wanted, backend, results = np.random.default_rng(4).random(60) < 0.3, make_backend(room, monocular=monocular), []
+    for index, pose in enumerate(room.path(60)):
+        schedule = "every" if wanted[index] else "none"
+        backend.configure(apply_overrides(backend.settings, {"keyframes.schedule": schedule}))
+        begins, frame = backend.world.keyframe_count == 0, room.see(pose, index)
+        results += track_all(backend, [without_depth(frame) if monocular else frame])
+        assert results[-1].keyframe == (results[-1].state == "ok" and (begins or wanted[index]))
+    assert states(results).count("ok") > 40
+
+
+def test_without_further_keyframes_the_camera_is_lost_where_the_map_ends_and_found_where_it_returns(room):
+    turn = 1.5 * np.sin(np.pi * np.arange(120) / 119)  # away and back, radians about y
+    frames = [room.see(pose, index) for index, pose in enumerate(se3.exp(turn[:, None] * [0, 0, 0, 0, 1, 0]))]
+    none, every = (track_all(make_backend(room, keyframes__schedule=when), frames) for when in ("none", "every"))
+    seen = states(none)
+    assert seen[:10] == seen[-10:] == ["ok"] * 10 and "lost" in seen and none[-1].keyframes == 1
+    assert states(every) == ["ok"] * 120 and all(result.keyframe for result in every)
 
 
 def test_filters_see_the_newest_keyframes_and_all_points(room, monkeypatch):

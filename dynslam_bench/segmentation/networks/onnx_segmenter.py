@@ -14,6 +14,7 @@ import ast
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -79,9 +80,9 @@ class OnnxSegmenter:
         self._input = header.inputs[0].name
         self.layout = self._find_layout(header)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> OnnxSegmenter:
-        """A segmenter with a network of its own: OpenCV's cannot be copied, nor used by two threads."""
-        return OnnxSegmenter(self.path, self.settings, threads=self.threads, floor=self.floor)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied and pickled by its arguments: OpenCV's network cannot be, nor be used by two threads."""
+        return partial(OnnxSegmenter, threads=self.threads, floor=self.floor), (self.path, self.settings)
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame.

@@ -7,8 +7,8 @@
 True
 """
 
-from slam_hpo.spaces import FRAMES, SEQUENCES, SPACES, SPLITS, STARTS, Range, defaults
-from slam_hpo.table import Benchmark, Evaluation, SlamHpoError, load
+from slam_hpo.spaces import FRAMES, SEQUENCES, SPACES, SPLITS, STARTS, Range, SlamHpoError, defaults
+from slam_hpo.table import Benchmark, Evaluation, load
 
 __all__ = [
     "FRAMES",

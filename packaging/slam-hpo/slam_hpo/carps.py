@@ -8,8 +8,8 @@ from carps.objective_functions.objective_function import ObjectiveFunction
 from carps.utils.trials import StatusType, TrialInfo, TrialValue
 from ConfigSpace import ConfigurationSpace, Float, Integer
 
-from slam_hpo.spaces import FRAMES, SEQUENCES, STARTS
-from slam_hpo.table import SlamHpoError, load
+from slam_hpo.spaces import FRAMES, SEQUENCES, STARTS, known
+from slam_hpo.table import load
 
 
 class SlamHpo(ObjectiveFunction):
@@ -40,10 +40,8 @@ class SlamHpo(ObjectiveFunction):
         return space
 
     def _evaluate(self, trial_info: TrialInfo) -> TrialValue:
-        instance = trial_info.instance or 0
-        if instance not in range(len(SEQUENCES)):
-            raise SlamHpoError(f"instance {instance} is not in the benchmark, which has 0 to {len(SEQUENCES) - 1}")
+        instance = known("instance", trial_info.instance or 0, range(len(SEQUENCES)))
         frames = FRAMES[-1] if trial_info.budget is None else trial_info.budget
         start = STARTS[(trial_info.seed or 0) % len(STARTS)]
-        found = self._bench.predicted(dict(trial_info.config), SEQUENCES[int(instance)], start=start, frames=frames)
+        found = self._bench.predicted(dict(trial_info.config), SEQUENCES[instance], start=start, frames=frames)
         return TrialValue(cost=found.ate_m, time=found.processor_s * frames, status=StatusType.SUCCESS)

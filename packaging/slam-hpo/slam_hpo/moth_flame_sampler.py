@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from slam_hpo.moth_flame import EMFOA, MFO, flames_left, flight, moth_positions, opposites
+from slam_hpo.spaces import whole
 
 CAUCHY_SHARE = 0.05
 """Scale of the Cauchy steps of Eq. 13, as a share of the unit interval."""
@@ -34,18 +34,18 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         population: Moths, and flames.
 
     Raises:
-        ValueError: `n_trials` is below 1, or `population` below 2; when sampling, the study has several objectives.
+        ValueError: `seed`, `n_trials` or `population` is no whole number, or below 0, 1 or 2; when sampling, the study
+            has several objectives.
     """
 
     def __init__(
         self, *, elite: bool = True, seed: int | None = None, n_trials: int = 100, population: int = 8
     ) -> None:
+        seed = None if seed is None else whole("seed", seed)
         super().__init__(seed=seed)
         self._rules = EMFOA if elite else MFO
         self._rng = np.random.default_rng(seed)
-        self._n_trials, self._population = operator.index(n_trials), operator.index(population)
-        if self._n_trials < 1 or self._population < 2:
-            raise ValueError(f"n_trials must be >= 1 and population >= 2, got {n_trials=}, {population=}")
+        self._n_trials, self._population = whole("n_trials", n_trials, 1), whole("population", population, 2)
 
     def reseed_rng(self) -> None:
         """Draw a new seed, for parallel workers."""

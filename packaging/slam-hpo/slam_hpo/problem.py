@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 
 from slam_hpo.real import run
-from slam_hpo.spaces import FRAMES, SEQUENCES, SPLITS, STARTS, defaults
-from slam_hpo.table import METRICS, SlamHpoError, load, natural
+from slam_hpo.spaces import FRAMES, SEQUENCES, SPLITS, STARTS, SlamHpoError, defaults, known, whole
+from slam_hpo.table import METRICS, load, natural
 
 Source = Literal["surrogate", "run"]
 MIN_COVERAGE = 0.95
+OBJECTIVES = ("ate_m", "processor_s")
 
 
 class Problem(optunahub.benchmarks.BaseProblem):
@@ -46,17 +47,11 @@ class Problem(optunahub.benchmarks.BaseProblem):
         noise: bool = False,
         seed: int | None = None,
     ) -> None:
-        if frames not in FRAMES:
-            raise SlamHpoError(f"frames {frames} is not in the benchmark, which has {', '.join(map(str, FRAMES))}")
-        if source not in get_args(Source):
-            raise SlamHpoError(f"no source {source!r}; there are {', '.join(get_args(Source))}")
-        if split not in SPLITS:
-            raise SlamHpoError(f"no split {split!r}; there are {', '.join(SPLITS)}")
-        unknown = [name for name in metrics if name not in ("ate_m", "processor_s")]
-        if unknown:
-            raise SlamHpoError(f"no metric {unknown[0]!r}; there are ate_m, processor_s")
-        self._bench, self._split, self._frames, self._source = load(system), split, frames, source
-        self.metric_names = [*metrics]
+        self._bench, self._split = load(system), known("split", split, SPLITS)
+        self._frames, self._source = known("frames", frames, FRAMES), known("source", source, get_args(Source))
+        if not isinstance(metrics, list | tuple) or not metrics:
+            raise SlamHpoError(f"metrics are {metrics!r}: give a list of {', '.join(OBJECTIVES)}")
+        self.metric_names = [known("metric", name, OBJECTIVES) for name in metrics]
         one = np.array([self._bench.noise(frames, metric) for metric in metrics]) if noise else np.zeros(len(metrics))
         self._noise = one / np.sqrt(len(SPLITS[split]) * len(STARTS))
         self.reseed(seed)
@@ -64,7 +59,7 @@ class Problem(optunahub.benchmarks.BaseProblem):
 
     def reseed(self, seed: int | None = None) -> None:
         """Draw the noise from another stream."""
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(None if seed is None else whole("seed", seed))
 
     @property
     def search_space(self) -> dict[str, BaseDistribution]:

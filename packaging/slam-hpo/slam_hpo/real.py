@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slam_hpo.spaces import STRIDE
+from slam_hpo.spaces import STRIDE, SlamHpoError
 from slam_hpo.table import Evaluation
 
 if TYPE_CHECKING:
@@ -26,8 +26,15 @@ def run(
     frames: int = 60,
     results: str | Path = "results",
 ) -> Evaluation:
-    """Run a system; a run that is stored in `results` is not made again. Arguments as for `Benchmark.measured`."""
-    import dynslam_bench as db
+    """Run a system; a run that is stored in `results` is not made again. Arguments as for `Benchmark.measured`.
+
+    Raises:
+        SlamHpoError: dynslam-bench is not installed.
+    """
+    try:
+        import dynslam_bench as db
+    except ModuleNotFoundError as error:
+        raise SlamHpoError(f"real runs need dynslam-bench ({error}): in its checkout, pip install .") from error
 
     window = (start, start + STRIDE * frames)
     made = db.run(system, sequence, settings=settings, frames=window, stride=STRIDE, cache=True, results=results)

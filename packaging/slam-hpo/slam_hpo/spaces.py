@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from numbers import Integral, Real
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Value = int | float
+
+
+class SlamHpoError(ValueError):
+    """What was asked for is not in the benchmark."""
 
 
 class Range(NamedTuple):
@@ -87,6 +92,34 @@ FRAMES = (20, 40, 60)
 """Fidelities: lengths of a run, every second frame. A run sees no later frame, so a shorter one is its beginning."""
 
 
+def known(name: str, value: Any, choices: Iterable[Any]) -> Any:
+    """The choice that a value is.
+
+    Raises:
+        SlamHpoError: It is none; the message names those that there are.
+    """
+    every = list(choices)
+    if not isinstance(value, Real | str) or value not in every:
+        there = f"0 to {every[-1]}" if isinstance(choices, range) else ", ".join(map(str, every))
+        raise SlamHpoError(f"{name} {value!r} is not in the benchmark, which has {there}")
+    return every[every.index(value)]
+
+
+def whole(name: str, value: Any, least: int = 0) -> int:
+    """The value as an int.
+
+    Raises:
+        SlamHpoError: It is no whole number, or below the least.
+    """
+    if not isinstance(value, Integral) or value < least:
+        raise SlamHpoError(f"{name} {value!r} is no whole number >= {least}")
+    return int(value)
+
+
 def defaults(system: str) -> dict[str, Value]:
-    """The configuration that the system ships with."""
-    return {name: setting.default for name, setting in SPACES[system].items()}
+    """The configuration that the system ships with.
+
+    Raises:
+        SlamHpoError: There is no such system.
+    """
+    return {name: setting.default for name, setting in SPACES[known("system", system, SPACES)].items()}

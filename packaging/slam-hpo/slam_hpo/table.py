@@ -13,16 +13,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from slam_hpo.spaces import FRAMES, SEQUENCES, SPACES, STARTS, Value, defaults
+from slam_hpo.spaces import FRAMES, SEQUENCES, SPACES, STARTS, SlamHpoError, Value, defaults, known
 
 METRICS = ("ate_m", "coverage", "processor_s")
 LOST_COVERAGE = 0.5
 """A run that tracks less than this share of its frames is lost."""
-KNOWN = (("sequence", SEQUENCES), ("start", STARTS), ("frames", FRAMES))
-
-
-class SlamHpoError(ValueError):
-    """What was asked for is not in the benchmark."""
+INSTANCE = (("sequence", SEQUENCES), ("start", STARTS), ("frames", FRAMES))
 
 
 class Evaluation(NamedTuple):
@@ -64,7 +60,7 @@ class Benchmark:
         self._index = {row: index for index, row in enumerate(self.configurations.itertuples(index=False, name=None))}
         at = [
             np.array([self._index[row] for row in keys.itertuples(index=False, name=None)]),
-            *(pd.Categorical(rows[column], categories=known).codes for column, known in KNOWN),
+            *(pd.Categorical(rows[column], categories=choices).codes for column, choices in INSTANCE),
         ]
         shape = (len(unique), len(SEQUENCES), len(STARTS), len(FRAMES))
         self.values = np.full((*shape, len(METRICS)), np.nan)
@@ -73,8 +69,12 @@ class Benchmark:
         self.status[tuple(at)] = rows["status"]
 
     def configuration(self, index: int) -> dict[str, Value]:
-        """A measured configuration."""
-        row = self.configurations.iloc[index]
+        """A measured configuration.
+
+        Raises:
+            SlamHpoError: There is none of this number.
+        """
+        row = self.configurations.iloc[known("configuration", index, range(len(self.configurations)))]
         return {name: (int if self.space[name].whole else float)(row[name]) for name in self.space}
 
     def units(self, settings: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -83,6 +83,8 @@ class Benchmark:
         Raises:
             SlamHpoError: A setting is missing, unknown or out of its range.
         """
+        if not isinstance(settings, Mapping):
+            raise SlamHpoError(f"the settings are {settings!r}: give a value for each of {', '.join(self.space)}")
         if settings.keys() != self.space.keys():
             wrong = ", ".join(sorted(settings.keys() ^ self.space.keys()))
             raise SlamHpoError(f"{self.system} has the settings {', '.join(self.space)}; missing or unknown: {wrong}")
@@ -130,8 +132,13 @@ class Benchmark:
         return Evaluation(ate, coverage, processor, status, log_ate_std=float(std[0]))
 
     def noise(self, frames: int = 60, metric: str = "ate_m") -> float:
-        """Standard deviation of a metric's logarithm between starts, on the same sequence with the same settings."""
-        logarithm = np.log(self.values[:, :, :, FRAMES.index(frames), METRICS.index(metric)])
+        """Standard deviation of a metric's logarithm between starts, on the same sequence with the same settings.
+
+        Raises:
+            SlamHpoError: No such number of frames or metric.
+        """
+        fidelity, column = known("frames", frames, FRAMES), known("metric", metric, METRICS)
+        logarithm = np.log(self.values[:, :, :, FRAMES.index(fidelity), METRICS.index(column)])
         between = logarithm[:, :, 0] - logarithm[:, :, 1]
         return float(np.sqrt(np.mean((between - between.mean(axis=0)) ** 2) / 2))
 
@@ -205,20 +212,21 @@ def natural(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _place(sequence: str, start: int, frames: int) -> tuple[int, int, int]:
-    for (name, known), value in zip(KNOWN, (sequence, start, frames), strict=True):
-        if value not in known:
-            raise SlamHpoError(f"{name} {value!r} is not in the benchmark, which has {', '.join(map(str, known))}")
-    return SEQUENCES.index(sequence), STARTS.index(start), FRAMES.index(frames)
+    values = (sequence, start, frames)
+    first, second, third = (c.index(known(n, v, c)) for (n, c), v in zip(INSTANCE, values, strict=True))
+    return first, second, third
 
 
-@lru_cache
 def load(system: str) -> Benchmark:
     """The benchmark of a system.
 
     Raises:
         SlamHpoError: There is none.
     """
-    if system not in SPACES:
-        raise SlamHpoError(f"no system {system!r}; there are {', '.join(SPACES)}")
+    return _load(known("system", system, SPACES))
+
+
+@lru_cache
+def _load(system: str) -> Benchmark:
     with files("slam_hpo").joinpath("data", f"{system.partition('?')[0]}.parquet").open("rb") as file:
         return Benchmark(system, pd.read_parquet(file))

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -57,8 +58,30 @@ def test_a_wrong_instance_is_refused_with_those_that_there_are(bench, where):
     name, value = next(iter(where.items()))
     with pytest.raises(slam_hpo.SlamHpoError, match=f"{name} {value!r} is not in the benchmark, which has"):
         bench.predicted(bench.configuration(0), **({"sequence": XYZ} | where))
-    with pytest.raises(slam_hpo.SlamHpoError, match="no system 'orb'; there are mask-rcnn"):
-        slam_hpo.load("orb")
+
+
+def test_what_is_not_in_the_benchmark_is_named_with_what_is():
+    bench = slam_hpo.load("mask-rcnn")
+    for call, message in (
+        (lambda: slam_hpo.load("orb"), "system 'orb' is not in the benchmark, which has mask-rcnn, emfoa"),
+        (lambda: slam_hpo.load([]), r"system \[\] is not"),
+        (lambda: slam_hpo.defaults("orb"), "system 'orb' is not in the benchmark, which has mask-rcnn, emfoa"),
+        (lambda: bench.configuration(129), "configuration 129 is not in the benchmark, which has 0 to 128"),
+        (lambda: bench.noise(61), "frames 61 is not in the benchmark, which has 20, 40, 60"),
+        (lambda: bench.noise(60, "rpe"), "metric 'rpe' is not in the benchmark, which has ate_m"),
+        (lambda: Problem(seed="x"), "seed 'x' is no whole number >= 0"),
+        (lambda: MothFlameSampler(n_trials=2.5), "n_trials 2.5 is no whole number >= 1"),
+        (lambda: MothFlameSampler(population=1), "population 1 is no whole number >= 2"),
+        (lambda: bench.units(5), "the settings are 5: give a value for each of features.n_features"),
+    ):
+        with pytest.raises(slam_hpo.SlamHpoError, match=message):
+            call()
+
+
+@pytest.mark.skipif(find_spec("dynslam_bench") is not None, reason="dynslam-bench is installed")
+def test_real_runs_say_what_they_need():
+    with pytest.raises(slam_hpo.SlamHpoError, match=r"real runs need dynslam-bench .*pip install"):
+        Problem(source="run")
 
 
 def test_the_surrogate_is_close_to_what_was_measured_and_says_how_sure_it_is(bench):
@@ -104,9 +127,11 @@ def test_noise_is_drawn_from_its_seed_and_two_metrics_are_two_values():
     assert len(both.evaluate(params)) == len(both.directions) == 2 and both.metric_names == ["ate_m", "processor_s"]
 
 
-@pytest.mark.parametrize("wrong", [{"split": "train"}, {"metrics": ("rpe",)}, {"frames": 61}, {"source": "rn"}])
+@pytest.mark.parametrize(
+    "wrong", [{"split": "train"}, {"metrics": ("rpe",)}, {"metrics": 5}, {"frames": 61}, {"source": "rn"}]
+)
 def test_a_wrong_problem_is_refused(wrong):
-    with pytest.raises(slam_hpo.SlamHpoError, match=r"there are|which has"):
+    with pytest.raises(slam_hpo.SlamHpoError, match=r"which has|give a list of"):
         Problem(**wrong)
 
 

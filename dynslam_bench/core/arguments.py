@@ -1,0 +1,53 @@
+"""One line for a call that Python cannot make sense of: which argument is of a wrong type, and what it should be."""
+
+import inspect
+import re
+import typing
+from collections.abc import Callable
+from contextlib import suppress
+from functools import wraps
+from typing import Any, TypeVar
+
+from pydantic import ConfigDict, ValidationError, create_model
+
+from dynslam_bench.core.errors import DynslamError, SettingsError
+from dynslam_bench.core.settings import shown
+
+C = TypeVar("C", bound=Callable[..., Any])
+
+
+def names_wrong_arguments(target: C) -> C:
+    """Decorates a function, or a class for its constructor: when it fails, arguments are compared with annotations.
+
+    Raises:
+        SettingsError: The call failed and an argument is not of the annotated type. Other errors pass as they are.
+    """
+    if isinstance(target, type):
+        target.__init__ = names_wrong_arguments(target.__init__)  # type: ignore[misc]
+        return target
+
+    @wraps(target)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return target(*args, **kwargs)
+        except DynslamError:
+            raise
+        except Exception as error:
+            with suppress(TypeError):  # names that do not fit, of which Python says so itself
+                _refuse_wrong(target, inspect.signature(target).bind(*args, **kwargs).arguments, error)
+            raise
+
+    return typing.cast("C", call)
+
+
+def _refuse_wrong(function: Callable[..., Any], given: dict[str, Any], error: Exception) -> None:
+    hints = typing.get_type_hints(function)
+    fields: dict[str, Any] = {name: (hints[name], ...) for name in given if name in hints}
+    model = create_model("Arguments", __config__=ConfigDict(arbitrary_types_allowed=True, strict=True), **fields)
+    try:
+        model.model_validate({name: given[name] for name in fields})
+    except ValidationError as wrong:
+        name = str(wrong.errors()[0]["loc"][0])
+        expected = inspect.formatannotation(inspect.signature(function).parameters[name].annotation)
+        expected = re.sub(r"\b(\w+\.)+", "", expected).strip("'")  # without the modules
+        raise SettingsError(f"{name} is {shown(given[name])}", f"give {expected}") from error
