@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -81,6 +81,23 @@ class StageClock:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed
 
 
+@dataclass(frozen=True, eq=False)
+class PreviousFrame:
+    """What filters and flow read of the frame before.
+
+    Attributes:
+        frame: The frame.
+        keep: bool ``[N]``, its static keypoints.
+        image: Its image as the flow prepared it; None if no flow ran.
+        T_world_cam: Its pose, None if it was not tracked.
+    """
+
+    frame: FrameBundle
+    keep: NDArray[np.bool_]
+    image: Any
+    T_world_cam: NDArray[np.float64] | None
+
+
 class SlamPipeline:
     """A tracker: segmentation, features, culling, flow, tracking and mapping, one frame at a time.
 
@@ -132,8 +149,7 @@ class SlamPipeline:
         for part in (*self._filters, self._masks):
             if part is not None and hasattr(part, "reset"):
                 part.reset(camera)
-        self._before: dict[str, Any] = {}  # what `FilterState` holds of the previous frame
-        self._image: Any = None  # the previous image as the flow prepared it; None if no flow ran
+        self._previous: PreviousFrame | None = None
         self._keyframe_due = True
 
     # ------------------------------------------------------------------ one frame
@@ -169,8 +185,7 @@ class SlamPipeline:
         result = backend.track(bundle, static.keep, static.weight)  # with mapping and loop closing
         # the pose of a frame that is not tracked in the root map's world is unknown
         pose = result.T_world_cam if result.state == backend.state == "ok" else None
-        self._before = {"previous": bundle, "previous_keep": static.keep, "T_world_prev": pose}
-        self._image = image
+        self._previous = PreviousFrame(bundle, static.keep, image, pose)
         self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
         timings = clock.seconds | dict(result.timings)
         if self._masks is not None and self._masks.beside_s:
@@ -186,17 +201,20 @@ class SlamPipeline:
 
     def _filter_state(self, frame: FrameBundle, camera: Camera) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
+        previous = self._previous
         T_world_pred, covariance = self._backend.predict(frame.timestamp)
         view = self._backend.view()
         return FilterState(
             camera=camera,
             keep=np.ones(len(frame.xy), dtype=bool),
+            previous=None if previous is None else previous.frame,
+            previous_keep=None if previous is None else previous.keep,
+            T_world_prev=None if previous is None else previous.T_world_cam,
             T_world_pred=T_world_pred,
             motion_covariance=covariance,
             keyframes=view.keyframes,
             map_points=(view.ids, view.positions),
             seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
-            **self._before,
         )
 
     def _cull(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> tuple[FilterResult, Any]:
@@ -231,8 +249,8 @@ class SlamPipeline:
         assert self._flow is not None  # checked in the constructor
         with clock("flow"):
             image = self._flow.prepare(frame.gray)
-            if state.previous is not None:
-                other = self._flow.prepare(state.previous.gray) if self._image is None else self._image
+            if (previous := self._previous) is not None:
+                other = self._flow.prepare(previous.frame.gray) if previous.image is None else previous.image
                 state.flow = flow_to_previous(self._flow, image, other, frame, state)
         with clock("ego_motion"):
             state.T_world_pred = refine_prediction(frame, state)
