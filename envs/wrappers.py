@@ -175,7 +175,8 @@ class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
 
     "Segment now?" is ``[{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}]`` with a setting
     ``segmentation.n`` that no episode reaches. "Keyframe now?" is ``[{"backend.keyframes.schedule": "none"},
-    {"backend.keyframes.schedule": "every"}]``: the frame of the step becomes one if it is tracked.
+    {"backend.keyframes.schedule": "every"}]``: the frame of the step becomes one if it is tracked with more than 15
+    inliers.
 
     Args:
         env: A `SlamEnv`, wrapped or not, made with ``control``.

@@ -2,6 +2,8 @@
 
 import inspect
 import re
+import sys
+import traceback
 import typing
 from collections.abc import Callable
 from contextlib import suppress
@@ -33,14 +35,26 @@ def names_wrong_arguments(target: C) -> C:
         except DynslamError:
             raise
         except Exception as error:
-            with suppress(TypeError):  # names that do not fit, of which Python says so itself
-                _refuse_wrong(target, inspect.signature(target).bind(*args, **kwargs).arguments, error)
+            wrong = None
+            with suppress(Exception):  # names that do not fit, or annotations that cannot be checked
+                if _is_ours(error):
+                    wrong = _wrong_argument(target, inspect.signature(target).bind(*args, **kwargs).arguments)
+            if wrong is not None:
+                raise wrong from error
             raise
 
     return typing.cast("C", call)
 
 
-def _refuse_wrong(function: Callable[..., Any], given: dict[str, Any], error: Exception) -> None:
+def _is_ours(error: Exception) -> bool:
+    """Whether this package, or a library that it calls, raised an error: not a plug-in, nor a user's callable."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    root = str(frame.f_globals.get("__name__")).partition(".")[0]
+    return root in {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
+
+
+def _wrong_argument(function: Callable[..., Any], given: dict[str, Any]) -> SettingsError | None:
+    """The line on the first argument that is not of the annotated type; None if all are."""
     hints = typing.get_type_hints(function)
     fields: dict[str, Any] = {name: (hints[name], ...) for name in given if name in hints}
     model = create_model("Arguments", __config__=ConfigDict(arbitrary_types_allowed=True, strict=True), **fields)
@@ -50,4 +64,5 @@ def _refuse_wrong(function: Callable[..., Any], given: dict[str, Any], error: Ex
         name = str(wrong.errors()[0]["loc"][0])
         expected = inspect.formatannotation(inspect.signature(function).parameters[name].annotation)
         expected = re.sub(r"\b(\w+\.)+", "", expected).strip("'")  # without the modules
-        raise SettingsError(f"{name} is {shown(given[name])}", f"give {expected}") from error
+        return SettingsError(f"{name} is {shown(given[name])}", f"give {expected}")
+    return None

@@ -4,9 +4,10 @@ Each message is one line: what was found (with the measured numbers), what was e
 """
 
 import difflib
-import re
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core.sanitise import without_passwords
@@ -45,12 +46,19 @@ LONGEST = 1000
 """Characters of the longest message, and of the longest hint."""
 
 
-_UNPACKED = re.compile(r"/[^\s'\"]*/\.dynslam-private\.[0-9a-f]{12}\.tmp/unpacked/")
-"""Where archives are unpacked, each below its own name: a message names the archive, not the temporary folder."""
+_LEFT_OUT: list[str] = []
+
+
+def left_out_of_messages(folder: Path) -> Path:
+    """A temporary folder whose path messages leave out: they name what lies below it, e.g. an unpacked archive."""
+    _LEFT_OUT.append(f"{folder}{os.sep}")
+    return folder
 
 
 def _one_line(text: str) -> str:
-    text = _UNPACKED.sub("", without_passwords(" ".join(text.splitlines())))
+    text = without_passwords(" ".join(text.splitlines()))
+    for folder in _LEFT_OUT:
+        text = text.replace(folder, "")
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
 
 

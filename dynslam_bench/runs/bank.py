@@ -28,6 +28,7 @@ from dynslam_bench.core import (
     write_atomic,
 )
 from dynslam_bench.core.download import download
+from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.runs.exchange.transfer import Which, import_trajectory
 from dynslam_bench.runs.record import RunRecord
@@ -206,18 +207,18 @@ def pull(source: str, bank: str | Path) -> Merged:
         DynslamError: It cannot be fetched, or the bank not be written.
     """
     with ExitStack() as stack:
-        folder = Path(source)
+        store = RunStore(source)
         if _ARCHIVE.fullmatch(source):
             archive = stack.enter_context(closing(TemporaryFolder())).path / Path(source.partition("?")[0]).name
             download(source, archive)
-            unpacked = open_store(archive)
-            folder = unpacked.root
+            store = open_store(archive)
         elif _is_repository(source):
-            folder = stack.enter_context(_cloned(source))
-        if not (folder / SUMS).is_file():
+            store = RunStore(stack.enter_context(_cloned(source)))
+        store.source = Path(source) if Path(source).exists() else Path(Path(source).name)  # an address's end
+        if not (store.root / SUMS).is_file():
             raise RunError(f"{source} is no bank: it has no {SUMS}")
-        _check(folder)
-        return _merge([RunStore(folder)], bank)
+        _check(store.root)
+        return _merge([store], bank)
 
 
 def push(bank: str | Path, target: str) -> Merged:
@@ -278,7 +279,7 @@ def _is_repository(place: str) -> bool:
 def _cloned(repository: str) -> Iterator[Path]:
     with closing(TemporaryFolder()) as folder:
         origin = repository if _ADDRESS.fullmatch(repository) else str(Path(repository).absolute())
-        clone = folder.path / "unpacked" / Path(repository).name  # so that errors name the repository
+        clone = left_out_of_messages(folder.path) / (re.sub(r"[^\w.-]", "-", Path(origin).resolve().name) or "bank")
         _git(folder.path, "clone", "--quiet", "--config", "core.autocrlf=false", "--", origin, str(clone))
         yield clone
 

@@ -36,6 +36,7 @@ from dynslam_bench.core import (
     temporary_folder,
     write_atomic,
 )
+from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import PROTOCOLS, Evaluation, Protocol, evaluate, get_protocol, hints
@@ -621,8 +622,8 @@ def open_store(results: str | Path) -> RunStore:
 
         with raising(InfrastructureError, f"cannot unpack {results}", "check the free space"):
             temporary = TemporaryFolder()
-            unpacked = temporary.path / "unpacked" / store.root.name  # so that errors name the archive
-            unpacked.mkdir(parents=True)
+            unpacked = left_out_of_messages(temporary.path) / store.root.name
+            unpacked.mkdir()
             extract(store.root, unpacked)
         roots = [path.parent for path in unpacked.rglob("runs") if path.is_dir()]
         depth = min((len(root.parts) for root in roots), default=0)  # below it, e.g. a study's own runs
@@ -823,9 +824,11 @@ def rescore(
     records, unreadable = store.all()
     readable = []
     for record in records:
+        if record.status == "stopped":
+            continue
         try:
             store.check(record)
-            readable += [] if record.status == "stopped" else [record.run_id]
+            readable.append(record.run_id)
         except DynslamError as error:
             unreadable.append(Unreadable(store.place(record.run_id), str(error)))
     ended, reasons = Records(store, readable), tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)

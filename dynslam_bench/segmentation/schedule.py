@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import atexit
 import time
+import warnings
 from concurrent.futures import Future, wait
 from copy import copy
 from dataclasses import dataclass, replace
@@ -121,10 +122,10 @@ class MaskScheduler:
         self.beside_s = 0.0
 
     def settle(self) -> None:
-        """Wait for the segmenter, which works on one frame at a time, and forget its answer; an error is raised."""
+        """Wait for the segmenter, which works on one frame at a time, and forget its answer; warn of its error."""
         request, self._request = self._request, None
-        if request is not None:
-            request.answer.result()
+        if request is not None and (error := request.answer.exception()) is not None:
+            warnings.warn(f"no frame took masks that failed: {error}", RuntimeWarning, stacklevel=2)
 
     def masks_for(self, frame: Frame, gray: NDArray[np.uint8], *, keyframe: bool) -> Instances:
         """The objects in the frame: segmented, or carried over from the previous frame.

@@ -307,7 +307,7 @@ class SlamPipeline:
         self._started().save_map(path, made_by)
 
     def close(self) -> None:
-        """Wait for the segmenter beside tracking; its error, which no frame met, is raised."""
+        """Wait for the segmenter beside tracking."""
         if self._masks is not None:
             self._masks.settle()
 

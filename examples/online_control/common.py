@@ -42,9 +42,9 @@ class Score:
 def score(benchmark: ControlBenchmark, env: gym.Env) -> Score:
     """Of the frames so far but the first, which no action has changed."""
     frames, reward = env.unwrapped.episode.outcomes[1:], benchmark.reward
-    rows = [(frame.reward, reward.charge(frame), reward.cost_of(frame)) for frame in frames]
-    earned, charge, cost = (float(sum(column)) for column in zip(*rows, strict=True))
-    return Score(earned, -earned - charge, cost)
+    earned = sum(frame.reward for frame in frames)
+    charge = sum(reward.charge(frame) for frame in frames)
+    return Score(earned, -earned - charge, sum(reward.cost_of(frame) for frame in frames))
 
 
 def play(benchmark: ControlBenchmark, env: gym.Env, policy: Policy, seed: int = 0) -> Score:

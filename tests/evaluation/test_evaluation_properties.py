@@ -811,8 +811,8 @@ def test_compare_protocols_shows_how_far_they_are_apart():
     truth = walk(n=400)
     rows = compare_protocols(turned(noisy(truth), 2), truth)
     errors = {row.label: row.rmse_m for row in rows}
-    labels = ("not aligned", "origin-aligned", "SE(3)-aligned (TUM's ATE)", "Sim(3)-aligned")
-    assert [errors[label] for label in labels] == sorted((errors[label] for label in labels), reverse=True)
+    assert errors["not aligned"] > errors["origin-aligned"] > errors["SE(3)-aligned (TUM's ATE)"]
+    assert errors["Sim(3)-aligned"] <= errors["SE(3)-aligned (TUM's ATE)"]
     assert {row.metric for row in rows} == {"ATE", "RPE"}
     assert all(row.rmse_m is not None and row.pairs > 0 for row in rows)
     short = compare_protocols(noisy(walk(n=20)), walk(n=20))

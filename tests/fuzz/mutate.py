@@ -127,13 +127,13 @@ def mutate_zip(data: bytes, random: Random) -> bytes:
         with zipfile.ZipFile(io.BytesIO(data)) as old:
             sizes = {entry.filename: entry.file_size for entry in old.infolist()}
             files = {name: old.read(name) if size < 1 << 16 else b"" for name, size in sizes.items()}
+        name = random.choice(list(files))
+        content = files.pop(name)
+        content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
+        name = random.choice((name, name, name, "../x.txt", "/etc/passwd", f"runs/{'0' * 16}/run.json"))
+        return zipped(files | {name: content})
     except Exception:  # a seed that is no archive any more is damaged as bytes
         return mutate(data, [data], random)
-    name = random.choice(list(files))
-    content = files.pop(name)
-    content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
-    name = random.choice((name, name, name, "../x.txt", "/etc/passwd", f"runs/{'0' * 16}/run.json"))
-    return zipped(files | {name: content})
 
 
 def mutate_png(data: bytes, random: Random) -> bytes:

@@ -312,9 +312,8 @@ def _read_folder(data: bytes | None, folder: Path) -> None:
         at(folder, f"depth/{name}", _DEPTH)
     camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0)
     sequence = reader.RecordedSequence(folder, layouts.read_tum(folder, 30.0), camera, id="fuzz")
-    assert all(
-        (folder / file).resolve().is_relative_to(folder.resolve()) for file in sequence._colour + sequence._depth
-    )
+    files = (*sequence._colour, *sequence._depth)
+    assert files and all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)
 
 
 def _read_manifest(data: bytes | None, folder: Path) -> None:
@@ -848,7 +847,7 @@ ODD: dict[str, list[tuple[str, bytes, bytes]]] = {
 LAYOUTS = [_attacked(name, files) for name, files in DAMAGED.items()]
 
 
-EUROC = (formats.EUROC_HEADING + "\n1000000000,0,0,0,1,0,0,0\n2000000000,1,2,3,0.5,0.5,0.5,0.5\n").encode()
+EUROC = (formats.POSE_TABLES["euroc"][1] + "\n1000000000,0,0,0,1,0,0,0\n2000000000,1,2,3,0.5,0.5,0.5,0.5\n").encode()
 VSLAM_LAB = b"ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n1000000000,0,0,0,0,0,0,1\n2e9,1,2,3,0.6,0,0,0.8\n"
 COLMAP = (
     b"# a comment\n1 1 0 0 0 0 0 0 1 rgb/1.5.png\n\n2 0.8 0 0 0.6 1 2 3 1 rgb/2.5.png\n3.0 4.0 -1 5 6 7\n"

@@ -329,3 +329,48 @@ def test_holm(p_values, corrected):
 def test_claims_of_simulated_boards_are_right(shape, sequences):
     right, _ = simulate(shape, np.sort(np.random.default_rng(0).normal(0, 0.25, 5)), sequences, 200)
     assert right.min() >= 0.95
+
+
+def test_ratio_is_the_geometric_mean_of_medians():
+    data = cells(np.random.default_rng(0), {"a": 0.5, "ref": 1.0})
+    (a, ref) = standings(data, data["ref"], ["a", "ref"])
+    expected = stats.gmean([np.median(data["a"][s]) / np.median(data["ref"][s]) for s in data["a"]])
+    assert a.key == "a"
+    assert a.ratio.value == pytest.approx(expected)
+    assert a.ratio.low < a.ratio.value < a.ratio.high
+    assert (ref.ratio.value, ref.ratio.low, ref.ratio.high) == (1, 1, 1)
+    assert (a.rank, ref.rank) == (1, 2)
+    assert (a.wins, ref.wins) == (6, 0)
+    assert (a.verdict, ref.verdict) == ("better", "cannot tell")
+
+
+def test_the_interval_of_a_ratio_is_students():
+    values = np.random.default_rng(1).normal(-0.3, 0.5, 12)
+    found = ratio_interval(np.append(values, np.nan))
+    low, high = np.exp(stats.ttest_1samp(values, 0).confidence_interval(0.95))
+    assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
+    few = ratio_interval(values[:4])
+    assert few.value == pytest.approx(np.exp(values[:4].mean())) and np.isnan([few.low, few.high]).all()
+
+
+def test_below_five_sequences_there_is_one_group_and_from_five_on_clear_differences_show():
+    rng = np.random.default_rng(3)
+    for sequences, groups in ((4, [(1, 2), (1, 2)]), (5, [(1, 1), (2, 2)])):
+        data = cells(rng, {"a": 0.1, "b": 1.0}, sequences=sequences)
+        assert [s.group for s in standings(data, data["b"], ["a", "b"])] == groups
+
+
+def test_a_difference_that_one_sequence_decides_is_none():
+    data = {"a": {f"s{i}": [0.1] for i in range(6)}, "b": {f"s{i}": [0.1] for i in range(5)} | {"s5": [3.0]}}
+    assert [s.group for s in standings(data, data["b"], ["a", "b"])] == [(1, 2), (1, 2)]
+
+
+def test_unranked_and_incomplete_trackers_come_last_and_take_no_rank():
+    data = cells(np.random.default_rng(4), {"a": 0.5, "ref": 1.0, "oracle": 0.01})
+    data["partial"] = {"s0": data["a"]["s0"]}
+    found = standings(data, data["ref"], ["a", "ref"])
+    assert [s.key for s in found] == ["a", "ref", "oracle", "partial"]
+    assert [s.rank is None for s in found] == [False, False, True, True]
+    assert found[3].sequences == 1 and found[3].ratio.value == pytest.approx(
+        np.median(data["a"]["s0"]) / np.median(data["ref"]["s0"])
+    )

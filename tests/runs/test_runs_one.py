@@ -501,3 +501,21 @@ def test_features_of_another_kind_begin_in_no_map() -> None:
     backend = BackendSettings(map=StartMapSettings(file="map.npz"))
     with pytest.raises(SettingsError, match="features are none that maps are made of"):
         start_map_of(SimpleNamespace(backend=backend, features=None), None, "rgbd", {})
+
+
+@pytest.mark.parametrize("name", ["groundtruth.txt", "rgb.txt"])
+def test_stamps_a_fifth_of_a_microsecond_apart_are_refused_before_tracking(
+    store: RunStore, folder: Path, name: str, tmp_path: Path
+) -> None:
+    good = write_folder(tmp_path / "good", FRAMES)
+    lines = (folder / name).read_text().splitlines()
+    lines.insert(3, f"{format_ns(START + 2 * STEP + 200)} {lines[2].partition(' ')[2]}")
+    (folder / name).write_text("\n".join(lines) + "\n")
+    with pytest.raises(DynslamError, match=rf"{name}.*200 ns apart") as caught:
+        resolve(RunSpec(tracker=TARGET, sequence=str(folder)))
+    assert "\n" not in str(caught.value)
+    told: list[str] = []
+    specs = [RunSpec(tracker=TARGET, sequence=str(place)) for place in (good, folder, good)]
+    records = run_many(specs, results=store, on_fault=lambda spec, error: told.append(str(error)))
+    assert [record.status for record in records] == ["ok", "ok"] and len(told) == 1
+    assert store.ids() == [records[0].run_id]

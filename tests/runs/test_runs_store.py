@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from dynslam_bench.runs import RunRecord, RunSpec, RunStore, load_frames, open_s
 from dynslam_bench.runs import store as store_module
 from dynslam_bench.runs.artifacts import PICTURE, SNAPSHOTS_FILE, SPREAD, WORST, SnapshotWriter, read_snapshots, spread
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
-from dynslam_bench.runs.store import FIELDS, list_runs, rescore, run_row
+from dynslam_bench.runs.store import FIELDS, RUN_FILE, list_runs, rescore, run_row
 from dynslam_bench.tuning.storage import JournalFile
 
 HERE = Path(__file__).parent
@@ -707,3 +708,19 @@ def test_nothing_is_written_through_links(one_run: tuple[RunStore, str], secret:
     with pytest.raises(StudyError, match="is a link"):
         JournalFile(journal)
     assert secret.read_text() == SECRET
+
+
+def test_four_publish_the_same_run(tmp_path: Path) -> None:
+    """No false error, no missing file, nothing left over: an existing run is no failure."""
+    store = RunStore(tmp_path)
+    store.prepare()
+
+    def publish(_: int) -> RunRecord:
+        with store.work_folder(RECORD.run_id) as work:
+            (work / "trajectory_online.txt").write_text("0 0 0 0 0 0 0 1\n")
+            return store.publish(work, RECORD)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(publish, range(100))) == [RECORD] * 100
+    assert {path.name for path in store.runs.iterdir()} == {RECORD.run_id}
+    assert {path.name for path in store.folder(RECORD.run_id).iterdir()} == {RUN_FILE, "trajectory_online.txt"}

@@ -484,3 +484,11 @@ def test_a_recording_that_is_here_is_in_the_check(folder: str, tmp_path: Path) -
     assert recorded == tuple(ProblemInstance("bonn/crowd", recorded[0].frames, offset) for offset in range(4))
     assert design_of(StudySpec(name="s", tune=(folder,), recorded=(), data_root=str(root))).recorded == ()
     assert design_of(StudySpec(name="s", tune=(folder,), data_root=str(tmp_path / "empty"))).recorded == ()
+
+
+def test_a_pruned_trial_is_a_preset_too(folders: list[str], tmp_path: Path) -> None:
+    spec = make(folders, trials=2, start=[{"gain": 3.0}], tune=folders[:5], confirm=[], held_out=[], pruner="wilcoxon")
+    trial = run_study(spec, results=tmp_path).study.get_trials()[1]
+    assert trial.state == TrialState.PRUNED and trial.params == {"gain": 3.0}
+    text = read_preset_text(spec, tmp_path, trial=1)
+    assert "gain = 3.0" in text and 'status = "not judged"' in text

@@ -362,9 +362,11 @@ def _keep(
     if not keep.size:
         return keep
     keep = keep[np.argsort(-scores[keep], kind="stable")][:MAX_CANDIDATES]
-    sized = np.concatenate([boxes[keep, :2], boxes[keep, 2:] - boxes[keep, :2]], axis=1).astype(float).tolist()
-    ranked = scores[keep].astype(float).tolist()
-    kept = cv2.dnn.NMSBoxesBatched(sized, ranked, labels[keep].tolist(), 0.0, NMS_IOU)
+    corners = boxes[keep]
+    extent = float(corners.max() - min(float(corners.min()), 0.0)) + 1.0
+    shifted = corners + labels[keep, None].astype(np.float32) * extent  # classes do not overlap any more
+    sized = np.concatenate([shifted[:, :2], shifted[:, 2:] - shifted[:, :2]], axis=1)
+    kept = cv2.dnn.NMSBoxes(sized.astype(float).tolist(), scores[keep].astype(float).tolist(), 0.0, NMS_IOU)
     return keep[np.asarray(kept, np.intp).reshape(-1)][:MAX_OBJECTS]
 
 

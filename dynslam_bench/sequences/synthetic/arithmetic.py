@@ -36,12 +36,18 @@ def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
 
 def _sine(x: float | Array, quarters: int) -> Any:
     """The sine of x + quarters * pi / 2."""
-    turns = np.floor(np.multiply(x, 0.6366197723675814) + 0.5)
+    many = isinstance(x, np.ndarray)
+    x = x if many else float(x)
+    turns: Any = np.floor(x * 0.6366197723675814 + 0.5) if many else math.floor(x * 0.6366197723675814 + 0.5)
     rest = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
-    square, quadrants = rest * rest, (turns.astype(np.int64) + quarters) & 3
+    square = rest * rest
+    if not many:
+        quadrant = (int(turns) + quarters) & 3
+        value = _polynomial(_COSINE, square) if quadrant & 1 else rest * _polynomial(_SINE, square)
+        return -value if quadrant & 2 else value
+    quadrants = (turns.astype(np.int64) + quarters) & 3
     values = np.where(quadrants & 1, _polynomial(_COSINE, square), rest * _polynomial(_SINE, square))
-    signed = np.where(quadrants & 2, -values, values)
-    return signed if signed.ndim else float(signed)
+    return np.where(quadrants & 2, -values, values)
 
 
 def sin(x: Reals) -> Reals:

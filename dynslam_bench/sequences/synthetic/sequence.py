@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dynslam_bench.contracts import Frame, FrameMasks
-from dynslam_bench.core import SequenceError, raising, read_lines, write_atomic
+from dynslam_bench.core import SequenceError, read_lines, write_atomic
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import Camera, Trajectory, write_tum
 from dynslam_bench.sequences.cameras import write_camera
@@ -87,8 +87,13 @@ class FrameStore:
             SequenceError: The file exists but cannot be read (permissions, input error).
         """
         path = self.path(kind, stamp)
-        with raising(SequenceError, f"cannot read {path}", "check the permissions of the cache"):
-            data = path.read_bytes() if path.exists() else b""
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            hint = "check the permissions of the cache"
+            raise SequenceError(f"cannot read {path}: {error.strerror}", hint) from error
         return data if is_intact_png(data, (self.camera.width, self.camera.height), _MODES[kind]) else None
 
     def read(self, kind: str, stamp: float) -> NDArray[Any] | None:

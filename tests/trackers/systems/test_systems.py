@@ -14,6 +14,7 @@ from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.filter import FilterState, FrameBundle
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.contracts.segmenter import Instances
+from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core.errors import DynslamError, SettingsError
@@ -436,3 +437,45 @@ def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> 
     checked = system(name, **{"flow.forward_backward_px": 1.5})._flow
     kept = checked.track(checked.prepare(first), checked.prepare(second), grid).valid
     assert np.count_nonzero(kept) < 0.9 * np.count_nonzero(found.valid), "the check would have changed the verdicts"
+
+
+# A detector that misses a person: every masked system bridges it for as many frames as its settings promise.
+
+
+SEEN = 2
+"""Frames with a detection; then the detector is blind."""
+BLIND_FRAMES = SEEN + 5 + 2
+
+
+CAMERA = Camera(320, 240, 267.7, 269.6, 160.0, 120.0)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[Frame]:
+    """A wall with a texture, two metres away, that moves by two pixels a frame."""
+    texture = np.random.default_rng(0).integers(0, 255, (60, 120), dtype=np.uint8)
+    wall = cv2.resize(texture, (480, 240), interpolation=cv2.INTER_CUBIC)
+    depth = np.full((240, 320), 2.0, np.float32)
+    images = [wall[:, 2 * index : 2 * index + 320, None].repeat(3, 2) for index in range(BLIND_FRAMES)]
+    return [Frame(index, index / 30, np.ascontiguousarray(view), depth) for index, view in enumerate(images)]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A person's mask on disk for the first frames; later images hold nobody."""
+    folder = tmp_path_factory.mktemp("masks")
+    for index in range(BLIND_FRAMES):
+        image = np.zeros((240, 320), np.uint8)
+        image[60:180, 100:180] = 255 if index < SEEN else 0
+        cv2.imwrite(str(folder / f"{index:06d}.png"), image)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["mask-rcnn", "dynaslam-n", "emfoa-oft?flow=none"])
+def test_a_missed_person_is_bridged_for_as_long_as_promised(name: str, views: list[Frame], recorded: Path) -> None:
+    """The systems that cull by masks alone."""
+    promised = TRACKERS.get(name).settings().segmentation.compensate
+    tracker = build_tracker(name, {"segmentation.source": f"recorded:{recorded}"})
+    tracker.reset(CAMERA, rng=np.random.default_rng(0))
+    culled = [tracker.track(frame).stats["culled"] > 0 for frame in views]
+    assert culled == [True] * (SEEN + promised) + [False] * (BLIND_FRAMES - SEEN - promised)
