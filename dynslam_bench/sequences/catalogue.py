@@ -272,7 +272,7 @@ def _is_path(name: str) -> bool:
     return name.startswith((".", "/", "~", "\\"))
 
 
-def parse_frames(frames: tuple[int, int | None] | str | None) -> tuple[int, int | None]:
+def parse_frames(frames: Iterable[int | None] | str | None) -> tuple[int, int | None]:
     """First frame and one past the last (None: to the end) of ``"A:B"``, ``"A:"``, ``":B"`` or a pair.
 
     Raises:
