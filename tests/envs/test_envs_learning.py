@@ -123,7 +123,7 @@ def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
     assert rest(env) == first and env.reset()[0].tobytes() == following, "random numbers are restored, too"
 
 
-def test_what_fails_beside_tracking_on_the_last_frames_is_raised_when_the_environment_is_closed() -> None:
+def test_what_fails_beside_tracking_on_the_last_frames_is_warned_of_when_the_environment_is_closed() -> None:
     class Broken:
         def segment(self, frame: Frame) -> None:
             raise ValueError(f"no masks of frame {frame.index}")
@@ -133,9 +133,8 @@ def test_what_fails_beside_tracking_on_the_last_frames_is_raised_when_the_enviro
     env.reset(seed=0)
     env._tracker._masks.segmenter = Broken()
     env.step(0)
-    with pytest.raises(ValueError, match="no masks of frame 1"):
+    with pytest.warns(RuntimeWarning, match="no masks of frame 1"):
         env.close()
-    env.close()
 
 
 @pytest.mark.parametrize("tracker", ["mask-rcnn", "emfoa-oft", "dynaslam", "ds-slam"])
