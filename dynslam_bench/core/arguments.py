@@ -47,10 +47,10 @@ def names_wrong_arguments(target: C) -> C:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Whether this package, or a library that it calls, raised an error: not a plug-in, nor a user's callable."""
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    root = str(frame.f_globals.get("__name__")).partition(".")[0]
-    return root in {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
+    """Whether an error passed through this package and its libraries alone: no plug-in, nor a user's callable."""
+    modules = {str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)}
+    ours = {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
+    return all(module.partition(".")[0] in ours for module in modules)
 
 
 def _wrong_argument(function: Callable[..., Any], given: dict[str, Any]) -> SettingsError | None:

@@ -2,7 +2,7 @@
 
     PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40]
 
-1,000 points, 640x480. Minimum and median over repeats; pyramidal Lucas-Kanade on the same points is the yardstick
+1,000 points, 640x480. Minimum and median over repeats; pyramidal Lucas-Kanade on the same points is the reference
 for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
 """
 
@@ -40,10 +40,10 @@ def main() -> None:
     points = a_thousand(first)
     lucas_kanade = FlowSettings(method="lucas-kanade", forward_backward_px=0.0)
     wall, processor = timed(one_frame(build_flow(lucas_kanade), first, second, points), repeats)
-    yardstick = min(processor)
+    reference = min(processor)
     print("| method, budget | threads | min ms | median ms | processor ms | ratio to LK | % < 1.5 px |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    print(f"| Lucas-Kanade, 4 levels, one way | 1 | {min(wall):.1f} | {np.median(wall):.1f} | {yardstick:.1f} | 1 | |")
+    print(f"| Lucas-Kanade, 4 levels, one way | 1 | {min(wall):.1f} | {np.median(wall):.1f} | {reference:.1f} | 1 | |")
     rows = [FlowSettings(budget=budget) for budget in (24, 48, 64, 96, 192, 384)]
     rows += [FlowSettings(search="patchmatch"), FlowSettings(forward_backward_px=0.0), FlowSettings(refinement="none")]
     for settings in rows:
@@ -57,7 +57,7 @@ def main() -> None:
                 if settings == FlowSettings()
                 else ", ".join(f"{k}={v}" for k, v in settings.model_dump().items() if v != getattr(FlowSettings(), k))
             )
-            cost = f"{min(processor):.1f} | {min(processor) / yardstick:.2f}" if threads == 1 else "- | -"
+            cost = f"{min(processor):.1f} | {min(processor) / reference:.2f}" if threads == 1 else "- | -"
             print(f"| {note} | {threads} | {min(wall):.1f} | {np.median(wall):.1f} | {cost} | {good:.1f} |", flush=True)
     print("\n| dense, both ways | min ms | median ms |\n| --- | --- | --- |")
     for threads in (1, 2):
