@@ -84,17 +84,13 @@ class FlowSettings(DaisySettings):
 class DenseFlowSettings(DaisySettings):
     """DAISY Filter Flow of every pixel (Eq. 1-3): superpixels, guided filter, winner takes all; read at the points."""
 
-    budget: int = tunable(
-        384, low=48, high=768, limits=(8, 4096), scale="log", meaning="cost evaluations a superpixel in the search"
-    )
-    sweeps: int = tunable(12, low=1, high=16, limits=(1, 32), meaning="times superpixels exchange their best labels")
     range_px: float = tunable(
         160.0, low=16.0, high=256.0, limits=(1.0, 1024.0), scale="log", unit="px",
         meaning="largest displacement searched",
     )  # fmt: skip
     superpixel_px: int = Field(12, ge=4, le=128, description="side of a superpixel")
     candidates: int = Field(
-        5, ge=1, le=9, description="labels tried at each pixel: its superpixel's own and its neighbours'"
+        3, ge=1, le=9, description="labels tried at each pixel: its superpixel's own and its neighbours'"
     )
     filter_radius_px: int = Field(5, ge=2, le=32, description="guided filter's radius (Eq. 2)")
     filter_epsilon: float = Field(

@@ -128,7 +128,7 @@ def main() -> None:
     sets = {"Real frames (fr1_xyz, fr1_rpy)": frames, "Real frames (Bonn crowd)": real("bonn", (1, 5, 10, 15), 12)}
     sparse_table({**sets, "Synthetic warps": warps, "KITTI pair": [kitti_pair()]}, options.budgets, options.seeds)
     kinds_table(warps)
-    dense_table([192, 384])
+    dense_table([64, 384])
 
 
 if __name__ == "__main__":
