@@ -1,6 +1,8 @@
 """What each part of the label search is worth: every search at equal budgets, with and without a guess, over strides.
 
-    PYTHONPATH=. python tests/benchmarks/flow_share.py [--scenes 12] [--starts 40 100] [--budget 64]
+    PYTHONPATH=. python tests/benchmarks/flow_share.py [--scenes 12] [--starts 40 100] [--budget 64] [--dense]
+
+With ``--dense``, the dense flow is compared with a six times larger search of its own.
 
 Every row uses the default settings but for the search (and the budget). A cell is the share of all points, valid or
 not, within `--within` pixels of the truth: mean +- standard deviation over the units; then the mean paired difference
@@ -8,7 +10,7 @@ to `emfoa+propagation` with Student's 95 % interval over the units. A unit is a 
 offsets averaged.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -18,7 +20,7 @@ from scipy import stats
 
 from dynslam_bench.flow.label_search import STRATEGIES
 from dynslam_bench.flow.registry import build_flow
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -34,7 +36,7 @@ Units = dict[str, list[Pair]]
 """Pairs by unit: what is averaged first, and drawn independently of the others (as far as that is true)."""
 
 
-def share(settings: FlowSettings, pair: Pair, guess: bool, seeds: Iterable[int], within: float) -> tuple[float, float]:
+def share(settings: DaisySettings, pair: Pair, guess: bool, seeds: Iterable[int], within: float) -> tuple[float, float]:
     """Percent of the points within so many pixels of the truth, and evaluations a point; means over the seeds."""
     flow = build_flow(settings)
     reference, target = flow.prepare(pair.reference), flow.prepare(pair.target)
@@ -58,7 +60,7 @@ def paired(values: np.ndarray, base: np.ndarray) -> str:
 
 
 def measure(
-    rows: dict[str, FlowSettings], units: Units, guess: bool, seeds: Sequence[int], within: float
+    rows: Mapping[str, DaisySettings], units: Units, guess: bool, seeds: Sequence[int], within: float
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Share of each unit, and mean evaluations a point, by row."""
     shares, spent = {}, {}
@@ -68,7 +70,7 @@ def measure(
     return shares, spent
 
 
-def table(title: str, rows: dict[str, FlowSettings], columns: dict[str, Units], guess: bool, options) -> None:  # type: ignore[no-untyped-def]
+def table(title: str, rows: Mapping[str, DaisySettings], columns: dict[str, Units], guess: bool, options) -> None:  # type: ignore[no-untyped-def]
     """One Markdown table: a row a search, a column a stride (or whatever the columns are)."""
     measured = {name: measure(rows, units, guess, options.seeds, options.within) for name, units in columns.items()}
     heads = []
@@ -128,7 +130,7 @@ def rendered(scene: int, start: int, strides: Sequence[int], count: int) -> list
 def main() -> None:
     """Print the tables."""
     parser = parser_of(
-        None, scenes=12, starts=[40, 100], points=400, budget=FlowSettings().budget, seeds=[0], within=3.0
+        None, scenes=12, starts=[40, 100], points=400, budget=FlowSettings().budget, seeds=[0], within=3.0, dense=False
     )
     options = parser.parse_args()
     names = sorted(STRATEGIES, key=lambda name: (name != BASE, not STRATEGIES[name].propagates))
@@ -139,6 +141,10 @@ def main() -> None:
             for pair, units in zip(rendered(scene, start, STRIDES, options.points), columns.values(), strict=True):
                 if len(pair.points) >= FEWEST:
                     units.setdefault(str(scene), []).append(pair)
+    if options.dense:
+        dense = {"default": DenseFlowSettings(), "larger": DenseFlowSettings(budget=384, sweeps=12, candidates=5)}
+        table("Dense", dense, columns, False, options)
+        return
     table("Rendered, guess given", rows, columns, True, options)
     table("Rendered, no guess", rows, columns, False, options)
 

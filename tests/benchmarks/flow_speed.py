@@ -1,6 +1,6 @@
-"""Time of the sparse flow by budget and thread count, and of the dense flow.
+"""Time of the sparse flow by budget and thread count, or of the dense flow.
 
-    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40]
+    PYTHONPATH=. python tests/benchmarks/flow_speed.py [--repeats 40] [--dense]
 
 1,000 points, 640x480. Minimum and median over repeats; pyramidal Lucas-Kanade on the same points is the reference
 for machines that are not idle: the ratio to it survives a busy neighbour, the milliseconds do not.
@@ -14,9 +14,8 @@ from command_line import parser_of, timed
 from flow_data import corners, synthetic
 
 from dynslam_bench.contracts.flow import FlowEstimator
-from dynslam_bench.flow.dense_flow import DenseDaisyFlow
 from dynslam_bench.flow.registry import build_flow
-from dynslam_bench.flow.settings import FlowSettings
+from dynslam_bench.flow.settings import DenseFlowSettings, FlowSettings
 
 
 def one_frame(flow: FlowEstimator, first: np.ndarray, second: np.ndarray, points: np.ndarray) -> Callable[[], object]:
@@ -31,13 +30,33 @@ def a_thousand(reference: np.ndarray) -> np.ndarray:
     return np.concatenate([points] * (1 + 1000 // len(points)))[:1000]
 
 
+def dense_table(first: np.ndarray, second: np.ndarray, points: np.ndarray, repeats: int) -> None:
+    """Time of a frame with the dense flow, in turns with a six times larger search."""
+    print("| dense flow, both ways | threads | min ms | median ms |\n| --- | --- | --- | --- |")
+    searches = {"default": DenseFlowSettings(), "larger": DenseFlowSettings(budget=384, sweeps=12, candidates=5)}
+    for threads in (1, 2):
+        frames = {
+            name: one_frame(build_flow(each, threads=threads), first, second, points) for name, each in searches.items()
+        }
+        taken: dict[str, list[float]] = {name: [] for name in frames}
+        for _ in range(repeats):
+            for name, frame in frames.items():
+                taken[name] += timed(frame, 1)[0]
+        for name, wall in taken.items():
+            print(f"| {name} | {threads} | {min(wall):.0f} | {np.median(wall):.0f} |", flush=True)
+
+
 def main() -> None:
     """Print all tables."""
-    repeats = parser_of(None, repeats=40).parse_args().repeats
+    options = parser_of(None, repeats=40, dense=False).parse_args()
+    repeats = options.repeats
     cv2.setNumThreads(1)
     pair = synthetic(("similarity",), 3)[-1]
     first, second = pair.reference, pair.target
     points = a_thousand(first)
+    if options.dense:
+        dense_table(first, second, points, repeats)
+        return
     lucas_kanade = FlowSettings(method="lucas-kanade", forward_backward_px=0.0)
     wall, processor = timed(one_frame(build_flow(lucas_kanade), first, second, points), repeats)
     reference = min(processor)
@@ -59,11 +78,6 @@ def main() -> None:
             )
             cost = f"{min(processor):.1f} | {min(processor) / reference:.2f}" if threads == 1 else "- | -"
             print(f"| {note} | {threads} | {min(wall):.1f} | {np.median(wall):.1f} | {cost} | {good:.1f} |", flush=True)
-    print("\n| dense, both ways | min ms | median ms |\n| --- | --- | --- |")
-    for threads in (1, 2):
-        dense = DenseDaisyFlow(threads=threads)
-        wall, _ = timed(lambda dense=dense: dense.flow(dense.prepare(first), dense.prepare(second)), 3)
-        print(f"| {threads} thread{'s'[: threads - 1]} | {min(wall):.0f} | {np.median(wall):.0f} |", flush=True)
 
 
 if __name__ == "__main__":

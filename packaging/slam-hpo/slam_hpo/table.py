@@ -167,7 +167,7 @@ class Benchmark:
 
 
 class Surrogate:
-    """A Gaussian process for every metric and instance: Matern-5/2 kernel, one length a setting and metric.
+    """A Gaussian process for every instance: Matern-5/2 kernel, one length a setting, shared by all instances.
 
     Standard deviations are scaled per instance and metric so that they fit the leave-one-out residuals.
 
@@ -177,35 +177,25 @@ class Surrogate:
     """
 
     def __init__(self, units: NDArray[np.float64], values: NDArray[np.float64]) -> None:
-        self._shape = values.shape[1:-1]
-        self._metrics = [
-            _process(units, metric.reshape(len(units), -1)) for metric in np.moveaxis(transformed(values), -1, 0)
-        ]
+        from sklearn.exceptions import ConvergenceWarning
+        from sklearn.gaussian_process import GaussianProcessRegressor
+        from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
+        self._shape = values.shape[1:]
+        targets = transformed(values).reshape(len(values), -1)
+        lengths = [1.0] * units.shape[1]
+        kernel = ConstantKernel() * Matern(lengths, (0.05, 50.0), nu=2.5) + WhiteKernel(0.2, (1e-3, 2.0))
+        self.process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0)
+        with warnings.catch_warnings():  # a setting without effect has the longest length
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            self.process.fit(units, targets)
+        precision = np.diag(np.linalg.inv(self.process.L_ @ self.process.L_.T))
+        self._calibration = np.sqrt(np.mean(self.process.alpha_**2 / precision[:, None], axis=0))
 
     def predict(self, units: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Means and standard deviations ``[N, sequences, starts, fidelities, 3]``, see `transformed`."""
-        mean = np.empty((len(units), *self._shape, len(self._metrics)))
-        std = np.empty_like(mean)
-        for index, (process, scale) in enumerate(self._metrics):
-            middle, deviation = process.predict(units, return_std=True)
-            mean[..., index] = middle.reshape(mean.shape[:-1])
-            std[..., index] = (deviation * scale).reshape(mean.shape[:-1])
-        return mean, std
-
-
-def _process(units: NDArray[np.float64], targets: NDArray[np.float64]) -> tuple[Any, NDArray[np.float64]]:
-    """A process fitted to targets ``[N, instances]``, and what its standard deviations are to be multiplied by."""
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-
-    kernel = ConstantKernel() * Matern([1.0] * units.shape[1], (0.05, 50.0), nu=2.5) + WhiteKernel(0.2, (1e-3, 2.0))
-    process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0)
-    with warnings.catch_warnings():  # a setting without effect has the longest length
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        process.fit(units, targets)
-    precision = np.diag(np.linalg.inv(process.L_ @ process.L_.T))
-    return process, np.sqrt(np.mean(process.alpha_**2 / precision[:, None], axis=0))
+        mean, std = self.process.predict(units, return_std=True)
+        return mean.reshape(len(units), *self._shape), (std * self._calibration).reshape(len(units), *self._shape)
 
 
 def transformed(values: NDArray[np.float64]) -> NDArray[np.float64]:
