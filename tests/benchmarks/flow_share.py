@@ -2,7 +2,7 @@
 
     PYTHONPATH=. python tests/benchmarks/flow_share.py [--scenes 12] [--starts 40 100] [--budget 64] [--dense]
 
-With ``--dense``, the dense flow is compared with a six times larger search of its own.
+With ``--dense``, the dense flow is compared with a larger search of its own.
 
 Every row uses the default settings but for the search (and the budget). A cell is the share of all points, valid or
 not, within `--within` pixels of the truth: mean +- standard deviation over the units; then the mean paired difference

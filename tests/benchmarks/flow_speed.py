@@ -31,7 +31,7 @@ def a_thousand(reference: np.ndarray) -> np.ndarray:
 
 
 def dense_table(first: np.ndarray, second: np.ndarray, points: np.ndarray, repeats: int) -> None:
-    """Time of a frame with the dense flow, in turns with a six times larger search."""
+    """Time of a frame with the dense flow, in turns with a larger search."""
     print("| dense flow, both ways | threads | min ms | median ms |\n| --- | --- | --- | --- |")
     searches = {"default": DenseFlowSettings(), "larger": DenseFlowSettings(budget=384, sweeps=12, candidates=5)}
     for threads in (1, 2):
