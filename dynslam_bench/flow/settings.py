@@ -43,9 +43,9 @@ class DaisySettings(FlowMethodSettings):
     )
     budget: int = tunable(
         64, low=24, high=384, limits=(8, 4096), scale="log", online=True,
-        meaning="cost evaluations a point, or a superpixel of the dense flow, in the label search",
+        meaning="cost evaluations a point or superpixel in the label search",
     )  # fmt: skip
-    population: int = tunable(6, low=4, high=16, limits=(2, 32), meaning="moths (and flames) a point")
+    population: int = tunable(6, low=4, high=16, limits=(2, 32), meaning="moths (and flames) a point or superpixel")
     sweeps: int = tunable(4, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels")
     cauchy_step_px: float = tunable(
         2.0, low=0.25, high=16.0, scale="log", unit="px", meaning="scale of the Cauchy steps of Eq. 13"

@@ -1,9 +1,9 @@
 """Error and cost evaluations of every flow and every label search, as Markdown tables.
 
-    PYTHONPATH=. python tests/benchmarks/flow_accuracy.py [--budgets 48 64 96 192 384]
+    PYTHONPATH=. python tests/benchmarks/flow_accuracy.py [--budgets 48 64 96 192 384] [--dense]
 
-Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by the length of the true motion. Dense:
-the KITTI pair. Every row uses the default settings but for what it names.
+Sparse: share of all tracks (valid or not) within 1.5 and 3 px of the truth, by the length of the true motion. With
+``--dense``: the dense flow on the KITTI pair. Every row uses the default settings but for what it names.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from command_line import parser_of
-from flow_data import Pair, kitti, real, synthetic
+from flow_data import DENSE_SEARCHES, Pair, kitti, real, synthetic
 
 from dynslam_bench.flow.dense_flow import DenseDaisyFlow
 from dynslam_bench.flow.opencv import DisFlow
@@ -93,7 +93,7 @@ def kinds_table(pairs: list[Pair]) -> None:
         print(f"| {kind} | {row[0]:.1f} | {row[1]:.1f} |", flush=True)
 
 
-def dense_table(budgets: Sequence[int]) -> None:
+def dense_table() -> None:
     """Dense flow of the KITTI pair."""
     first, second, truth, known = kitti()
     gray = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (first, second)]
@@ -111,24 +111,24 @@ def dense_table(budgets: Sequence[int]) -> None:
 
     for preset in ("ultrafast", "fast", "medium"):
         row(f"DIS {preset}", DisFlow(FlowSettings(method="dis", dis_preset=preset)).dense(*gray), None, 0)
-    settings = [DenseFlowSettings(budget=b, search=s) for s in ("emfoa+propagation", "patchmatch") for b in budgets]
-    for each in settings:
-        dense = DenseDaisyFlow(each)
+    searches = DENSE_SEARCHES | {"patchmatch": DenseFlowSettings(search="patchmatch")}
+    for name, settings in searches.items():
+        dense = DenseDaisyFlow(settings)
         result = dense.flow(dense.prepare(gray[0]), dense.prepare(gray[1]))
-        star = " (default)" if each == DenseFlowSettings() else ""
-        name = f"DAISY Filter Flow, {each.search}, {each.budget}{star}"
-        row(name, result.flow, result.valid, result.evaluations)
+        row(f"DAISY Filter Flow, {name}", result.flow, result.valid, result.evaluations)
 
 
 def main() -> None:
     """Print all tables."""
-    options = parser_of(None, budgets=[48, 64, 96, 192, 384], seeds=[0], images=6).parse_args()
+    options = parser_of(None, budgets=[48, 64, 96, 192, 384], seeds=[0], images=6, dense=False).parse_args()
+    if options.dense:
+        dense_table()
+        return
     warps = synthetic(KINDS, options.images)
     frames = real("fr1_xyz", (1, 3, 8, 14), 6) + real("fr1_rpy", (1, 2, 3, 5), 2)
     sets = {"Real frames (fr1_xyz, fr1_rpy)": frames, "Real frames (Bonn crowd)": real("bonn", (1, 5, 10, 15), 12)}
     sparse_table({**sets, "Synthetic warps": warps, "KITTI pair": [kitti_pair()]}, options.budgets, options.seeds)
     kinds_table(warps)
-    dense_table([64, 384])
 
 
 if __name__ == "__main__":

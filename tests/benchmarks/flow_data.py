@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from dynslam_bench.contracts.sequence import Frame
+from dynslam_bench.flow.settings import DenseFlowSettings
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.slam.pose_optimisation import optimise_pose
@@ -18,6 +19,8 @@ RECORDINGS = {
     "fr1_rpy": DATA / "tum/rgbd_dataset_freiburg1_rpy",
     "bonn": DATA / "bonn/rgbd_bonn_crowd",
 }
+DENSE_SEARCHES = {"default": DenseFlowSettings(), "larger": DenseFlowSettings(budget=384, sweeps=12, candidates=5)}
+"""Searches of the dense flow that the measurements compare."""
 
 
 @dataclass

@@ -15,12 +15,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import cv2
 import numpy as np
 from command_line import parser_of
-from flow_data import Pair, corners
+from flow_data import DENSE_SEARCHES, Pair, corners
 from scipy import stats
 
 from dynslam_bench.flow.label_search import STRATEGIES
 from dynslam_bench.flow.registry import build_flow
-from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
+from dynslam_bench.flow.settings import DaisySettings, FlowSettings
 from dynslam_bench.geometry import se3
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -142,8 +142,7 @@ def main() -> None:
                 if len(pair.points) >= FEWEST:
                     units.setdefault(str(scene), []).append(pair)
     if options.dense:
-        dense = {"default": DenseFlowSettings(), "larger": DenseFlowSettings(budget=384, sweeps=12, candidates=5)}
-        table("Dense", dense, columns, False, options)
+        table("Dense", DENSE_SEARCHES, columns, False, options)
         return
     table("Rendered, guess given", rows, columns, True, options)
     table("Rendered, no guess", rows, columns, False, options)

@@ -11,11 +11,13 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 from command_line import parser_of, timed
-from flow_data import corners, synthetic
+from flow_data import DENSE_SEARCHES, corners, synthetic
 
 from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.flow.registry import build_flow
-from dynslam_bench.flow.settings import DenseFlowSettings, FlowSettings
+from dynslam_bench.flow.settings import FlowSettings
+
+LUCAS_KANADE = FlowSettings(method="lucas-kanade", forward_backward_px=0.0)
 
 
 def one_frame(flow: FlowEstimator, first: np.ndarray, second: np.ndarray, points: np.ndarray) -> Callable[[], object]:
@@ -31,19 +33,17 @@ def a_thousand(reference: np.ndarray) -> np.ndarray:
 
 
 def dense_table(first: np.ndarray, second: np.ndarray, points: np.ndarray, repeats: int) -> None:
-    """Time of a frame with the dense flow, in turns with a larger search."""
+    """Time of a frame with each search of the dense flow and with Lucas-Kanade, in turns."""
+    flows = {("Lucas-Kanade, 4 levels, one way", 1): build_flow(LUCAS_KANADE)}
+    flows |= {(name, n): build_flow(each, threads=n) for n in (1, 2) for name, each in DENSE_SEARCHES.items()}
+    frames = {key: one_frame(flow, first, second, points) for key, flow in flows.items()}
+    taken: dict[tuple[str, int], list[float]] = {key: [] for key in frames}
+    for _ in range(repeats):
+        for key, frame in frames.items():
+            taken[key] += timed(frame, 1)[0]
     print("| dense flow, both ways | threads | min ms | median ms |\n| --- | --- | --- | --- |")
-    searches = {"default": DenseFlowSettings(), "larger": DenseFlowSettings(budget=384, sweeps=12, candidates=5)}
-    for threads in (1, 2):
-        frames = {
-            name: one_frame(build_flow(each, threads=threads), first, second, points) for name, each in searches.items()
-        }
-        taken: dict[str, list[float]] = {name: [] for name in frames}
-        for _ in range(repeats):
-            for name, frame in frames.items():
-                taken[name] += timed(frame, 1)[0]
-        for name, wall in taken.items():
-            print(f"| {name} | {threads} | {min(wall):.0f} | {np.median(wall):.0f} |", flush=True)
+    for (name, threads), wall in taken.items():
+        print(f"| {name} | {threads} | {min(wall):.0f} | {np.median(wall):.0f} |")
 
 
 def main() -> None:
@@ -57,8 +57,7 @@ def main() -> None:
     if options.dense:
         dense_table(first, second, points, repeats)
         return
-    lucas_kanade = FlowSettings(method="lucas-kanade", forward_backward_px=0.0)
-    wall, processor = timed(one_frame(build_flow(lucas_kanade), first, second, points), repeats)
+    wall, processor = timed(one_frame(build_flow(LUCAS_KANADE), first, second, points), repeats)
     reference = min(processor)
     print("| method, budget | threads | min ms | median ms | processor ms | ratio to LK | % < 1.5 px |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
