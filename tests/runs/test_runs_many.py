@@ -332,7 +332,8 @@ def test_dynamic_holds_every_ranked_system_on_three_scenes_of_the_eight_replicas
     assert composed - ablations <= set(suite.trackers)
     assert load_suite("dynamic-full").trackers == suite.trackers
     objects = load_suite("objects")
-    assert set(suite.trackers) - {"emfoa-oft-paper"} < set(objects.trackers), "its dense flow takes about a second a frame"
+    slow = {"emfoa-oft-paper"}  # its dense flow takes about half a second a frame
+    assert set(suite.trackers) - slow < set(objects.trackers)
     assert objects.settings == {"segmentation.source": "oracle-classes"}
 
 
