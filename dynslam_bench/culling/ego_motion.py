@@ -12,6 +12,7 @@ from dynslam_bench.culling import Rule
 from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, failing_regions
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, twist_of
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -19,10 +20,14 @@ Floats = NDArray[np.floating]
 MIN_POINTS = 12
 NEAR_M = 0.05
 """Points nearer than this to the camera plane have no weight."""
+MIN_AGREEING = 6.0
+"""Least sum of the points' weights in a fit."""
 TURN_PX = (12.0, 6.0, 4.0)
 """Scale of the redescending kernel in the first Gauss-Newton steps, which change the rotation only."""
 KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
 """The same in the later steps; narrow, since the flow is exact and moving points must not influence the fit."""
+STEPS_PX = np.array(TURN_PX + KERNEL_PX)
+NO_PRIOR = np.zeros((6, 6))
 NEAR_FAR = (0.1, 0.9)
 """Quantiles of the depths whose geometric mean separates near points from distant ones."""
 LOWER_COST = 0.95
@@ -117,38 +122,40 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     use = flow.valid & state.keep & (frame.z > 0)
     if np.count_nonzero(use) < MIN_POINTS:
         return state.T_world_pred
-    start, prior, share = np.eye(4), None, static_share(frame, state, flow.xy[use])
+    start, prior, share = np.eye(4), NO_PRIOR, static_share(frame, state, flow.xy[use])
     points = state.camera.unproject(frame.xy[use], frame.z[use])
     before = state.camera.undistort_points(flow.xy[use])
     if state.T_world_pred is not None:
         start = se3.inverse(state.T_world_prev) @ state.T_world_pred
         prior = prior_information(state, start)
-    T_prev_cur = _align(points, before, state.camera, start, share, prior)
-    if T_prev_cur is None:
+    lens = state.camera.fx, state.camera.fy, state.camera.cx, state.camera.cy
+    T_prev_cur, agreeing = _align(start, points, before, share, prior, STEPS_PX, len(TURN_PX), *lens)
+    if agreeing < MIN_AGREEING:
         return state.T_world_pred
-    return state.T_world_prev @ _compared(T_prev_cur, points, before, state.camera, start, share)
+    return state.T_world_prev @ _compared(T_prev_cur, points, before, start, share, lens)
 
 
-def _compared(T_prev_cur: Array, points: Array, pixels: Array, camera: Camera, start: Array, weight: Array) -> Array:
+def _compared(
+    T_prev_cur: Array, points: Array, pixels: Array, start: Array, weight: Array, lens: tuple[float, ...]
+) -> Array:
     """The given motion, or that of the distant points if clearly more agree with it; arguments as of `_align`."""
     far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
-    other = _align(points[far], pixels[far], camera, start, weight[far], None)
-    if other is None:
+    other, agreeing = _align(start, points[far], pixels[far], weight[far], NO_PRIOR, STEPS_PX, len(TURN_PX), *lens)
+    if agreeing < MIN_AGREEING:
         return T_prev_cur
-    noise = np.median(np.linalg.norm(camera.project(se3.transform(other, points[far])) - pixels[far], axis=1))
-    scale = float(np.clip(3 * noise, *NOISE_PX))
-    other = _align(points, pixels, camera, other, weight, None, (scale, scale))
-    if other is None:
+    noise = np.sqrt(np.median(_squared_errors(other, points[far], pixels[far], *lens)))
+    scale = np.clip(3 * noise, *NOISE_PX)
+    other, agreeing = _align(other, points, pixels, weight, NO_PRIOR, np.repeat(scale, 2), 0, *lens)
+    if agreeing < MIN_AGREEING:
         return T_prev_cur
+    costs = [
+        (weight * (1 - scale**2 / (_squared_errors(pose, points, pixels, *lens) + scale**2))).sum()
+        for pose in (other, T_prev_cur)
+    ]
+    return other if costs[0] < LOWER_COST * costs[1] else T_prev_cur
 
-    def cost(pose: Array) -> float:
-        squared = np.square(camera.project(se3.transform(pose, points)) - pixels).sum(axis=1)
-        return float((weight * squared / (squared + scale**2)).sum())
 
-    return other if cost(other) < LOWER_COST * cost(T_prev_cur) else T_prev_cur
-
-
-def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64]:
     """Information of the motion model on the motion since the previous frame.
 
     Args:
@@ -157,10 +164,10 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
 
     Returns:
         Information ``[6, 6]`` of (translation, rotation), both in the previous camera's frame, times `CORRELATION`;
-        None without a covariance of the motion model.
+        0 without a covariance of the motion model.
     """
     if state.motion_covariance is None or state.T_world_prev is None:
-        return None
+        return NO_PRIOR
     rotation = np.zeros((6, 6))
     rotation[:3, :3] = state.T_world_prev[:3, :3].T
     rotation[3:, 3:] = T_prev_cur[:3, :3]
@@ -168,40 +175,50 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
     return np.asarray(CORRELATION * np.linalg.inv(covariance))
 
 
+@kernel
 def _align(
-    points: NDArray[np.float64],
-    pixels: NDArray[np.float64],
-    camera: Camera,
-    start: NDArray[np.float64],
-    prior_weight: NDArray[np.float64],
-    information: NDArray[np.float64] | None,
-    scales: tuple[float, ...] = (),
-) -> NDArray[np.float64] | None:
-    """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``; None if too few points agree.
+    start: Array, points: Array, pixels: Array, prior_weight: Array, information: Array, scales: Array, turns: int,
+    fx: float, fy: float, cx: float, cy: float,
+) -> tuple[Array, float]:  # fmt: skip
+    """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``, and the sum of the points' weights.
 
-    `information` ``[6, 6]`` is that of the prior, the start pose. With `scales`, these are the kernel's, and no step
-    changes the rotation only.
+    `information` ``[6, 6]`` is that of the prior, the start pose. `scales` are the kernel's, one a step, of which the
+    first `turns` change the rotation only. Where the system cannot be solved the sum is 0.
     """
-    shutter = np.square(ROLLING_SHUTTER_SHARE * np.linalg.norm(camera.project(points) - pixels, axis=1))
-    lens = camera.fx, camera.fy, camera.cx, camera.cy
-    pose, total, inverse_start = start, 0.0, se3.inverse(start)
-    turns = 0 if scales else len(TURN_PX)
-    for number, scale in enumerate(scales or TURN_PX + KERNEL_PX):
-        hessian, gradient, total = _linearise(pose, points, pixels, prior_weight, shutter, scale**2, *lens)
-        if information is not None:
-            hessian += information
-            gradient += information @ se3.log(pose @ inverse_start)
+    pose, total, inverse_start = start, 0.0, start.copy()
+    inverse_start[:3, :3] = start[:3, :3].T
+    inverse_start[:3, 3] = -inverse_start[:3, :3] @ np.ascontiguousarray(start[:3, 3])
+    shutter = ROLLING_SHUTTER_SHARE**2 * _squared_errors(np.eye(4), points, pixels, fx, fy, cx, cy)
+    for number in range(len(scales)):
+        hessian, gradient, total = _linearise(
+            pose, points, pixels, prior_weight, shutter, scales[number] ** 2, fx, fy, cx, cy
+        )
+        hessian += information
+        gradient += information @ twist_of(pose @ inverse_start)
         if number < turns:
             hessian[:3], hessian[:, :3], gradient[:3] = 0.0, 0.0, 0.0
             hessian[:3, :3] = np.trace(hessian) * np.eye(3)
-        try:
-            step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), -gradient)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.isfinite(step).all() or np.linalg.norm(step[3:]) > 1.0:
-            return None
-        pose = se3.exp(step) @ pose
-    return pose if total >= 0.5 * MIN_POINTS else None
+        step = -gradient
+        if not cholesky_solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), step):
+            return pose, 0.0
+        if not np.linalg.norm(step[3:]) <= 1.0:
+            return pose, 0.0
+        pose = apply_twist(pose, step)
+    return pose, total
+
+
+@kernel
+def _squared_errors(pose: Array, points: Array, pixels: Array, fx: float, fy: float, cx: float, cy: float) -> Array:
+    """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
+    errors = np.full(len(points), np.inf)
+    for i in range(len(points)):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        if z > 0:
+            x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z
+            y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z
+            errors[i] = (fx * x + cx - pixels[i, 0]) ** 2 + (fy * y + cy - pixels[i, 1]) ** 2
+    return errors
 
 
 @kernel
@@ -209,7 +226,7 @@ def _linearise(
     pose: Array, points: Array, pixels: Array, prior_weight: Array, shutter: Array, scale2: float,
     fx: float, fy: float, cx: float, cy: float,
 ) -> tuple[Array, Array, float]:  # fmt: skip
-    """Gauss-Newton matrix ``[6, 6]`` and gradient ``[6]`` by a left perturbation (rho, phi), and the sum of weights."""
+    """Lower triangle of the Gauss-Newton matrix ``[6, 6]``, gradient ``[6]`` of a left twist, sum of the weights."""
     hessian, gradient, total = np.zeros((6, 6)), np.zeros(6), 0.0
     j = np.zeros((2, 6))
     for i in range(len(points)):
@@ -228,7 +245,7 @@ def _linearise(
             for m in range(6):
                 scaled = weight * j[row, m]
                 gradient[m] += scaled * error
-                for n in range(6):
+                for n in range(m + 1):
                     hessian[m, n] += scaled * j[row, n]
     return hessian, gradient, total
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.flow.simd import Bytes, Floats, Ints, load, load_bytes, sample, spread, store, total
-from dynslam_bench.geometry.cholesky import cholesky_solve
+from dynslam_bench.geometry.gauss_newton import cholesky_solve
 
 BORDER = 48
 """Pixels repeated around the images that are refined on."""

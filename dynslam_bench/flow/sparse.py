@@ -174,6 +174,7 @@ class SparseDaisyFlow:
             candidates = np.concatenate([start, np.broadcast_to(zero, start.shape)], axis=1)
         neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
         motions = np.full((2, 4), np.nan, dtype=np.float32)
+        images = described, side_of(pair.target, pair.tables), pair.tables
         for phase, end in enumerate(ends):
             if phase > 0:
                 best = state.flames[:, 0].copy()
@@ -182,7 +183,6 @@ class SparseDaisyFlow:
                 candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
                 sources = (points, best, label_turns(best), neighbours, motions)
                 run(transported_labels, 0, n, *sources, lower, upper, candidates)
-            images = described, side_of(pair.target, pair.tables), pair.tables
             run(run_phase, 0, n, *images, state, candidates, end, phase, np.uint64(seed), *options)
         return state
 

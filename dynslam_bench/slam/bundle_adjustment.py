@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.cholesky import cholesky_solve
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import (
     CHI2_DEPTH,
     CHI2_MONO,
-    apply_twist,
     cauchy_width,
     observation_chi2,
 )

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import Camera, Trajectory, se3
+from dynslam_bench.geometry.gauss_newton import apply_twist
 from dynslam_bench.slam.map import Array, Map
-from dynslam_bench.slam.pose_optimisation import apply_twist
 from dynslam_bench.slam.settings import MotionModelSettings
 from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, fit_pose, right_coordinates
 

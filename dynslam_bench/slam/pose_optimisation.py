@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.cholesky import cholesky_solve
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve
 
 Array = NDArray[np.float64]
 
@@ -55,52 +55,6 @@ class PoseEstimate:
     def count(self) -> int:
         """Number of inliers."""
         return int(np.count_nonzero(self.inliers))
-
-
-@kernel
-def apply_twist(pose: Array, xi: Array) -> Array:
-    """``exp(xi) @ pose`` for a twist (translation, rotation), re-orthonormalised."""
-    theta2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
-    theta = np.sqrt(theta2)
-    if theta < 1e-8:
-        a, b, c = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
-    else:
-        a, b, c = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta2, (theta - np.sin(theta)) / (theta2 * theta)
-    k = np.zeros((3, 3))
-    k[0, 1], k[0, 2], k[1, 2] = -xi[5], xi[4], -xi[3]
-    k[1, 0], k[2, 0], k[2, 1] = xi[5], -xi[4], xi[3]
-    k2 = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for m in range(3):
-                k2[i, j] += k[i, m] * k[m, j]
-    step = np.eye(4)
-    for i in range(3):
-        for j in range(3):
-            step[i, j] += a * k[i, j] + b * k2[i, j]
-            step[i, 3] += (b * k[i, j] + c * k2[i, j]) * xi[j]
-        step[i, 3] += xi[i]
-    out = np.eye(4)
-    for i in range(3):
-        for j in range(4):
-            s = step[i, 3] if j == 3 else 0.0
-            for m in range(3):
-                s += step[i, m] * pose[m, j]
-            out[i, j] = s
-    # Gram-Schmidt on the rows keeps rounding from building up
-    n = np.sqrt(out[0, 0] ** 2 + out[0, 1] ** 2 + out[0, 2] ** 2)
-    for j in range(3):
-        out[0, j] /= n
-    d = out[0, 0] * out[1, 0] + out[0, 1] * out[1, 1] + out[0, 2] * out[1, 2]
-    for j in range(3):
-        out[1, j] -= d * out[0, j]
-    n = np.sqrt(out[1, 0] ** 2 + out[1, 1] ** 2 + out[1, 2] ** 2)
-    for j in range(3):
-        out[1, j] /= n
-    out[2, 0] = out[0, 1] * out[1, 2] - out[0, 2] * out[1, 1]
-    out[2, 1] = out[0, 2] * out[1, 0] - out[0, 0] * out[1, 2]
-    out[2, 2] = out[0, 0] * out[1, 1] - out[0, 1] * out[1, 0]
-    return out
 
 
 @kernel

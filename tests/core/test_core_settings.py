@@ -204,7 +204,7 @@ def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pyte
 
 
 def test_kernels_are_cached_and_release_the_lock() -> None:
-    from dynslam_bench.slam.pose_optimisation import apply_twist
+    from dynslam_bench.geometry.gauss_newton import apply_twist
 
     options = apply_twist.targetoptions
     assert options["nogil"] and apply_twist.stats.cache_path

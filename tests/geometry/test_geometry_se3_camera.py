@@ -9,6 +9,7 @@ import scipy.linalg
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.geometry import Camera, Trajectory, se3
+from dynslam_bench.geometry.gauss_newton import apply_twist, twist_of
 
 FR1 = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 BONN = Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098, (0.039903, -0.099343, -0.00073, -0.000144, 0.0))
@@ -36,6 +37,14 @@ def test_exp_is_the_matrix_exponential(angle):
     xi = twists(angle, 5)
     generators = se3.from_matrix(xi[:, :3], se3.hat(xi[:, 3:])) - np.diag([0, 0, 0, 1])
     assert np.allclose(se3.exp(xi), scipy.linalg.expm(generators), atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 9e-6, 1.1e-5, 0.3, 2.0])
+def test_compiled_twists_are_those_of_numpy(angle):
+    start = se3.exp(twists(1.0, 1, seed=1))[0]
+    for twist in twists(angle, 5):
+        assert np.allclose(twist_of(se3.exp(twist)), twist, atol=1e-9)
+        assert np.allclose(apply_twist(start, twist), se3.exp(twist) @ start, atol=1e-9)
 
 
 def test_inverse_transform_and_hat():

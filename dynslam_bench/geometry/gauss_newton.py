@@ -1,0 +1,105 @@
+"""Steps of Gauss-Newton on SE(3), inside compiled loops: solve the normal equations, apply the twist to the pose."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynslam_bench.core.compiled import kernel
+
+Array = NDArray[np.float64]
+
+
+@kernel
+def cholesky_solve(a: Array, b: Array) -> bool:
+    """Solve ``a x = b`` in place for a symmetric positive definite `a`; `b` becomes x. False if it is not definite.
+
+    Only the lower triangle of `a` is read.
+    """
+    n = a.shape[0]
+    for j in range(n):
+        for i in range(j, n):
+            s = a[i, j]
+            for k in range(j):
+                s -= a[i, k] * a[j, k]
+            if i == j:
+                if not s > 1e-14:
+                    return False
+                a[j, j] = np.sqrt(s)
+            else:
+                a[i, j] = s / a[j, j]
+    for i in range(n):
+        s = b[i]
+        for k in range(i):
+            s -= a[i, k] * b[k]
+        b[i] = s / a[i, i]
+    for i in range(n - 1, -1, -1):
+        s = b[i]
+        for k in range(i + 1, n):
+            s -= a[k, i] * b[k]
+        b[i] = s / a[i, i]
+    return True
+
+
+@kernel
+def apply_twist(pose: Array, xi: Array) -> Array:
+    """``exp(xi) @ pose`` for a twist (translation, rotation), re-orthonormalised."""
+    theta2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
+    theta = np.sqrt(theta2)
+    if theta < 1e-8:
+        a, b, c = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    else:
+        a, b, c = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta2, (theta - np.sin(theta)) / (theta2 * theta)
+    k = np.zeros((3, 3))
+    k[0, 1], k[0, 2], k[1, 2] = -xi[5], xi[4], -xi[3]
+    k[1, 0], k[2, 0], k[2, 1] = xi[5], -xi[4], xi[3]
+    k2 = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for m in range(3):
+                k2[i, j] += k[i, m] * k[m, j]
+    step = np.eye(4)
+    for i in range(3):
+        for j in range(3):
+            step[i, j] += a * k[i, j] + b * k2[i, j]
+            step[i, 3] += (b * k[i, j] + c * k2[i, j]) * xi[j]
+        step[i, 3] += xi[i]
+    out = np.eye(4)
+    for i in range(3):
+        for j in range(4):
+            s = step[i, 3] if j == 3 else 0.0
+            for m in range(3):
+                s += step[i, m] * pose[m, j]
+            out[i, j] = s
+    # Gram-Schmidt on the rows keeps rounding from building up
+    n = np.sqrt(out[0, 0] ** 2 + out[0, 1] ** 2 + out[0, 2] ** 2)
+    for j in range(3):
+        out[0, j] /= n
+    d = out[0, 0] * out[1, 0] + out[0, 1] * out[1, 1] + out[0, 2] * out[1, 2]
+    for j in range(3):
+        out[1, j] -= d * out[0, j]
+    n = np.sqrt(out[1, 0] ** 2 + out[1, 1] ** 2 + out[1, 2] ** 2)
+    for j in range(3):
+        out[1, j] /= n
+    out[2, 0] = out[0, 1] * out[1, 2] - out[0, 2] * out[1, 1]
+    out[2, 1] = out[0, 2] * out[1, 0] - out[0, 0] * out[1, 2]
+    out[2, 2] = out[0, 0] * out[1, 1] - out[0, 1] * out[1, 0]
+    return out
+
+
+@kernel
+def twist_of(pose: Array) -> Array:
+    """The twist ``[6]`` (translation, rotation) whose exponential is the pose, rotated by less than half a turn."""
+    out = np.empty(6)
+    out[3] = 0.5 * (pose[2, 1] - pose[1, 2])
+    out[4] = 0.5 * (pose[0, 2] - pose[2, 0])
+    out[5] = 0.5 * (pose[1, 0] - pose[0, 1])
+    sine = np.sqrt(out[3] * out[3] + out[4] * out[4] + out[5] * out[5])
+    theta = np.arctan2(sine, 0.5 * (pose[0, 0] + pose[1, 1] + pose[2, 2] - 1.0))
+    if theta < 1e-5:
+        factor = 1.0 / 12.0 + theta * theta / 720.0
+    else:
+        out[3:] *= theta / sine
+        factor = (1.0 - 0.5 * theta / np.tan(0.5 * theta)) / (theta * theta)
+    phi, t = out[3:], pose[:3, 3]
+    once = np.cross(phi, t)
+    out[:3] = t - 0.5 * once + factor * np.cross(phi, once)
+    return out
