@@ -2,9 +2,9 @@
 
 1. Superpixels; one label search per superpixel at its centre, with propagation between adjacent ones (as in `sparse`).
 2. Labels are refined photometrically (`refinement`). A label is a similarity and thus sub-pixel exact over its region.
-3. For each superpixel, its own label and its neighbours' are tried on every pixel of its bounding box extended by twice
-   the filter's radius. The raw costs (Eq. 1) are aggregated by the guided filter (Eq. 2), each pixel takes the label of
-   the lowest cost (Eq. 3). This works at half resolution: the orientation maps are no finer.
+3. For each superpixel, its own label and its neighbours' are tried on every pixel of its bounding box extended by the
+   filter's radius. The raw costs (Eq. 1) are aggregated by the guided filter (Eq. 2), each pixel takes the label of the
+   lowest cost (Eq. 3). This works at half resolution: the orientation maps are no finer.
 4. A pixel is valid if the flow of the other direction leads back. The others take an affine motion that is fitted to
    the consistent regions around them, but stay marked as not valid.
 """
@@ -615,7 +615,7 @@ def aggregate_and_choose(
         if starts[r] == starts[r + 1]:
             continue
         region = members[starts[r] : starts[r + 1]]
-        top, left, high, wide = patch_around(region, rows, columns, 2 * radius)
+        top, left, high, wide = patch_around(region, rows, columns, radius)
         pitch = wide + 2 * radius
         n = (high + 2 * radius) * pitch
         if n > size:
