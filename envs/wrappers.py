@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import operator
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
@@ -364,7 +365,8 @@ class DropFrames(SlamWrapper):
     Real-time mode: frame i arrives at its stamp. When the tracker is done with a frame it takes the newest one that
     has arrived, or waits for the next; those in between are dropped. They count as not tracked (coverage) and cost
     what lost ones do, added to the reward of the step that dropped them. The last frame is never dropped. With
-    measured times the episode depends on the machine; `frame_time_s` makes it reproducible.
+    measured times the episode depends on the machine, and `step` waits for the frame: what works beside tracking (a
+    network, threads of an external system) has the time that it has live. `frame_time_s` makes it reproducible.
 
     Compiling kernels and loading networks is no work of a frame: before the first measured episode the tracker tracks
     the first `WARM_UP_FRAMES` frames off the clock and is reset.
@@ -397,7 +399,9 @@ class DropFrames(SlamWrapper):
         if share is not None and not 0 <= share < 1:
             raise SettingsError(f"share is {share}, expected a probability in [0, 1)")
         self._speed, self._frame_time_s, self._share, self._seed = speed, frame_time_s, share, seed
-        self._warm = share is not None or frame_time_s is not None
+        self._live = share is None and frame_time_s is None
+        self._warm = not self._live
+        self._overhead_s = 0.0  # of the latest step beside tracking: it is a part of the wait
 
     @property
     def dropped(self) -> int:
@@ -419,8 +423,13 @@ class DropFrames(SlamWrapper):
         index = episode.next_index
         target = self._next_frame(index)
         charged = self._base.drop_frames(target - index)
+        idle_s = max(self._arrivals()[target] - episode.free_at, 0.0)
+        if self._live:
+            time.sleep(max(idle_s - self._overhead_s, 0.0))
+        start = time.perf_counter()
         observation, reward, terminated, truncated, info = self.env.step(action)
-        episode.free_at = max(episode.free_at, self._arrivals()[target]) + self._busy_s()
+        self._overhead_s = time.perf_counter() - start - self._busy_s()
+        episode.free_at += idle_s + self._busy_s()
         return observation, float(reward) + charged, terminated, truncated, info
 
     def _warm_up(self, options: dict[str, Any] | None) -> None:

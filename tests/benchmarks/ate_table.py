@@ -32,6 +32,7 @@ COLUMNS = {
     "skipped": ("F not used %", "epipolar_skipped", 1e2),
     "frame": ("frame ms", "frame_ms", 1),
     "p95": ("95 % of frames, ms", "frame_p95_s", 1e3),
+    "dropped": ("dropped %", "dropped", 1e2),
     "memory": ("memory MB", "peak_memory_mb", 1),
     "keyframes": ("keyframes", "keyframes", 1),
     "loops": ("loops closed", "loops", 1),
@@ -57,6 +58,7 @@ def measured(run: RunResult) -> dict[str, float]:
     return {
         "keyframes": run.record.keyframes,
         "loops": int(run.frames().get("stat_loops", pd.Series([0])).max()),
+        "dropped": run.record.n_dropped / run.record.n_frames,
         "frame_p95_s": run.record.timings["total"].p95_s,
         "path_m": steps.sum(),
         "farthest_m": np.linalg.norm(positions - positions[0], axis=1).max(),
@@ -77,8 +79,9 @@ def cell(runs: pd.DataFrame, show: str, style: str) -> str:
 def main() -> None:
     """Make the runs and print the table."""
     parser = parser_of(
-        __doc__, offsets=[0], seeds=[0], stride=1, protocol="tum-rgbd/v1", jobs=1, results="results/tables"
-    )
+        __doc__, offsets=[0], seeds=[0], stride=1, protocol="tum-rgbd/v1", jobs=1, results="results/tables",
+        realtime=False,
+    )  # fmt: skip
     parser.add_argument("--scenes", nargs="+", type=int, default=[])
     parser.add_argument("--trackers", nargs="+", required=True, metavar="'TRACKER [NAME=VALUE ...]'")
     parser.add_argument("--sequences", nargs="+", required=True)
@@ -93,6 +96,7 @@ def main() -> None:
             tracker, [f"{sequence}?scene={scene}" for scene in chosen.scenes] or [sequence],
             settings=parse_assignments(assignments), seeds=chosen.seeds,
             offsets=chosen.offsets, frames=chosen.frames, stride=chosen.stride,
+            realtime=chosen.realtime,
         )  # fmt: skip
         specs += new
         keys += [(text, sequence)] * len(new)

@@ -662,6 +662,15 @@ def test_compiling_is_no_work_of_a_frame(monkeypatch: pytest.MonkeyPatch) -> Non
     assert Compiles.resets == 3  # it is warm
 
 
+def test_a_live_episode_takes_as_long_as_the_recording() -> None:
+    env = DropFrames(SlamEnv(ToySequence(12), TARGET))
+    env.reset(seed=0)
+    start = time.perf_counter()
+    for _ in range(11):
+        env.step(0)
+    assert time.perf_counter() - start > 10 / 30 and env.dropped == 0
+
+
 def test_warming_up_leaves_the_random_numbers_where_they_are() -> None:
     def drawn(env) -> list[float]:
         found = []
