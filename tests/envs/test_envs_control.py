@@ -194,14 +194,6 @@ def test_rgbd_holds_copies_of_the_images() -> None:
     assert env.observation_space["depth"].high.max() == MAX_DEPTH_M
 
 
-def test_no_ground_truth_in_the_observation() -> None:
-    with_truth, without = SlamEnv(ToySequence(8), TARGET), SlamEnv(ToySequence(8, has_truth=False), TARGET)
-    for env in (with_truth, without):
-        env.reset(seed=4)
-    for _ in range(7):
-        assert with_truth.step(0)[0].tobytes() == without.step(0)[0].tobytes()
-
-
 # The paper's preprocessing is a group of the tracker's settings; the environment's frames follow it.
 
 

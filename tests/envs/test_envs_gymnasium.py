@@ -133,14 +133,6 @@ def rollout(env: SlamEnv, steps: int, seed: int) -> bytes:
 # Copies of an environment in mid-episode: they go on alike, and apart.
 
 
-def test_a_copy_goes_on_from_the_same_frame_to_the_bit() -> None:
-    env = stepped(SlamEnv(ToySequence(12), TARGET, control=["noise.level_m"]), 4)
-    duplicate = copy.deepcopy(env)
-    assert isinstance(duplicate, SlamEnv) and duplicate.sequence is env.sequence and duplicate.episode.next_index == 5  # type: ignore[attr-defined]
-    assert rest(env) == rest(duplicate)
-    assert env.reset()[0] == pytest.approx(duplicate.reset()[0]), "the seeds that follow are the same, too"
-
-
 def test_copies_go_their_own_ways() -> None:
     env = stepped(SlamEnv(ToySequence(12), TARGET, control=["noise.level_m"]), 4)
     loud, quiet = copy.deepcopy(env), copy.deepcopy(env)

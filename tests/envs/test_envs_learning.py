@@ -110,6 +110,7 @@ def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
     settings = {"segmentation.schedule": "async", "segmentation.latency_s": 0.06} if beside else {}
     env = stepped(SlamEnv(sequence, tracker, threads=2, settings=settings), 3)
     state, duplicate = env.clone_state(), copy.deepcopy(env)
+    assert duplicate.sequence is env.sequence and duplicate.episode.next_index == 4
     first = rest(env)
     assert rest(duplicate) == first and len(first[0]) == 4
     finals = [each.final_trajectory() for each in (env, duplicate)]
@@ -121,6 +122,7 @@ def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
     following = env.reset()[0].tobytes()
     env.restore_state(state)
     assert rest(env) == first and env.reset()[0].tobytes() == following, "random numbers are restored, too"
+    assert duplicate.reset()[0].tobytes() == following, "the seeds that follow are the same, too"
 
 
 def test_what_fails_beside_tracking_on_the_last_frames_is_warned_of_when_the_environment_is_closed() -> None:
