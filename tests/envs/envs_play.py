@@ -4,6 +4,7 @@ import warnings
 from typing import Any
 
 import gymnasium as gym
+import pytest
 from gymnasium.utils.env_checker import check_env
 
 QUIET = {"noise.enabled": False}
@@ -43,3 +44,11 @@ def checked(env: gym.Env) -> None:
         warnings.simplefilter("error")
         check_env(env.unwrapped)
     env.close()
+
+
+def checked_by_stable_baselines3(env: gym.Env) -> None:
+    """Its checker has nothing to say."""
+    checks = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra [rl] is not installed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checks.check_env(env)

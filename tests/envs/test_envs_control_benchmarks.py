@@ -3,13 +3,12 @@
 import copy
 import dataclasses
 import pickle
-import warnings
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_play import checked
+from envs_play import checked, checked_by_stable_baselines3
 from gymnasium.envs.registration import EnvSpec
 from sequence_folders import SHARED, needs_shared
 
@@ -45,12 +44,7 @@ def test_it_passes_the_checkers(id: str) -> None:
         return gym.make(f"dynslam/{id}", split="test", index=0, frames=[0, 16], render_mode="rgb_array")
 
     checked(make())
-    pytest.importorskip("stable_baselines3", reason="the extra [rl] is not installed")
-    from stable_baselines3.common.env_checker import check_env
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(make())
+    checked_by_stable_baselines3(make())
 
 
 @pytest.mark.parametrize("id", BENCHMARKS)

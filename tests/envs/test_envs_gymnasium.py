@@ -54,7 +54,9 @@ def test_the_default_tracker_passes_the_checker() -> None:
 
 
 @pytest.mark.parametrize(
-    "kwargs", [{}, {"observation": "rgbd"}, {"control": CONTROL}, {"reward": "neg_pose_error", "lost_after": 3}]
+    "kwargs",
+    [{}, {"observation": "rgbd"}, {"control": CONTROL}]
+    + [{"reward": reward, "lost_after": 3, "window": 6} for reward in (*REWARDS, AccuracyMinusCost(weight=0.1))],
 )
 def test_every_kind_of_environment_passes_the_checker(kwargs: dict) -> None:
     for sequence in (ToySequence(12), ToySequence(12, has_truth=False), ToySequence(12, hole=(0, 4))):

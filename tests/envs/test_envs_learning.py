@@ -4,7 +4,6 @@ import copy
 import pickle
 import sys
 import time
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_play import QUIET, checked, play, rest, stepped
+from envs_play import QUIET, checked, checked_by_stable_baselines3, play, rest, stepped
 from envs_toys import FIXED, SPEC, TARGET, FixedTracker, ToySequence, ToyTracker, images, write_folder
 
 import dynslam_bench.envs  # noqa: F401
@@ -24,7 +23,6 @@ from dynslam_bench.envs import (
     GENERIC_ID,
     KEYPOINT_LAYOUT,
     PRIVILEGED_LAYOUT,
-    REWARDS,
     AccuracyMinusCost,
     Degradation,
     DegradeFrames,
@@ -251,7 +249,8 @@ def test_fixed_infos_have_one_form_and_say_what_is_there() -> None:
     forms = []
     for sequence in (ToySequence(9), ToySequence(9, has_truth=False), ToySequence(9, hole=(0, 4))):
         settings = {"mode": "lost", "at": 5, "until": 7}
-        infos = play(SlamEnv(sequence, TARGET, settings=settings, fixed_info=True), seed=0)[1]
+        env = SlamEnv(sequence, TARGET, settings=settings, fixed_info=True)
+        infos = play(env, seed=0)[1]
         plain = play(SlamEnv(sequence, TARGET, settings=settings), seed=0)[1]
         forms += [form(info) for info in infos]
         for info, usual in zip(infos, plain, strict=True):
@@ -260,14 +259,8 @@ def test_fixed_infos_have_one_form_and_say_what_is_there() -> None:
             assert all(np.array_equal(info[name], usual[name]) for name in set(usual) - {"episode_metrics"})
             metrics = usual.get("episode_metrics", {})
             assert {name: info["episode_metrics"][name] for name in metrics} == metrics
-            assert sum(info["episode_metrics"][f"has_{name}"] for name in metric_names(infos_protocol())) == len(
-                metrics
-            )
+            assert sum(info["episode_metrics"][f"has_{name}"] for name in metric_names(env.protocol)) == len(metrics)
     assert all(each == forms[0] for each in forms)
-
-
-def infos_protocol() -> Any:
-    return SlamEnv(ToySequence(2), TARGET).protocol
 
 
 def test_minari_records_fixed_infos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,8 +292,6 @@ def test_sub_environments_run_other_sequences(tmp_path: Path) -> None:
     random = SequenceSampler(SlamEnv(folders[0], TARGET, window=4), folders, mode="random")
     name = random.reset(seed=0)[1]["sequence"]
     assert random.step(0)[4]["sequence"] == name, "Minari needs the same keys on every step"
-    drawn = [[random.reset(seed=seed if n == 0 else None)[1]["sequence"] for n in range(6)] for seed in (1, 2, 3)]
-    assert drawn[0] != drawn[1] != drawn[2]
 
 
 @pytest.mark.parametrize("fixed", [False, True])
@@ -386,12 +377,6 @@ def test_a_callable_earns_what_it_returns_and_sees_the_episode() -> None:
     settings = {"mode": "lost", "at": 4}
     rewards, *_ = play(SlamEnv(ToySequence(10), TARGET, settings=settings, reward=reward, lost_after=2))
     assert rewards == [0.5, 0.5, 0.5, -1.0, -1.0 - 4.0] and lengths == [*range(1, 11)]
-
-
-@pytest.mark.parametrize("reward", [*REWARDS, AccuracyMinusCost(weight=0.1)])
-def test_every_reward_passes_the_checker(reward: Any) -> None:
-    for sequence in (ToySequence(9), ToySequence(9, has_truth=False), ToySequence(9, hole=(0, 4))):
-        checked(made(sequence, reward=reward, lost_after=3, window=6))
 
 
 # Choices.
@@ -505,13 +490,10 @@ def test_the_truth_is_in_its_own_key_alone() -> None:
 
 
 def test_stable_baselines3_takes_choices_and_parts() -> None:
-    checks = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra [rl] is not installed")
     env = SlamEnv(
         ToySequence(8), TARGET, control=["noise.passes"], window=5, observation=["stats", "gray", "privileged"]
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checks.check_env(DiscreteActions(env, [{}, {"noise.passes": 3}]))
+    checked_by_stable_baselines3(DiscreteActions(env, [{}, {"noise.passes": 3}]))
 
 
 def test_record_timings() -> None:
@@ -715,12 +697,5 @@ def test_what_it_cannot_wrap_is_refused(observation: str, width: int) -> None:
 
 
 def test_stable_baselines3_takes_it_without_a_word() -> None:
-    checks = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra [rl] is not installed")
-    env = SmallImages(
-        SlamEnv(ToySequence(6), TARGET, observation="rgbd", control=["noise.level_m"]), width=40, height=36
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checks.check_env(env)
-    with pytest.warns(UserWarning, match="unconventional shape"):
-        checks.check_env(SlamEnv(ToySequence(6), TARGET, observation="rgbd", control=["noise.level_m"]))
+    env = SlamEnv(ToySequence(6), TARGET, observation="rgbd", control=["noise.level_m"])
+    checked_by_stable_baselines3(SmallImages(env, width=40, height=36))
