@@ -270,23 +270,13 @@ def test_frames_and_stride_cut_the_sequence(toy_folder: str) -> None:
     assert np.allclose(in_memory.sequence.timestamps, env.sequence.timestamps, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("mode", "message"),
-    [
-        ("nan", r"frame 4 returned a pose with 16 values that are not finite"),
-        ("scaled", r"frame 4 returned a pose that is no rigid transformation: .* det R = 8"),
-        ("mirrored", r"frame 4 returned a pose that is no rigid transformation: .* det R = -1"),
-        ("far", r"frame 4 returned a pose 1e\+200 m away"),
-        ("none", r"frame 4 returned state 'ok' without a pose"),
-        ("string", r"frame 4 returned a str"),
-    ],
-)
-def test_a_tracker_that_breaks_its_contract(mode: str, message: str) -> None:
-    env = SlamEnv(ToySequence(12), TARGET, settings={"mode": mode})
+def test_a_tracker_that_breaks_its_contract() -> None:
+    """Every way to do so is a case of tests/contracts/test_contracts.py."""
+    env = SlamEnv(ToySequence(12), TARGET, settings={"mode": "nan"})
     env.reset(seed=0)
     for _ in range(3):
         env.step(0)
-    with pytest.raises(TrackerContractError, match=message):
+    with pytest.raises(TrackerContractError, match="frame 4 returned a pose with 16 values that are not finite"):
         env.step(0)
 
 
