@@ -99,14 +99,6 @@ def in_docstrings() -> Iterator[Mention]:
                 yield Mention(f"{file.relative_to(ROOT)}:{line}", found.group(2))
 
 
-def links() -> Iterator[Mention]:
-    """Targets of relative links in all pages."""
-    for page in PAGES:
-        for found in re.finditer(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
-            if "://" not in found.group(1) and not found.group(1).startswith("mailto:"):
-                yield Mention(str(page.relative_to(ROOT)), str((page.parent / found.group(1)).resolve()))
-
-
 def exists(path: str) -> bool:
     """Whether a path is there, from the root, from the package, or from a package (``culling/epipolar.py``)."""
     return any((base / path).exists() for base in (ROOT, ROOT / "dynslam_bench", ROOT / "docs", ROOT.parent))

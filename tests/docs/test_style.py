@@ -1,12 +1,12 @@
 """Pages are written in short sentences, say at their top what they are for, and stay short."""
 
 import ast
-import importlib.util
 import re
 import statistics
 from pathlib import Path
 
 import pytest
+import results
 from documented_names import sources
 from prose import ROOT, paragraphs, sentences, tables, user_pages, words
 
@@ -103,7 +103,6 @@ def test_variables_are_named_by_what_they_hold() -> None:
 # Measured tables lie in `docs/results/`, each with its command, commit, date, machine and data.
 
 
-SCRIPT = ROOT / "tests" / "benchmarks" / "results.py"
 RESULTS = sorted({*(ROOT / "docs" / "results").glob("*.md")} - {ROOT / "docs" / "results" / "README.md"})
 
 SIGN = r"[\d.,±+~<>/()\[\];:\s-]"
@@ -145,10 +144,6 @@ def test_measured_tables_are_told_from_others() -> None:
 
 @pytest.mark.parametrize("page", RESULTS, ids=lambda page: page.stem)
 def test_every_table_says_how_it_was_made(page: Path) -> None:
-    spec = importlib.util.spec_from_file_location("results", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    results = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(results)
     text = page.read_text(encoding="utf-8")
     sections = results.sections(text)
     assert sections and measured(text.partition("\n## ")[0]) == [], "a table above the first section"
@@ -162,10 +157,6 @@ def test_every_table_says_how_it_was_made(page: Path) -> None:
 
 
 def test_a_section_is_made_of_what_its_command_prints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = importlib.util.spec_from_file_location("results", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    results = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(results)
     section = "## Sums\n\nA sum.\n\n```bash\nprintf '| a |\\n| --- |\\n| %s |\\n' $((2 + 3))\n```\n\n"
     made = results.remade(section, "none")
     assert made.startswith(section) and made.endswith("data: none.*\n\n| a |\n| --- |\n| 5 |\n\n")
