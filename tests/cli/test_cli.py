@@ -44,9 +44,7 @@ def test_the_help_of_every_command_fits_one_screen(cli, monkeypatch, words):
 
 
 def test_version(cli):
-    import dynslam_bench
-
-    assert cli("--version") == (0, f"dynslam-bench {dynslam_bench.__version__}\n", "")
+    assert cli("--version") == (0, f"dynslam-bench {db.__version__}\n", "")
 
 
 def test_usage_errors_exit_with_2(cli):
@@ -187,20 +185,11 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
 
 
 def test_damaged_sequences_never_become_runs(cli, walk, tmp_path):
-    """One line, exit code 1, and nothing half written."""
-    code, _, err = cli("run", "never-move", walk, "--frames", "0:1")
-    assert code == 1 and "1 frames" in one_line(err)
-    for damage, words in (
-        (lambda folder: (folder / "rgb.txt").write_text(""), "lists no image"),
-        (lambda folder: (folder / "depth.txt").write_text("9.0 depth/100.000000.png"), "has a depth image within"),
-        (lambda folder: shutil.copytree(folder / "rgb", folder / "depth", dirs_exist_ok=True), "8 bits"),
-        (lambda folder: (folder / "groundtruth.txt").write_text(""), "holds no poses"),
-    ):
-        copy = shutil.copytree(walk, tmp_path / "copy")
-        damage(copy)
-        code, _, err = cli("run", "never-move", copy)
-        assert code == 1 and words in one_line(err)
-        shutil.rmtree(copy)
+    """One line, exit code 1, and nothing half written; each kind of damage is a case of the tests of readers."""
+    copy = shutil.copytree(walk, tmp_path / "copy")
+    (copy / "rgb.txt").write_text("")
+    code, _, err = cli("run", "never-move", copy)
+    assert code == 1 and "lists no image" in one_line(err)
     assert not list(tmp_path.glob("results/runs/*"))
 
 

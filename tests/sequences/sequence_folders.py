@@ -53,6 +53,12 @@ def reprojected(sequence, index, other):
     return CAMERA.project(points @ relative[:3, :3].T + relative[:3, 3]) - np.stack([U, V], -1)
 
 
+def flipped(data):
+    """A file with another byte in its middle."""
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 255]) + data[middle + 1 :]
+
+
 class Altered:
     """A sequence with other frames, truth or camera."""
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from fetch_server import FOLDER, NAME, Server, left_behind, tgz
 from published_folders import random_poses, write_eth3d
-from sequence_folders import make_folder
+from sequence_folders import flipped, make_folder
 
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError
@@ -483,11 +483,6 @@ def test_zip_files(get, server, folder, tmp_path, entry):
     assert left_behind(tmp_path) == []
     server.data = zipped(files)
     assert len(open_sequence(get())) == 4
-
-
-def flipped(data):
-    middle = len(data) // 2
-    return data[:middle] + bytes([data[middle] ^ 255]) + data[middle + 1 :]
 
 
 @pytest.mark.parametrize(

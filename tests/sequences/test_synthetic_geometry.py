@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from sequence_folders import U, V, frame_hash, reprojected
+from sequence_folders import U, V, flipped, frame_hash, reprojected
 
 import dynslam_bench.sequences.synthetic as package
 from dynslam_bench.core.errors import SequenceError
@@ -535,11 +535,6 @@ def test_rendering_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert open_synthetic("synthetic/sitting_xyz?frames=6", tmp_path).render() == 0
     masks = [line.split()[1] for line in (folder / "masks.txt").read_text().splitlines() if line[0] != "#"]
     assert len(masks) == 6 and all((folder / file).is_file() for file in masks)
-
-
-def flipped(data: bytes) -> bytes:
-    half = len(data) // 2
-    return data[:half] + bytes([data[half] ^ 0x10]) + data[half + 1 :]
 
 
 DAMAGES = (

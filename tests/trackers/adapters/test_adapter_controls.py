@@ -523,8 +523,6 @@ def test_two_resets_on_real_frames():
 @needs_vocabulary
 def test_frames_without_features():
     """Black frames give no pose and no crash; once there is something to see it begins."""
-    from dynslam_bench.contracts.sequence import Frame
-
     camera = replace(FR1, distortion=(0.0,) * 5)
     tracker = build_tracker("orbslam3", {"vocabulary": str(PACKED)})
     try:
