@@ -1,11 +1,7 @@
 """Everything that comes with the package passes its own conformance checks."""
 
-import importlib
-import inspect
-import pkgutil
 import re
 import sys
-import typing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,9 +9,9 @@ from types import SimpleNamespace
 import hostile
 import numpy as np
 import pytest
+from culling_rules import RULES
 
-import dynslam_bench.culling
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult
+from dynslam_bench.contracts.filter import FilterResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import PluginError
@@ -43,31 +39,9 @@ from dynslam_bench.trackers import TrackerSpec
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
-def filters():
-    """Every filter class of the package `culling`."""
-    found = {}
-    for module in pkgutil.iter_modules(dynslam_bench.culling.__path__):
-        loaded = importlib.import_module(f"dynslam_bench.culling.{module.name}")
-        for name, value in vars(loaded).items():
-            if inspect.isclass(value) and value.__module__ == loaded.__name__ and DynamicFilter in value.__mro__[1:]:
-                found[name] = value
-    return found
-
-
-def construct(filter_class):
-    """A filter with default settings, by the types of its parameters."""
-    hints = typing.get_type_hints(filter_class.__init__)
-    parameters = list(inspect.signature(filter_class).parameters.values())
-    bound = typing.get_args(getattr(filter_class, "__orig_bases__", [None])[0])  # the settings of a `Rule[...]`
-    needed = [hints[p.name] for p in parameters if p.default is p.empty]
-    needed = [bound[0] if isinstance(kind, typing.TypeVar) else kind for kind in needed]
-    assert all(issubclass(kind, Settings) for kind in needed), needed
-    return filter_class(*[kind() for kind in needed])
-
-
-@pytest.mark.parametrize("name", sorted(filters()))
+@pytest.mark.parametrize("name", sorted(RULES))
 def test_filters(name):
-    check_filter(lambda: construct(filters()[name]))
+    check_filter(RULES[name])
 
 
 def test_the_filter_scene_is_exact():
