@@ -183,14 +183,15 @@ def test_an_extended_study_goes_on_with_more_scenes_and_trials(tmp_path: Path) -
 
 
 def test_any_trial_is_a_preset(tmp_path: Path) -> None:
-    spec = make_spec(trials=4, pruner="none")
-    tuner = SimulatedTuner(spec, tmp_path, in_memory=False)
-    trial = tuner.run().study.get_trials()[2]
-    text = read_preset_text(spec, tmp_path, trial=2)
-    (tmp_path / "two.toml").write_text(text)
-    assert read_settings(tmp_path / "two.toml") == trial.params and 'status = "not judged"' in text
-    with pytest.raises(StudyError, match="no trial 9"):
-        read_preset_text(spec, tmp_path, trial=9)
+    spec = make_spec(trials=16, pruner="halving")
+    tuner = SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run()
+    for state in (TrialState.COMPLETE, TrialState.PRUNED):
+        trial = tuner.study.get_trials(states=(state,))[-1]
+        (tmp_path / "own.toml").write_text(read_preset_text(spec, tmp_path, trial=trial.number))
+        assert read_settings(tmp_path / "own.toml") == trial.params
+        assert 'status = "not judged"' in (tmp_path / "own.toml").read_text()
+    with pytest.raises(StudyError, match="no trial 99"):
+        read_preset_text(spec, tmp_path, trial=99)
 
 
 def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_path: Path) -> None:
@@ -484,11 +485,3 @@ def test_a_recording_that_is_here_is_in_the_check(folder: str, tmp_path: Path) -
     assert recorded == tuple(ProblemInstance("bonn/crowd", recorded[0].frames, offset) for offset in range(4))
     assert design_of(StudySpec(name="s", tune=(folder,), recorded=(), data_root=str(root))).recorded == ()
     assert design_of(StudySpec(name="s", tune=(folder,), data_root=str(tmp_path / "empty"))).recorded == ()
-
-
-def test_a_pruned_trial_is_a_preset_too(folders: list[str], tmp_path: Path) -> None:
-    spec = make(folders, trials=2, start=[{"gain": 3.0}], tune=folders[:5], confirm=[], held_out=[], pruner="wilcoxon")
-    trial = run_study(spec, results=tmp_path).study.get_trials()[1]
-    assert trial.state == TrialState.PRUNED and trial.params == {"gain": 3.0}
-    text = read_preset_text(spec, tmp_path, trial=1)
-    assert "gain = 3.0" in text and 'status = "not judged"' in text
