@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from cli_helpers import one_line
 from envs_toys import write_folder
+from reports_fake_store import add_run
 
 from dynslam_bench.cli import app, demo, output, running, runs
 from dynslam_bench.cli.demo import compiled_ahead, tell
@@ -520,6 +521,34 @@ def test_report_prints_its_message_the_leaderboard_and_its_place(cli, walk, tmp_
     assert code == 1 and "there is no run of the reference 'orb-slam2'" in one_line(err)
     code, out, _ = cli("report", "compare", "results", "results")
     assert code == 0 and "\\_" not in out and "| tracker" not in out and "all 1 sequences" in out
+
+
+def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
+    store = RunStore(tmp_path / "results")
+    for name in ("s/a", "s/b"):
+        add_run(store, "orb-slam2", name)
+        add_run(store, "ours", name, error=0.02)
+    add_run(store, "ours", "s/c", error=0.02)
+    assert cli("report", "results", "-o", "common")[0] == 0
+    assert cli("report", "results", "-o", "all", "--on", "all")[0] == 0
+    common, everything = ((tmp_path / name / "report.md").read_text() for name in ("common", "all"))
+    assert "The ranking stands on the 2 of 3 sequences that all ranked trackers have." in common
+    assert "| 1–2 | 2/2 | orb-slam2 |" in common
+    assert "Not ranked, since they lack sequences: orb-slam2." in everything
+    assert "| – lacks sequences | 2/2 | orb-slam2 |" in everything
+    assert "--on all" in (tmp_path / "all" / "reproduce.html").read_text()
+    code, _, error = cli("report", "results", "--on", "some")
+    assert (code, error) == (1, "error: --on is 'common' or 'all', got 'some'\n")
+
+
+def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
+    for place, value in (("a", 1), ("b", 2)):
+        add_run(RunStore(tmp_path / place), "ours", "s/a", overrides={"x": value})
+    code, out, _ = cli("report", "compare", "a", "b", "--json")
+    found = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
+    assert code == 0 and list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
+    assert [interval["low"] for interval in found["overall"].values()] == [None]
+    assert "B better on" in cli("report", "compare", "a", "b")[1]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ import pytest
 from reports_fake_store import add_frames, add_run, fill, truth_of
 from reports_rows import PROTOCOL, crashed, page_data, row, rows_of
 
-from dynslam_bench.cli.app import start
 from dynslam_bench.core import reading
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError
 from dynslam_bench.core.records import digest
@@ -520,36 +519,6 @@ def test_rows_that_somebody_made_count_as_missing(known, reads, change):
     assert loaded_from(known) == before and first in reads
 
 
-@pytest.fixture
-def cli(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as ended:
-            start([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return ended.value.code or 0, captured.out, captured.err
-
-    return call
-
-
-def test_the_sequences_to_rank_on_are_a_switch(store, cli, tmp_path):
-    for name in ("s/a", "s/b"):
-        add_run(store, "orb-slam2", name)
-        add_run(store, "ours", name, error=0.02)
-    add_run(store, "ours", "s/c", error=0.02)
-    assert cli("report", "results", "-o", "common")[0] == 0
-    assert cli("report", "results", "-o", "all", "--on", "all")[0] == 0
-    common, everything = ((tmp_path / name / "report.md").read_text() for name in ("common", "all"))
-    assert "The ranking stands on the 2 of 3 sequences that all ranked trackers have." in common
-    assert "| 1–2 | 2/2 | orb-slam2 |" in common
-    assert "Not ranked, since they lack sequences: orb-slam2." in everything
-    assert "| – lacks sequences | 2/2 | orb-slam2 |" in everything
-    assert "--on all" in (tmp_path / "all" / "reproduce.html").read_text()
-    code, _, error = cli("report", "results", "--on", "some")
-    assert (code, error) == (1, "error: --on is 'common' or 'all', got 'some'\n")
-
-
 def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
     trial = {"error": 0.001, "overrides": {"features": 500}, "study": "mine"}
     store, only = RunStore(tmp_path / "r"), RunStore(tmp_path / "only")
@@ -565,13 +534,3 @@ def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
         commands = page.split("The commands that")[1]
         shown = "features=500" in text, "--trials" in commands, "trial of the study &#39;mine&#39;" in page
         assert shown == (trials,) * 3
-
-
-def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
-    for place, value in (("a", 1), ("b", 2)):
-        add_run(RunStore(tmp_path / place), "ours", "s/a", overrides={"x": value})
-    code, out, _ = cli("report", "compare", "a", "b", "--json")
-    found = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
-    assert code == 0 and list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
-    assert [interval["low"] for interval in found["overall"].values()] == [None]
-    assert "B better on" in cli("report", "compare", "a", "b")[1]
