@@ -409,21 +409,6 @@ def test_coverage_is_that_of_the_trajectory_that_is_scored(monkeypatch: pytest.M
         assert (metrics["tracked_frames"], metrics["coverage"]) == (tracked, tracked / 12)
 
 
-def test_asking_for_the_final_trajectory_changes_no_later_pose() -> None:
-    """With all of the map refined at the end, which a run that goes on takes back."""
-    poses = []
-    for asks in (True, False):
-        settings = {"backend.bundle_adjustment.full": True}
-        env = SlamEnv("synthetic/fast_walking?scene=100&frames=14", "orb-slam2", settings=settings)
-        env.reset(seed=0)
-        for _ in range(13):
-            if asks:
-                env.final_trajectory()
-            env.step(env.neutral_action)
-        poses.append(env.online_trajectory().T_world_cam)
-    assert np.array_equal(*poses)
-
-
 def test_a_reset_that_fails_ends_the_episode_and_changes_nothing(tmp_path: Path) -> None:
     (damaged := tmp_path / "damaged.npz").write_bytes(b"no map")
     env = SlamEnv(ToySequence(12), "emfoa-oft?masks=none")
