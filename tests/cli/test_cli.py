@@ -12,6 +12,8 @@ import pytest
 import toy_tracker
 from cli_helpers import PROGRAM, one_line
 from envs_toys import write_sequence
+from evaluation_walks import noisy
+from evaluation_walks import walk as random_walk
 
 import dynslam_bench as db
 from dynslam_bench.cli.app import expand_lists
@@ -328,13 +330,9 @@ def test_output_to_a_closed_pipe_is_no_error():
 @pytest.fixture
 def pair(tmp_path):
     """An estimate and its ground truth, which lie in ``estimate.txt`` and ``truth.txt``, too."""
-    rng = np.random.default_rng(3)
-    stamps, twists = 1305031100 + np.arange(90) / 30, np.cumsum(rng.normal(0, 0.02, (90, 6)), axis=0)
-    estimate = Trajectory(stamps, se3.exp(twists + rng.normal(0, 0.005, (90, 6))))
-    trajectories = {"estimate": estimate, "truth": Trajectory(stamps, se3.exp(twists))}
-    for name, trajectory in trajectories.items():
-        write_tum(tmp_path / f"{name}.txt", trajectory)
-    return trajectories
+    truth = random_walk(n=90)
+    write_tum(tmp_path / "truth.txt", truth)
+    write_tum(tmp_path / "estimate.txt", noisy(truth))
 
 
 def test_hints_are_shown_of_files_runs_and_boards(cli, tmp_path):

@@ -261,11 +261,8 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     command = [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"]
     program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive)
     try:
-        deadline = time.monotonic() + 300
-        while not (pids.is_file() and pids.read_text().endswith("\n")):
-            assert program.poll() is None, program.stderr.read()
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        hostile.until(lambda: program.poll() is not None or (pids.is_file() and pids.read_text().endswith("\n")), 300)
+        assert program.poll() is None, program.stderr.read()
         program.send_signal(number)
         began = time.monotonic()
         _, err = program.communicate(timeout=60)

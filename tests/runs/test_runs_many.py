@@ -421,10 +421,8 @@ class Cluster:
     def __init__(self, folder: Path) -> None:
         self.folder, self.place, self.workers = folder, folder / "scheduler.json", []
         self.scheduler = self.start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
-        deadline = time.monotonic() + 300
-        while not (self.place.is_file() and self.place.read_text()):
-            assert self.scheduler.poll() is None and time.monotonic() < deadline
-            time.sleep(0.02)
+        until(lambda: self.scheduler.poll() is not None or (self.place.is_file() and self.place.read_text()), 300)
+        assert self.scheduler.poll() is None
         self.address = json.loads(self.place.read_text())["address"]
 
     def start(self, program: str, *arguments: str, **environment: str) -> subprocess.Popen:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from envs_play import play
 from envs_toys import TARGET, ToySequence, write_folder
 
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
@@ -62,21 +63,17 @@ def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
 def test_the_run_is_the_environment(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, seed=11, frames=(5, 45), stride=2), store)
     env = SlamEnv(toy_folder, TARGET, frames=(5, 45), stride=2)
-    _, info = env.reset(seed=11)
-    rewards = [0.0]
-    for _ in range(19):
-        _, reward, _, truncated, info = env.step(0)
-        rewards.append(reward)
-    assert truncated
+    rewards, infos, ends = play(env, seed=11)
+    assert len(rewards) == 19 and ends[-1] == (False, True)
     online = read_tum(store.folder(record.run_id) / "trajectory_online.txt")
     assert np.allclose(online.T_world_cam, env.online_trajectory().T_world_cam, atol=1e-8)
     rows = read_csv(store.folder(record.run_id) / "frames.csv")
-    assert [row.reward_m for row in rows[1:]] == rewards[1:]
-    assert rows[-1].pose_error_trans_m == info["pose_error_trans_m"]
+    assert [row.reward_m for row in rows[1:]] == rewards
+    assert rows[-1].pose_error_trans_m == infos[-1]["pose_error_trans_m"]
     assert rows[-1].stats["keypoints"] == 100 and rows[-1].timings["tracking"] == 0.002
     assert [row.state for row in rows] == ["ok"] * 20 and rows[0].frame_error_trans_m is None
     scored = score(store, record).metrics
-    assert scored["ate_rmse_m"] == pytest.approx(info["episode_metrics"]["ate_rmse_m"], rel=1e-5)
+    assert scored["ate_rmse_m"] == pytest.approx(infos[-1]["episode_metrics"]["ate_rmse_m"], rel=1e-5)
 
 
 def test_a_start_offset_is_a_repeat_of_the_same_block(store: RunStore, toy_folder: str) -> None:

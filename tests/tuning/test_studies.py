@@ -19,6 +19,7 @@ import optuna
 import pytest
 import toy_tracker
 from faults import in_a_small_process, survey
+from hostile import until
 from optuna.trial import TrialState
 from simulated import HELD_OUT, TRACKER, TUNE, SimulatedTuner, make_spec, simulated_design, toy_spec, valley
 
@@ -123,10 +124,9 @@ def test_kill_and_resume_loses_only_the_running_trial(folders: list[str], tmp_pa
     checkout = str(Path(__file__).resolve().parents[2])
     child = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": checkout}, start_new_session=True)
     journal = tmp_path / "studies" / "toy" / "journal.log"
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not (journal.exists() and journal.read_text().count('"op_code":6') >= 4):
-        time.sleep(0.1)  # a state is set for each trial that was told, and once for the enqueued first one
-        assert child.poll() is None, "the worker ended before it could be killed"
+    # a state is set for each trial that was told, and once for the enqueued first one
+    until(lambda: child.poll() is not None or (journal.exists() and journal.read_text().count('"op_code":6') >= 4))
+    assert child.poll() is None, "the worker ended before it could be killed"
     os.killpg(child.pid, signal.SIGKILL)
     child.wait()
     before = {t.number: t.values for t in Study(spec, tmp_path).study.get_trials() if t.state == TrialState.COMPLETE}

@@ -20,6 +20,7 @@ from unittest.mock import patch
 import numpy as np
 import optuna
 import pytest
+from hostile import until
 from optuna.trial import FrozenTrial, TrialState
 from simulated import SimulatedTuner, make_spec, nothing, toy_spec, valley
 from sqlalchemy.exc import OperationalError
@@ -165,24 +166,15 @@ def test_a_killed_worker_and_a_restarted_database_lose_no_trial(
     ]  # fmt: skip
 
     def finished() -> int:
-        with_states = optuna.load_study(study_name="toy", storage=postgres.url).get_trials(deepcopy=False)
-        return sum(trial.state.is_finished() for trial in with_states)
-
-    def until(count: int) -> None:
-        deadline = time.monotonic() + 120
-        while time.monotonic() < deadline:
-            try:
-                if finished() >= count:
-                    return
-            except KeyError:  # no study yet
-                pass
-            time.sleep(0.2)
-        pytest.fail(f"{count} trials are not finished")
+        with suppress(KeyError):  # no study yet
+            with_states = optuna.load_study(study_name="toy", storage=postgres.url).get_trials(deepcopy=False)
+            return sum(trial.state.is_finished() for trial in with_states)
+        return 0
 
     try:
-        until(2)
+        until(lambda: finished() >= 2)
         os.killpg(workers[0].pid, signal.SIGKILL)
-        until(4)
+        until(lambda: finished() >= 4)
         postgres.stop()
         postgres.start()
         _, errors = workers[1].communicate(timeout=240)

@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 import pytest
 from adapter_programs import GOOD, frame, reset
+from envs_play import play
 from hostile import alive, until
-from test_adapter_controls import PACKED, XYZ
+from test_adapter_controls import PACKED, XYZ, needs_data
 
 from dynslam_bench import api as db
 from dynslam_bench.core.errors import (
@@ -201,14 +202,11 @@ def test_a_tracker_in_one_cpp_file_follows_the_camera(tmp_path: Path) -> None:
     command = [COMPILER, "-O2", "-Wall", "-Wextra", "-Werror", "-o", str(program), str(SOURCE)]
     subprocess.run(command, check=True, capture_output=True)
     env = SlamEnv("synthetic/sitting_xyz?scene=100", f"subprocess:{program}", frames=(0, 12))
-    env.reset(seed=0)
-    info: dict = {}
-    for _ in range(11):
-        *_, info = env.step(0)
+    _, infos, _ = play(env)
     outcomes = env.episode.outcomes
     assert [each.state for each in outcomes] == ["ok"] * 12
     assert all(set(each.timings) >= {"odometry", "transfer"} for each in outcomes[1:])
-    metrics = info["episode_metrics"]
+    metrics = infos[-1]["episode_metrics"]
     env.close()
     assert metrics["ate_rmse_m"] < 0.3 * metrics["static_camera_ate_rmse_m"]
 
@@ -649,7 +647,6 @@ def test_open3d_as_a_batch_program(tmp_path):
 
 INSTALLED = importlib.util.find_spec("svo_cpp") is not None
 needs_svo = pytest.mark.skipif(not INSTALLED, reason="svo-cpp is not installed")
-needs_data = pytest.mark.skipif(not XYZ.is_dir(), reason="no TUM excerpt beside the checkout")
 
 
 @pytest.mark.skipif(INSTALLED, reason="svo-cpp is installed")
