@@ -7,14 +7,12 @@ import baseline_signatures as signatures
 import cv2
 import numpy as np
 import pytest
+from envs_play import play
 from quick_dense import QUICK_DENSE, quick
 from reports_fake_store import add_run
+from scenes import ACROSS, BOX, SIDEWAYS, Scene, box_instance, on_rectangle, scene
 
-from dynslam_bench.contracts.features import Keypoints
-from dynslam_bench.contracts.filter import FilterState, FrameBundle
-from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core.errors import DynslamError, SettingsError
@@ -22,8 +20,6 @@ from dynslam_bench.core.settings import parameters, settings_table
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.flow import dense_flow as dense
 from dynslam_bench.flow.opencv import LEVELS
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.runs import RunStore
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
@@ -314,18 +310,12 @@ def test_the_error_on_a_recording_has_not_grown(excerpt, tracker, frames, stride
     if missing:
         pytest.skip(f"not here: {', '.join(missing)}")
     masks = {"segmentation.source": f"onnx:{YOLO}"} if tracker == "mask-rcnn" else {}
-    env = SlamEnv(str(needed[0]), tracker, settings=masks, frames=frames, stride=stride)
-    env.reset(seed=0)
-    over = False
-    while not over:
-        *_, terminated, truncated, info = env.step(0)
-        over = terminated or truncated
-    metrics = info["episode_metrics"]
+    _, infos, _ = play(SlamEnv(str(needed[0]), tracker, settings=masks, frames=frames, stride=stride))
+    metrics = infos[-1]["episode_metrics"]
     assert metrics["coverage"] == 1.0
     assert 1000 * metrics["ate_rmse_m"] < SLACK * least_mm
 
 
-XTION = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
 TESTED = {
     "sgc-slam", "di-slam", "blitz-slam", "chen-slam", "chen-slam-mono", "mor-slam", "sof-slam", "seg-slam", "opf-slam",
 }  # fmt: skip
@@ -336,44 +326,13 @@ UNPUBLISHED = {"dai-slam"}
 """Its tracks are judged over a window: `correlation_graph.py`."""
 
 
-def moving_scene(thing: str) -> tuple[FrameBundle, FilterState, np.ndarray, np.ndarray]:
-    """A wall of 300 features, and a thing with 80 that moved across; the flow of half of these failed.
-
-    Returns:
-        The frame, the state, and bool ``[N]``: the moving features, and those whose flow failed.
-    """
-    rng = np.random.default_rng(1)
-    wall = rng.uniform((20, 20), (180, 460), (300, 2))
-    wall[150:] += (440, 0)
-    xy = np.concatenate([wall, rng.uniform((240, 120), (400, 360), (80, 2))])
-    moving = np.arange(380) >= 300
-    z = np.where(moving, 1.5, rng.uniform(1.5, 4.0, 380))
-    motion = se3.exp(np.array([0.06, 0.02, 0.03, 0.01, -0.01, 0.005]))
-    points = se3.transform(motion, XTION.unproject(xy, z))
-    points[moving] -= (0.0, 0.05, 0.0)
-    before = XTION.project(points)
-    valid = ~moving | (np.arange(380) % 2 == 0)
-    frame, previous = (bundle(xy, z, thing), bundle(before, points[:, 2], thing))
-    state = FilterState(
-        camera=XTION,
-        keep=np.ones(380, bool),
-        previous=previous,
-        previous_keep=np.ones(380, bool),
-        T_world_prev=np.eye(4),
-        T_world_pred=motion,
-        flow=FlowResult(before.astype(np.float32), valid, np.zeros(380, np.float32)),
-    )
-    return frame, state, moving, ~valid
-
-
-def bundle(xy: np.ndarray, z: np.ndarray, thing: str) -> FrameBundle:
-    zeros, ones = np.zeros(len(xy), np.float32), np.ones(len(xy), np.float32)
-    keypoints = Keypoints(xy.astype(np.float32), zeros.astype(np.int32), zeros, ones, np.zeros((len(xy), 32), np.uint8))
-    mask = np.zeros((1, 480, 640), bool)
-    mask[0, 80:400, 220:420] = True
-    instances = Instances(mask, np.array([[220, 80, 420, 400]], np.float32), (thing,), np.ones(1, np.float32))
-    image, depth = np.zeros((480, 640, 3), np.uint8), np.full((480, 640), 1.5, np.float32)
-    return FrameBundle(0, 0.0, image, image[:, :, 0], depth, keypoints, xy, z.astype(np.float32), instances)
+def moving_scene(thing: str) -> tuple[Scene, np.ndarray]:
+    """A thing that moved across before a wall, and bool ``[N]``: those of its features whose flow failed."""
+    made = scene(SIDEWAYS, n_moving=80, motion=ACROSS, instances=box_instance(*BOX, name=thing))
+    made.state.previous.instances = made.frame.instances
+    lost = made.moving & (np.arange(len(made.frame)) % 2 == 1)
+    made.state.flow.valid[lost] = False
+    return made, lost
 
 
 def system(name: str, **settings: object) -> SlamPipeline:
@@ -395,11 +354,11 @@ def test_a_moving_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule
     assert block.settings.unmatched == "keep"
     block.settings = block.settings.model_copy(update={"unmatched": rule})
     movable = name in ("sof-slam", "seg-slam")
-    frame, state, moving, lost = moving_scene("chair" if movable else "person")
+    made, lost = moving_scene("chair" if movable else "person")
     if movable:  # the depth of a moving thing takes its unmatched features along: not what is tested here
         block.settings = block.settings.model_copy(update={"depth_m": 0.0})
-    keep = block.apply(frame, state).keep
-    assert keep[~moving].mean() > 0.99 and not keep[moving & ~lost].any()
+    keep = block.apply(made.frame, made.state).keep
+    assert keep[~on_rectangle(made, *BOX)].mean() > 0.99 and not keep[made.moving & ~lost].any()
     assert keep[lost].all() if rule == "keep" else not keep[lost].any()
 
 
@@ -431,45 +390,3 @@ def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> 
     checked = system(name, **{"flow.forward_backward_px": 1.5})._flow
     kept = checked.track(checked.prepare(first), checked.prepare(second), grid).valid
     assert np.count_nonzero(kept) < 0.9 * np.count_nonzero(found.valid), "the check would have changed the verdicts"
-
-
-# A detector that misses a person: every masked system bridges it for as many frames as its settings promise.
-
-
-SEEN = 2
-"""Frames with a detection; then the detector is blind."""
-BLIND_FRAMES = SEEN + 5 + 2
-
-
-CAMERA = Camera(320, 240, 267.7, 269.6, 160.0, 120.0)
-
-
-@pytest.fixture(scope="module")
-def views() -> list[Frame]:
-    """A wall with a texture, two metres away, that moves by two pixels a frame."""
-    texture = np.random.default_rng(0).integers(0, 255, (60, 120), dtype=np.uint8)
-    wall = cv2.resize(texture, (480, 240), interpolation=cv2.INTER_CUBIC)
-    depth = np.full((240, 320), 2.0, np.float32)
-    images = [wall[:, 2 * index : 2 * index + 320, None].repeat(3, 2) for index in range(BLIND_FRAMES)]
-    return [Frame(index, index / 30, np.ascontiguousarray(view), depth) for index, view in enumerate(images)]
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A person's mask on disk for the first frames; later images hold nobody."""
-    folder = tmp_path_factory.mktemp("masks")
-    for index in range(BLIND_FRAMES):
-        image = np.zeros((240, 320), np.uint8)
-        image[60:180, 100:180] = 255 if index < SEEN else 0
-        cv2.imwrite(str(folder / f"{index:06d}.png"), image)
-    return folder
-
-
-@pytest.mark.parametrize("name", ["mask-rcnn", "dynaslam-n", "emfoa-oft?flow=none"])
-def test_a_missed_person_is_bridged_for_as_long_as_promised(name: str, views: list[Frame], recorded: Path) -> None:
-    """The systems that cull by masks alone."""
-    promised = TRACKERS.get(name).settings().segmentation.compensate
-    tracker = build_tracker(name, {"segmentation.source": f"recorded:{recorded}"})
-    tracker.reset(CAMERA, rng=np.random.default_rng(0))
-    culled = [tracker.track(frame).stats["culled"] > 0 for frame in views]
-    assert culled == [True] * (SEEN + promised) + [False] * (BLIND_FRAMES - SEEN - promised)
