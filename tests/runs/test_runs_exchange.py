@@ -21,6 +21,7 @@ import pytest
 from envs_toys import CAMERA, TARGET, write_folder
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
+from published_trajectories import SINGLE
 from typer.testing import CliRunner
 
 from dynslam_bench import api as db
@@ -43,6 +44,7 @@ from dynslam_bench.runs.artifacts import read_snapshots
 from dynslam_bench.runs.exchange.formats import read_colmap, write_colmap
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, check_rerun, write_recording
 from dynslam_bench.runs.exchange.transfer import Provenance, stated_provenance
+from dynslam_bench.sequences.catalogue import entry_of
 from dynslam_bench.slam.map_files import read_ply, write_ply
 
 TOLERANCE = 1e-6
@@ -581,26 +583,9 @@ def test_a_truth_of_another_time_is_refused(tmp_path):
         import_trajectory(tmp_path / "other.txt", "x", "mine", truth=tmp_path / "truth.txt", results=tmp_path / "r")
 
 
-TUM = {"freiburg1": "fr1", "freiburg3": "fr3"}
-
-
-def sequence_of(folder):
-    if "bonn" in folder:
-        return "bonn/crowd"
-    _, _, camera, name = folder.split("_", 3)
-    return f"tum/{TUM[camera]}/{name}"
-
-
 @pytest.mark.skipif(not PUBLISHED.is_dir(), reason="needs the authors' trajectories in ../shared/data/trajectories")
 def test_published_trajectories_give_the_published_numbers_out_of_a_bank(tmp_path):
     """44 with numbers of their author, of which evo takes repeated stamps of the truth for five, and nine without."""
-    singles = {
-        "amos_slam/CameraTrajectory": "amos_slam", "cds_slam/walking_rpy": "walking_rpy",
-        "ddn_slam/fr3_long_office": "long_office_household", "dyn_orb_slam/walking_xyz": "walking_xyz",
-        "dyslam/walking_xyz": "walking_xyz", "lc_crf_slam/traject": "lc_crf_slam",
-        "ygc_slam/CameraTrajectory": "walking_rpy", "yolo_dynaslam/walking_xyz": "walking_xyz",
-        "yolo_slam_ywl0720/walking_xyz": "walking_xyz",
-    }  # fmt: skip
     lines, numbers = [], {}
 
     def name(file, truth, tracker, sequence):
@@ -611,16 +596,15 @@ def test_published_trajectories_give_the_published_numbers_out_of_a_bank(tmp_pat
 
     for table in sorted(PUBLISHED.glob("rgbd-vo/*/published.csv")):
         for row in csv.DictReader(table.open()):
-            tracker, sequence = Path(row["trajectory"]).stem, sequence_of(table.parent.name)
+            tracker, sequence = Path(row["trajectory"]).stem, entry_of(table.parent.name).id
             name(table.parent / row["trajectory"], table.parent / "groundtruth.txt", tracker, sequence)
             numbers[tracker, sequence] = float(row["rmse_m"])
-    for file, truth in singles.items():
-        own = PUBLISHED / "authors" / truth
-        where = own if own.is_dir() else PUBLISHED / "rgbd-vo" / f"rgbd_dataset_freiburg3_{truth}"
-        sequence = {"amos_slam": "bonn/synchronous2", "lc_crf_slam": "tum/fr3/walking_xyz"}.get(truth) or sequence_of(
-            where.name
-        )
-        name(PUBLISHED / "authors" / f"{file}.txt", where / "groundtruth.txt", file.partition("/")[0], sequence)
+    own = {"amos_slam": "bonn/synchronous2", "lc_crf_slam": "tum/fr3/walking_xyz"}
+    for file, of_truth in SINGLE.items():
+        estimate = PUBLISHED / "authors" / f"{file}.txt"
+        truth = PUBLISHED / "rgbd-vo" / of_truth if of_truth else estimate.parent
+        tracker = estimate.parent.name
+        name(estimate, truth / "groundtruth.txt", tracker, entry_of(of_truth).id if of_truth else own[tracker])
     (tmp_path / "manifest.toml").write_text("".join(lines))
     added = bank.add([tmp_path / "manifest.toml"], tmp_path / "bank")
     assert (len(added.added), added.left_out) == (53, []) and bank.verify(tmp_path / "bank") == []
