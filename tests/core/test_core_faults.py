@@ -323,7 +323,7 @@ def test_the_byte_order_mark_is_left_out_and_long_lines_are_bounded(tmp_path: Pa
 
 
 def test_messages_are_one_line_of_bounded_length() -> None:
-    error = DynslamError("first\nsecond" + "x" * 100_000, "hint\r\nmore")
+    error = DynslamError("first\nsecond" + "x" * 100_000, "hint\r\nmore", options=["one\ntwo"])
     assert "\n" not in str(error) and len(str(error)) < 2100 and str(error).startswith("first second")
     with pytest.raises(DynslamError, match="where is no valid JSON"):
         parse_json("\n{\n", "where")

@@ -115,9 +115,8 @@ def test_the_budget_of_a_frame_falls_to_a_fifth() -> None:
     ],
 )
 def test_what_is_not_there(call: Any, words: str) -> None:
-    with pytest.raises(SettingsError, match=words) as caught:
+    with pytest.raises(SettingsError, match=words):
         call()
-    assert "\n" not in str(caught.value)
 
 
 @needs_shared

@@ -197,9 +197,8 @@ def test_a_state_of_another_sequence_tracker_settings_or_version_is_refused(
     ):
         if "version" in words:
             state = replace(state, origin={**state.origin, "version": "0.0.1"})
-        with pytest.raises(DynslamError, match=words) as caught:
+        with pytest.raises(DynslamError, match=words):
             env.restore_state(state)
-        assert "\n" not in str(caught.value)
         assert len(play(env)[0]) >= 8
     with pytest.raises(DynslamError, match="before reset"):
         SlamEnv(ToySequence(9), TARGET).clone_state()
@@ -594,13 +593,17 @@ def test_degraded_frames_reach_the_tracker_and_the_observation() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrapper", "arguments"),
-    [(DegradeFrames, {"blur": 1.5}), (DegradeFrames, {"noise": -0.1}), (SequenceSampler, {"sequences": []})]
-    + [(DropFrames, arguments) for arguments in ({"speed": 0}, {"frame_time_s": -1}, {"share": 1.0})],
+    ("wrapper", "observation", "arguments"),
+    [(DegradeFrames, "stats", {"blur": 1.5}), (DegradeFrames, "stats", {"noise": -0.1})]
+    + [(DropFrames, "stats", arguments) for arguments in ({"speed": 0}, {"frame_time_s": -1}, {"share": 1.0})]
+    + [(SequenceSampler, "stats", {"sequences": []})]
+    + [(SmallImages, "stats", {"width": 80}), (SmallImages, "rgbd", {"width": 0})],
 )
-def test_arguments_outside_their_range(wrapper: type, arguments: dict) -> None:
+def test_arguments_outside_their_range_and_what_cannot_be_wrapped(
+    wrapper: type, observation: str, arguments: dict
+) -> None:
     with pytest.raises(SettingsError):
-        wrapper(SlamEnv(ToySequence(5), TARGET), **arguments)
+        wrapper(SlamEnv(ToySequence(5), TARGET, observation=observation), **arguments)
 
 
 def test_sequence_sampler(toy_folder: str, tmp_path) -> None:
@@ -688,12 +691,6 @@ def test_depth_keeps_missing_apart_and_is_right_to_half_a_step() -> None:
     assert (steps == 0).sum() == 1 and steps[0, 0] == 0 and steps[-1, -1] == 255
     metres = (steps - 1) * MAX_DEPTH_M / 254
     assert np.abs(metres - shown["depth"]).ravel()[1:].max() <= 0.5 * MAX_DEPTH_M / 254 + 1e-6
-
-
-@pytest.mark.parametrize(("observation", "width"), [("stats", 80), ("rgbd", 0)])
-def test_what_it_cannot_wrap_is_refused(observation: str, width: int) -> None:
-    with pytest.raises(SettingsError):
-        SmallImages(SlamEnv(ToySequence(4), TARGET, observation=observation), width=width)
 
 
 def test_stable_baselines3_takes_it_without_a_word() -> None:

@@ -225,9 +225,8 @@ EMPTY = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
     ],
 )
 def test_too_few_poses_and_nothing_in_common(estimate, truth, named):
-    with pytest.raises(EvaluationError, match=named) as caught:
+    with pytest.raises(EvaluationError, match=named):
         evaluate(estimate, truth)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -508,9 +508,8 @@ def test_stamps_a_fifth_of_a_microsecond_apart_are_refused_before_tracking(
     lines = (folder / name).read_text().splitlines()
     lines.insert(3, f"{format_ns(START + 2 * STEP + 200)} {lines[2].partition(' ')[2]}")
     (folder / name).write_text("\n".join(lines) + "\n")
-    with pytest.raises(DynslamError, match=rf"{name}.*200 ns apart") as caught:
+    with pytest.raises(DynslamError, match=rf"{name}.*200 ns apart"):
         resolve(RunSpec(tracker=TARGET, sequence=str(folder)))
-    assert "\n" not in str(caught.value)
     told: list[str] = []
     specs = [RunSpec(tracker=TARGET, sequence=str(place)) for place in (good, folder, good)]
     records = run_many(specs, results=store, on_fault=lambda spec, error: told.append(str(error)))
