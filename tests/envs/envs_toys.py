@@ -123,7 +123,6 @@ class ToyTracker:
 
     def __init__(self, settings: ToySettings) -> None:
         self.settings = self._built = settings
-        self.closed = False
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         assert camera.width > 0
@@ -157,9 +156,6 @@ class ToyTracker:
     def finalize(self) -> Trajectory:
         return Trajectory(np.array(list(self._poses)), np.array(list(self._poses.values())).reshape(-1, 4, 4))
 
-    def close(self) -> None:
-        self.closed = True
-
 
 def misbehave(mode: str, result: TrackResult) -> TrackResult:
     """One of the ways in which a tracker can fail."""
@@ -184,10 +180,9 @@ class FixedTracker:
         self.settings = settings
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
-        self.frames = 0
+        """Nothing to forget."""
 
     def track(self, frame: Frame) -> TrackResult:
-        self.frames += 1
         return TrackResult(truth(frame.index + 1)[-1], "ok")
 
 

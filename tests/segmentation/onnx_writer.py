@@ -39,7 +39,7 @@ def node(operator: str, inputs, outputs, name: str) -> bytes:
     return data + text(3, name) + text(4, operator)
 
 
-def model(input_shape, outputs: dict[str, np.ndarray], metadata: dict[str, str] | None = None, declared=None) -> bytes:
+def model(input_shape, outputs: dict[str, np.ndarray]) -> bytes:
     """A network that ignores its image (but for adding its zero-scaled mean) and gives constants.
 
     Each output is ``constant + 0 * mean(image)``.
@@ -53,8 +53,7 @@ def model(input_shape, outputs: dict[str, np.ndarray], metadata: dict[str, str] 
         inits += text(5, tensor(f"const_{name}", flat))
         graph += text(1, node("Reshape", ["nothing", "one_dim"], [f"flat_{name}"], f"flatten_{name}"))
         graph += text(1, node("Add", [f"const_{name}", f"flat_{name}"], [name], f"add_{name}"))
-        outs += text(12, info(name, (declared or {}).get(name, value.shape)))
+        outs += text(12, info(name, value.shape))
     inits += text(5, tensor("one_dim", np.array([1], np.int64)))
     graph += text(2, "tiny") + inits + text(11, info("image", input_shape)) + outs
-    extra = b"".join(text(14, text(1, key) + text(2, value)) for key, value in (metadata or {}).items())
-    return number(1, 8) + text(7, graph) + text(8, text(1, "") + number(2, 13)) + extra
+    return number(1, 8) + text(7, graph) + text(8, text(1, "") + number(2, 13))
