@@ -21,7 +21,7 @@ from sequence_folders import flipped, make_folder
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError
 from dynslam_bench.geometry import Camera, Trajectory
-from dynslam_bench.sequences import DATASETS, SequenceView, open_sequence, sequence_ids
+from dynslam_bench.sequences import SequenceView, open_sequence
 from dynslam_bench.sequences import fetch as fetching
 from dynslam_bench.sequences.cameras import CAMERAS, read_camera, write_camera
 from dynslam_bench.sequences.catalogue import catalogue, entry_of
@@ -158,29 +158,6 @@ def test_camera_choices(tmp_path, vga):
         open_sequence(folder)
     with pytest.raises(SequenceError, match="unknown camera 'tum-f3'"):
         open_sequence(folder, camera="tum-f3")
-
-
-def test_a_data_set_plugs_in(tmp_path, monkeypatch, vga):
-    vga("mine/one")
-    plugin = tmp_path / "my_dataset.py"
-    plugin.write_text(
-        "from dynslam_bench.contracts import DatasetSpec\n"
-        "from dynslam_bench.sequences.catalogue import open_folder\n"
-        f"SPEC = DatasetSpec('mine', r'{plugin}:load', ('mine/one',))\n"
-        "def load(sequence_id, *, data_root):\n"
-        "    return open_folder(data_root / sequence_id)\n"
-    )
-    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"sequences={plugin}:SPEC,sequences={tmp_path}/broken.py:SPEC")
-    DATASETS.refresh()
-    try:
-        assert "mine/one" in sequence_ids()
-        assert len(open_sequence("mine/one", data_root=tmp_path)) == 2
-        assert [failure.source for failure in DATASETS.failures()] == [
-            f"DYNSLAM_BENCH_PLUGINS: {tmp_path}/broken.py:SPEC"
-        ]
-    finally:
-        monkeypatch.undo()
-        DATASETS.refresh()
 
 
 # Tags: what moves in a scene, and what a camera's path is like.

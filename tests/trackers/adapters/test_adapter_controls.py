@@ -28,7 +28,7 @@ from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
-from dynslam_bench.sequences.catalogue import DATASETS, open_sequence
+from dynslam_bench.sequences.catalogue import DATASETS, open_sequence, sequence_ids
 from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.adapters import odometry as opencv_odometry
@@ -297,7 +297,8 @@ def test_data_set(example, plugged, tmp_path):
     plugged("sequences", example("my_data.py"), DATASETS)
     sequence = open_sequence("grey/wall", data_root=tmp_path)
     check_sequence(sequence)
-    assert len(sequence) == 20 and open_sequence("grey/wall", data_root=tmp_path, frames="5:8")[0].timestamp == 5 / 30
+    assert "grey/wall" in sequence_ids() and len(sequence) == 20
+    assert open_sequence("grey/wall", data_root=tmp_path, frames="5:8")[0].timestamp == 5 / 30
     with pytest.raises(SequenceError, match="known: grey/wall"):
         open_sequence("grey/door", data_root=tmp_path)
 
