@@ -7,12 +7,11 @@ import math
 import os
 import random
 import socket
-import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
 from functools import cache, wraps
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
-from dynslam_bench.core import HIDDEN, StudyError, read_json, without_passwords
+from dynslam_bench.core import HIDDEN, StudyError, read_json, repeating, without_passwords
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.samplers import is_feasible
@@ -406,23 +405,14 @@ class Heartbeats:
         self._count += 1
         self._study.set_user_attr(_ALIVE + self._name, self._count)
 
-    @contextmanager
-    def beating(self) -> Iterator[None]:
+    def beating(self) -> AbstractContextManager[None]:
         """Count up while the block lasts."""
-        ended = threading.Event()
 
-        def keep_beating() -> None:
-            while not ended.wait(HEARTBEAT_S):
-                with suppress(Exception):  # the trials themselves say what is wrong with the storage
-                    self.beat()
+        def beat() -> None:
+            with suppress(Exception):  # the trials themselves say what is wrong with the storage
+                self.beat()
 
-        thread = threading.Thread(target=keep_beating, name="dynslam-heartbeat", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
+        return repeating(HEARTBEAT_S, beat)
 
 
 class JournalFile(JournalFileBackend):

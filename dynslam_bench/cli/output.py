@@ -8,7 +8,6 @@ import re
 import shutil
 import sys
 import textwrap
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import from_json, to_json
 
-from dynslam_bench.core import DynslamError, printable
+from dynslam_bench.core import DynslamError, printable, repeating
 
 if TYPE_CHECKING:
     from dynslam_bench.core.download import Report
@@ -222,7 +221,7 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
 
 @contextmanager
 def _progress_lines(label: str) -> Iterator[Advance]:
-    began, text, ended = time.monotonic(), label, threading.Event()
+    began, text = time.monotonic(), label
 
     def update(done: float, total: float | None, step: str = "") -> None:
         nonlocal text
@@ -231,15 +230,8 @@ def _progress_lines(label: str) -> Iterator[Advance]:
         left = f", about {spent_s * (total - done) / done:.0f} s left" if total and 0 < done < total else ""
         text = f"{label}{share}{left}" + (f" ({step})" if step else "")
 
-    def report() -> None:
-        while not ended.wait(HEARTBEAT_S):
-            warn(f"{text}, {time.monotonic() - began:.0f} s so far")
-
-    threading.Thread(target=report, daemon=True).start()
-    try:
+    with repeating(HEARTBEAT_S, lambda: warn(f"{text}, {time.monotonic() - began:.0f} s so far")):
         yield update
-    finally:
-        ended.set()
 
 
 @contextmanager

@@ -59,6 +59,7 @@ from dynslam_bench.core.reading import (
     read_npz,
     read_text,
 )
+from dynslam_bench.core.repeating import repeating
 from dynslam_bench.core.sanitise import (
     HIDDEN,
     inside,
@@ -116,6 +117,7 @@ __all__ = [
     "read_text",
     "read_toml",
     "reason_of",
+    "repeating",
     "replace_folder",
     "replacing",
     "setting_text",

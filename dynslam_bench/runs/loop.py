@@ -1,15 +1,15 @@
 """The loop in which every run is made: it steps an environment and keeps what is recorded of each frame."""
 
 import contextlib
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from dynslam_bench.core import repeating
 from dynslam_bench.envs import DegradeFrames, DropFrames, SlamEnv
 from dynslam_bench.evaluation import Protocol, compare_masks
 from dynslam_bench.evaluation.comparison import tracked_frames
@@ -100,29 +100,13 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
             with at(position):
                 _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
-        signs = _signs_of_life(send, total - 1) if not base.tracker_spec.online else contextlib.nullcontext()
+        signs: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+        if not base.tracker_spec.online:  # a batch program, which has a time limit of its own, is at work
+            signs = repeating(_BEAT_S, lambda: send({"type": "frame", "index": total - 1}))
         with at(lambda: "after the last frame"), signs:
             outcome = recorder.finish()
             env.close()
     return {"type": "done", **outcome}
-
-
-@contextlib.contextmanager
-def _signs_of_life(send: Send, frame: int) -> Iterator[None]:
-    """Tell the parent every few seconds that a batch program, which has a time limit of its own, is at work."""
-    over = threading.Event()
-
-    def beat() -> None:
-        while not over.wait(_BEAT_S):
-            send({"type": "frame", "index": frame})
-
-    thread = threading.Thread(target=beat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:
