@@ -144,14 +144,12 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
     """
     path = folder / IMAGES if folder.is_dir() else folder
     poses_by_stamp: dict[float, Array] = {}
-    held = False
-    for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
-        if line.startswith("#"):
+    numbered = enumerate(read_lines(path, kind=TrajectoryError), start=1)
+    lines = ((number, line) for number, line in numbered if not line.startswith("#"))
+    for number, line in lines:
+        if not line.strip():
             continue
-        held = not held
-        if not held or not line.strip():  # every other line holds the image's points, often none
-            held = held and bool(line.strip())
-            continue
+        next(lines, None)  # the line of the image's points, often empty
         parts = line.split(maxsplit=9)
         if len(parts) != 10 or not all(map(is_number, parts[1:8])):
             raise TrajectoryError(f"{path} line {number} is no image: expected ID QW QX QY QZ TX TY TZ CAMERA NAME")
