@@ -23,7 +23,7 @@ from dynslam_bench.contracts import Sequence
 from dynslam_bench.core import RunError, raising
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.rendering import CULLED, ESTIMATE, KEPT, MASK, TRUTH
-from dynslam_bench.geometry import Camera, Trajectory, se3
+from dynslam_bench.geometry import Camera, Trajectory, associate, se3
 from dynslam_bench.runs.artifacts import Snapshot, aligned_truth, read_snapshots
 from dynslam_bench.runs.frames import CSV_FILE, read_csv
 from dynslam_bench.runs.record import RunRecord
@@ -195,14 +195,16 @@ def write_stored(
     scale = np.array([sequence.camera.width / max(width, 1), sequence.camera.height / max(height, 1)])
     shots = {shot.index: _scaled(shot, scale) for shot in snapshots}
     online = store.trajectory(record.run_id, "online") or trajectory
+    tracked, rows_of_poses = associate(sequence.timestamps, online.timestamps, _TOLERANCE_S, strict=False)
+    poses = dict(zip(tracked.tolist(), online.T_world_cam[rows_of_poses], strict=True))
     rows = {row.index: row for row in read_csv(folder / CSV_FILE)} if (folder / CSV_FILE).is_file() else {}
 
     def frames() -> Iterator[RecordedFrame]:
         for index in range(len(sequence)):
             frame, row = sequence[index], rows.get(index)
             state = ("", None) if row is None else (str(row.state), row.pose_error_trans_m)
-            pose = _pose_at(online, frame.timestamp)
-            yield RecordedFrame(index, frame.timestamp, encode(frame.rgb), pose, shots.get(index), *state)
+            image = encode(frame.rgb)
+            yield RecordedFrame(index, frame.timestamp, image, poses.get(index), shots.get(index), *state)
 
     cloud = read_ply(folder / "map.ply") if (folder / "map.ply").is_file() else None
     truth = aligned_truth(sequence.ground_truth, trajectory)[0]
@@ -215,14 +217,4 @@ def write_stored(
 
 def _scaled(shot: Snapshot, scale: NDArray[np.float64]) -> Snapshot:
     """A snapshot of an image that the tracker's preprocessing had resized, in pixels of the sequence's."""
-    if (scale == 1).all():
-        return shot
     return replace(shot, points=((shot.points + 0.5) * scale - 0.5).round().astype(np.int16))
-
-
-def _pose_at(trajectory: Trajectory, stamp: float) -> NDArray[np.float64] | None:
-    near = int(np.searchsorted(trajectory.timestamps, stamp - _TOLERANCE_S))
-    if near < len(trajectory) and abs(trajectory.timestamps[near] - stamp) <= _TOLERANCE_S:
-        pose: NDArray[np.float64] = trajectory.T_world_cam[near]
-        return pose
-    return None
