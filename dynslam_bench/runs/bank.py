@@ -30,9 +30,9 @@ from dynslam_bench.core import (
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.core.records import Record, digest, validated
-from dynslam_bench.runs.exchange.transfer import Which, import_trajectory
+from dynslam_bench.runs.exchange.transfer import import_trajectory
 from dynslam_bench.runs.record import RunRecord
-from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, merge, open_store
+from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, Which, merge, open_store
 
 SUMS = "SHA256SUMS"
 _PARTS = ("runs", "sequences")

@@ -19,7 +19,7 @@ from dynslam_bench.contracts import stage_seconds
 from dynslam_bench.core import DynslamError, RunError, read_lines, reason_of, storable
 from dynslam_bench.geometry import Trajectory, format_ns, ns_of, se3, write_tum
 from dynslam_bench.runs.record import RunRecord, StageTime
-from dynslam_bench.runs.store import RunStore
+from dynslam_bench.runs.store import ONLINE, RunStore
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,7 +30,6 @@ FRAMES_FILE = "frames.jsonl"
 """The child's log: one line a frame, complete before the next frame begins; gone when the run is stored."""
 CSV_FILE = "frames.csv"
 """The stored table: one row a frame."""
-ONLINE_FILE = "trajectory_online.txt"
 FIXED = (
     *("index", "timestamp", "state"),
     *("frame_error_trans_m", "frame_error_rot_deg", "pose_error_trans_m", "pose_error_rot_deg"),
@@ -243,7 +242,7 @@ class FrameLog:
             comment: Head of the trajectory.
             exact: The nanoseconds of the frames' stamps by their seconds, where a float does not hold them.
         """
-        write_tum(folder / ONLINE_FILE, self.trajectory().with_exact(exact or {}), comment=comment)
+        write_tum(folder / ONLINE, self.trajectory().with_exact(exact or {}), comment=comment)
         write_csv(folder / CSV_FILE, self.rows, exact)
 
 

@@ -33,6 +33,7 @@ from dynslam_bench.runs.exchange.recording import (
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameRow
 from dynslam_bench.runs.process.child import at
 from dynslam_bench.runs.spec import RunSpec
+from dynslam_bench.runs.store import FINAL
 
 _BEAT_S = 5.0
 Send = Callable[[dict[str, Any]], None]
@@ -173,7 +174,7 @@ class _Recorder:
         outcome: dict[str, Any] = {"finalize_s": None, "gpu_memory_mb": None}
         if final is not None:
             outcome["finalize_s"] = time.perf_counter() - began
-            write_tum(folder / "trajectory_final.txt", final)
+            write_tum(folder / FINAL, final)
         outputs, counts, notes = keep_map(env, folder, self._spec)
         if not env.tracker_spec.online and final is not None:
             measured, tracked = env.measured, tracked_frames(final, env.sequence.timestamps)

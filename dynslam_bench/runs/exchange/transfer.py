@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from hashlib import sha256
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -32,13 +31,12 @@ from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo
 from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
-from dynslam_bench.runs.store import RunStore, open_store
+from dynslam_bench.runs.store import RunStore, Which, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 from dynslam_bench.sequences.tags import motion_tags
 from dynslam_bench.sequences.view import Part, part_of
 from dynslam_bench.slam.map_files import read_ply
 
-Which = Literal["online", "final"]
 _STAMP_TOLERANCE_S = 1e-5
 _IMPORT_TOLERANCE_S = 0.02
 
