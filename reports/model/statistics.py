@@ -9,7 +9,6 @@ does not depend on how many sequences each category has; with equal weights all 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import combinations
 from typing import Literal
 
@@ -126,14 +125,8 @@ def ratio_interval(log_ratios: Array, weights: Array | None = None) -> Interval:
     if len(values) < FEWEST:
         return Interval(float(np.exp(np.average(values, weights=share))), math.nan, math.nan)
     mean, error, freedom = _weighted_mean(values, share)
-    half = _quantile(round(freedom, 9)) * float(error)
+    half = float(scipy.special.stdtrit(freedom, 0.975) * error)
     return Interval(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))
-
-
-@cache
-def _quantile(freedom: float) -> float:
-    """Student's 97.5 % quantile."""
-    return float(scipy.stats.t.ppf(0.975, freedom))
 
 
 def _weighted_mean(values: Array, weights: Array) -> tuple[Array, Array, float]:
