@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
+from statistics import median_high
 
 from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, common_logs
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
@@ -100,8 +101,7 @@ def mean_rank_note(board: Board) -> str:
 def _typical_width(board: Board) -> float:
     """Median over trackers of the factor between an interval's end and its middle."""
     ratios = [s.ratio for s in board.standings if s.rank is not None and s.ratio.high > s.ratio.value > 0]
-    widths = sorted(ratio.high / ratio.value for ratio in ratios)
-    return widths[len(widths) // 2] if widths else 1.0
+    return median_high(ratio.high / ratio.value for ratio in ratios) if ratios else 1.0
 
 
 def _sequences(board: Board) -> str:
