@@ -18,9 +18,6 @@ STATES = {"OK": "ok", "OK_KLT": "ok", "RECENTLY_LOST": "lost", "LOST": "lost"}
 class Worker:
     """One ORB-SLAM3 system; states and poses as its bindings give them."""
 
-    def __init__(self) -> None:
-        self._slam: Any = None
-
     def reset(self, request: dict[str, Any]) -> None:
         """Load the vocabulary and start ORB-SLAM3's threads."""
         try:
@@ -35,7 +32,7 @@ class Worker:
         sensor = getattr(pyorbslam3.Sensor, options["sensor"])
         self._tracked: list[float] = []
         self._final: list[list[float]] | None = None
-        self._slam = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], sensor)
+        self._slam: Any = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], sensor)
 
     def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
         """One frame; without depth in monocular mode."""
