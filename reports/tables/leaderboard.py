@@ -920,6 +920,6 @@ def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]
     ]
 
 
-def has_lost(cell: Cell | None) -> bool:
+def has_lost(cell: Cell) -> bool:
     """Whether frames were lost in a run that succeeded: the errors of the cell are of the tracked ones only."""
-    return cell is not None and any(row.incomplete for row in cell.kept if not row.failed)
+    return any(row.incomplete for row in cell.kept if not row.failed)
