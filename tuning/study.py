@@ -363,19 +363,16 @@ class Study(Plan):
 
     def evaluate(self, trial: optuna.Trial) -> Evaluation:
         """Run a trial on one instance after the other until it ends or is pruned."""
-        with self._heartbeats.beating():
-            return self._evaluate(trial)
-
-    def _evaluate(self, trial: optuna.Trial) -> Evaluation:
         outcomes: dict[ProblemInstance, Outcome] = {}
-        reference, pruned = self._reference or self.reference(), False
-        try:
-            for instance in self.design.tune:
-                outcomes |= self.outcomes(self.configuration_of(trial).settings, [instance])
-                if pruned := self._prune(trial, outcomes, instance):
-                    break
-        except (CancelledError, InstanceFailedError) as error:
-            return Evaluation(TrialState.FAIL, CRASHED_WORKER if isinstance(error, CancelledError) else str(error))
+        with self._heartbeats.beating():
+            reference, pruned = self._reference or self.reference(), False
+            try:
+                for instance in self.design.tune:
+                    outcomes |= self.outcomes(self.configuration_of(trial).settings, [instance])
+                    if pruned := self._prune(trial, outcomes, instance):
+                        break
+            except (CancelledError, InstanceFailedError) as error:
+                return Evaluation(TrialState.FAIL, CRASHED_WORKER if isinstance(error, CancelledError) else str(error))
         trial.set_user_attr("coverage", coverage(outcomes))
         trial.set_user_attr("fps", fps(outcomes))
         trial.set_user_attr("scenes", together(self.objectives).ratios(outcomes, reference))
