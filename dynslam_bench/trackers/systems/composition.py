@@ -80,15 +80,10 @@ class SemanticSystemSettings(SystemSettings):
             )
 
 
-class MonocularSystemSettings(SystemSettings):
-    """A system that uses no depth."""
-
-    backend: MonocularBackendSettings = MonocularBackendSettings()
-
-
-class MonocularSemanticSettings(MonocularSystemSettings, SemanticSystemSettings):
+class MonocularSemanticSettings(SemanticSystemSettings):
     """A system that uses masks and no depth; repair needs depth."""
 
+    backend: MonocularBackendSettings = MonocularBackendSettings()
     segmentation: UnrepairedSettings = UnrepairedSettings()
 
 

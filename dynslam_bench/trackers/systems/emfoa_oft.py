@@ -30,17 +30,6 @@ from dynslam_bench.trackers.systems.published import SEMANTIC, UNGUARDED
 Groups = Mapping[str, Settings]
 
 
-class EpipolarTestSettings(SystemSettings):
-    """Flow at the points, and the guarded epipolar test."""
-
-    flow: FlowSettings = FlowSettings()
-    epipolar: EpipolarSettings = EpipolarSettings()
-
-
-class MonocularSettings(MonocularSemanticSettings, EpipolarTestSettings):
-    """This project's system without depth: the paper calls itself monocular in half of its text."""
-
-
 TESTS = (
     ("epipolar:EpipolarFilter", "epipolar"),
     ("ego_motion:RigidMotionFilter", "motion"),
@@ -73,7 +62,7 @@ DEPTH_TESTS = "rigid motion in depth and free space seen before are tested as we
 
 
 def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[str]:
-    masks, monocular, tested = base is not SystemSettings, base is MonocularSettings, "epipolar" in groups
+    masks, monocular, tested = base is not SystemSettings, base is MonocularSemanticSettings, "epipolar" in groups
     paper, sparse = name.startswith("emfoa-oft-paper"), isinstance(groups.get("flow"), FlowSettings)
     sentences: list[tuple[bool, tuple[str, ...]]] = [
         (name == "emfoa-oft", (WHOSE,)),
@@ -161,10 +150,10 @@ SPECS = (
         provenance="faithful-paper",
         published_as=("EMFOA-OFT-SLAM",),
     ),
-    _spec(
+    _spec(  # the paper calls itself monocular in half of its text
         "emfoa-oft-mono",
         "EMFOA-OFT, monocular (our back end)",
-        MonocularSettings,
+        MonocularSemanticSettings,
         EPIPOLAR,
         "our own system without depth: masks, EMFOA-optimised sparse flow, guarded epipolar test",
         sensors="rgb",
