@@ -259,13 +259,10 @@ class RunStore:
         """Make sure that runs can be stored, and remove what killed processes left behind.
 
         Raises:
-            RunError: The folder cannot be written.
+            DynslamError: The folder cannot be written.
         """
-        try:
-            with temporary_folder(self.runs / "probe"):
-                pass
-        except DynslamError as error:
-            raise RunError(str(error.args[0]), "name another folder") from error
+        with temporary_folder(self.runs / "probe"):
+            pass
         if not self._swept:
             self._swept = True
             for pattern in (".*", "runs/.*", "sequences/*/.*"):
