@@ -27,7 +27,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
-from dynslam_bench.core import HIDDEN, StudyError, read_json, repeating, without_passwords
+from dynslam_bench.core import HIDDEN, StudyError, raising, read_json, repeating, without_passwords
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.samplers import is_feasible
@@ -432,10 +432,8 @@ class JournalFile(JournalFileBackend):
     def __init__(self, path: Path) -> None:
         if path.is_symlink():
             raise StudyError(f"{path} is a link: a study is written in its own folder", "put the file in its place")
-        try:
+        with _writing(path):
             super().__init__(str(path))
-        except OSError as error:
-            raise _cannot_write(path, error) from error
         self.path = path
 
     def append_logs(self, logs: Sequence[dict[str, Any]]) -> None:
@@ -445,22 +443,19 @@ class JournalFile(JournalFileBackend):
             StudyError: They cannot be written; then the file is as it was.
         """
         rest = memoryview("".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs).encode())
-        try:
-            with self.path.open("r+b", buffering=0) as file:
-                fcntl.flock(file, fcntl.LOCK_EX)
-                end = file.readall().rfind(b"\n") + 1
+        with _writing(self.path), self.path.open("r+b", buffering=0) as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            end = file.readall().rfind(b"\n") + 1
+            file.truncate(end)
+            file.seek(end)
+            try:
+                while rest:
+                    rest = rest[file.write(rest) :]
+                os.fsync(file.fileno())
+            except OSError:
                 file.truncate(end)
-                file.seek(end)
-                try:
-                    while rest:
-                        rest = rest[file.write(rest) :]
-                    os.fsync(file.fileno())
-                except OSError:
-                    file.truncate(end)
-                    raise
-        except OSError as error:
-            raise _cannot_write(self.path, error) from error
+                raise
 
 
-def _cannot_write(path: Path, error: OSError) -> StudyError:
-    return StudyError(f"cannot write {path}: {error.strerror}", "free some space, or check the folder; then go on")
+def _writing(path: Path) -> AbstractContextManager[None]:
+    return raising(StudyError, f"cannot write {path}", "free some space, or check the folder; then go on")
