@@ -1,7 +1,5 @@
 """A report: load the runs, order them, put the pages together, write; and the site that is published of it."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
@@ -107,6 +105,8 @@ class ReportPaths:
 
 
 _NOT_IN_LATEX = ("machines", "failures")
+Fact = tuple[str, str, list[str]]
+"""A number, what it counts, and its details."""
 
 
 def build_report(
@@ -345,10 +345,6 @@ def sections_page(sections: Sequence[Section], **values: Any) -> str:
         if block.figure is not None
     }
     return render("sections.html.j2", sections=shown, figures=charts, **values)
-
-
-Fact = tuple[str, str, list[str]]
-"""A number, what it counts, and its details."""
 
 
 def facts_of(board: Board, protocol: Protocol) -> list[Fact]:

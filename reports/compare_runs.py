@@ -1,7 +1,5 @@
 """Two sets of results against each other: before and after a change of the code, or of the settings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -24,6 +22,9 @@ from dynslam_bench.reports.tables.leaderboard import interval_cell
 from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
 from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
+
+Paired = tuple[str, Cell, Cell]
+"""A sequence, with `SEEN` behind it if a side's network was trained on it, and one tracker's runs on both sides."""
 
 
 @dataclass(frozen=True)
@@ -178,10 +179,6 @@ def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRo
                 rows = ReportData.read(file).rows
                 return rows, rows[0].protocol_id if rows else ""
     return load_runs(open_stores(source), protocol, trials=True).rows, protocol.describe()
-
-
-Paired = tuple[str, Cell, Cell]
-"""A sequence, with `SEEN` behind it if a side's network was trained on it, and one tracker's runs on both sides."""
 
 
 def _by_column(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:

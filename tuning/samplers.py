@@ -5,8 +5,6 @@ pruners end the worse ones early: asynchronous successive halving (Li et al. 202
 against the best trial. Optuna prunes no trials of several objectives.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from typing import Any

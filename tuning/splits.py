@@ -1,7 +1,5 @@
 """The splits of a study: instances to tune on, to choose on and to judge on, and whether they are apart."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from collections.abc import Sequence as PySequence
