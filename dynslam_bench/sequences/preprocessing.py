@@ -103,9 +103,3 @@ def normalise(rgb: NDArray[np.uint8], settings: PreprocessingSettings) -> NDArra
         luminance = cv2.convertScaleAbs(np.clip((luminance - mean.item()) * gain + 255 * settings.target_mean, 0, 255))
     merged = cv2.merge([luminance, *chroma])
     return np.asarray(cv2.cvtColor(merged, cv2.COLOR_YCrCb2RGB), dtype=np.uint8)
-
-
-def intensity(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Grey values in [0, 1], float32 ``[H, W]``, of a uint8 image ``[H, W]`` or ``[H, W, 3]`` (red first)."""
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
-    return np.asarray(gray, dtype=np.float32) / np.float32(255)
