@@ -164,8 +164,6 @@ def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> 
         keep_aspect: Letterbox (YOLO) instead of stretching (semantic networks).
     """
     height, width = rgb.shape[:2]
-    if (height, width) == size:
-        return rgb, Placement(size, size)
     ratio = min(size[0] / height, size[1] / width)
     rows, columns = (max(1, round(height * ratio)), max(1, round(width * ratio))) if keep_aspect else size
     top, left = (size[0] - rows) // 2, (size[1] - columns) // 2
