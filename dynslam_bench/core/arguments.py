@@ -4,11 +4,10 @@ import inspect
 import re
 import sys
 import traceback
-import typing
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast, get_type_hints
 
 from pydantic import ConfigDict, ValidationError, create_model
 
@@ -43,19 +42,19 @@ def names_wrong_arguments(target: C) -> C:
                 raise wrong from error
             raise
 
-    return typing.cast("C", call)
+    return cast("C", call)
 
 
 def _is_ours(error: Exception) -> bool:
     """Whether an error passed through this package and its libraries alone: no plug-in, nor a user's callable."""
-    modules = {str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)}
-    ours = {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
-    return all(module.partition(".")[0] in ours for module in modules)
+    modules = (str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__))
+    packages = {module.partition(".")[0] for module in modules}
+    return packages <= {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
 
 
 def _wrong_argument(function: Callable[..., Any], given: dict[str, Any]) -> SettingsError | None:
     """The line on the first argument that is not of the annotated type; None if all are."""
-    hints = typing.get_type_hints(function)
+    hints = get_type_hints(function)
     fields: dict[str, Any] = {name: (hints[name], ...) for name in given if name in hints}
     model = create_model("Arguments", __config__=ConfigDict(arbitrary_types_allowed=True, strict=True), **fields)
     try:

@@ -96,13 +96,11 @@ def download(
                 raise DownloadError(
                     f"another process is downloading {url}", "wait for it, then run the same command again"
                 )
-            if progress is None:
-                progress = stack.enter_context(_display[0](target.name)) if _display else lambda _: None
-            partial = _Partial(url, part, progress, timeout_s, most_bytes)
+            report = progress or (stack.enter_context(_display[0](target.name)) if _display else lambda _: None)
+            partial = _Partial(url, part, report, timeout_s, most_bytes)
             if not target.is_file():
                 partial.complete(attempts, wait_s)
             file = target if target.is_file() else part
-            report = progress
             checksum = file_sha256(file, lambda done, total: report(Progress("check", done, total)))
             if sha256 is not None and not checksum.startswith(sha256):
                 size = file.stat().st_size

@@ -3,7 +3,6 @@
 What is written has the permissions that the user's umask gives.
 """
 
-import contextlib
 import ctypes
 import errno
 import fcntl
@@ -16,7 +15,7 @@ import tempfile
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from dynslam_bench.core.errors import DynslamError, raising
@@ -44,7 +43,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     finally:
-        with contextlib.suppress(OSError):  # it has become `path`, or the disk takes nothing more
+        with suppress(OSError):  # it has become `path`, or the disk takes nothing more
             temporary.unlink()
         os.close(lock)
 
@@ -143,7 +142,7 @@ def sweep_temporary(folder: Path, pattern: str = ".*") -> int:
     for path in folder.glob(pattern):
         if not _TEMPORARY.fullmatch(path.name) or not is_abandoned(path):
             continue
-        with contextlib.suppress(OSError):  # another process was faster, or it is another user's
+        with suppress(OSError):  # another process was faster, or it is another user's
             if path.suffix == ".tmp" or time.time() - path.stat().st_mtime > _NEW_S:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
                 removed += 1
@@ -208,7 +207,7 @@ def claimed(path: Path) -> Iterator[bool]:
             yield mine
         finally:
             if mine:  # while it is locked, so that no process locks a file that is being removed
-                with contextlib.suppress(OSError):  # a file that stays does no damage
+                with suppress(OSError):  # a file that stays does no damage
                     path.unlink()
     finally:
         os.close(handle)

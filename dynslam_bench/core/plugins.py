@@ -7,7 +7,6 @@ ones, those of the environment variable ``DYNSLAM_BENCH_PLUGINS``, and those of 
 rest; the reason is kept and shown by ``trackers doctor``.
 """
 
-import importlib
 import importlib.util
 import json
 import os
@@ -291,9 +290,11 @@ def check_import(location: str) -> None:
         return
     command = [sys.executable, "-c", _PROBE, location, json.dumps(sys.path), str(_IMPORTED)]
     environment = {**os.environ, ISOLATED_VARIABLE: "1"}
-    quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet = subprocess.DEVNULL
     try:
-        code = subprocess.run(command, env=environment, timeout=LIMIT_S, check=False, **quiet).returncode  # type: ignore[call-overload]
+        code = subprocess.run(
+            command, env=environment, timeout=LIMIT_S, check=False, stdin=quiet, stdout=quiet, stderr=quiet
+        ).returncode
     except subprocess.TimeoutExpired:
         raise PluginError(f"cannot import {location}: it is not done after {LIMIT_S} s") from None
     if code != _IMPORTED:
