@@ -9,11 +9,8 @@ from typing import Annotated, Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dynslam_bench.core.errors import DynslamError, did_you_mean
-from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.reading import RECORD_BYTES, read_text
 from dynslam_bench.core.sanitise import json_without_passwords, storable
-
-__all__ = ["Digest", "Record", "digest", "schema", "write_atomic"]
 
 R = TypeVar("R", bound="Record")
 M = TypeVar("M", bound=BaseModel)

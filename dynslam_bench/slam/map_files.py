@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from dynslam_bench.contracts.tracker import MapOutputs
-from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
+from dynslam_bench.core import DynslamError, RunError, SettingsError, TrackerError, write_atomic
 from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
-from dynslam_bench.core.records import Record, schema, write_atomic
+from dynslam_bench.core.records import Record, schema
 from dynslam_bench.geometry import Camera, format_ns, ns_of, se3
 
 MAP_FILE = "map.npz"

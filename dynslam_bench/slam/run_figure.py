@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageOps
 
 from dynslam_bench.contracts.tracker import MapOutputs
-from dynslam_bench.core.records import write_atomic
+from dynslam_bench.core import write_atomic
 from dynslam_bench.geometry import Trajectory, se3
 
 Array = NDArray[np.float64]
