@@ -134,15 +134,13 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
     pairs = np.stack([candidate_a, candidate_b], axis=1)
     if not (np.diff(pairs, axis=0) > 0).all():  # some stamp has several candidates
-        used_a: set[int] = set()
-        used_b: set[int] = set()
-        matched: list[tuple[int, int]] = []
+        match_of: dict[int, int] = {}
+        taken: set[int] = set()
         for i, j in pairs[np.lexsort((candidate_b, candidate_a, dt))].tolist():
-            if i not in used_a and j not in used_b:
-                used_a.add(i)
-                used_b.add(j)
-                matched.append((i, j))
-        pairs = np.array(sorted(matched), dtype=np.intp).reshape(-1, 2)
+            if i not in match_of and j not in taken:
+                match_of[i] = j
+                taken.add(j)
+        pairs = np.array(sorted(match_of.items()), dtype=np.intp).reshape(-1, 2)
     index_a, index_b = order_a[pairs[:, 0]], order_b[pairs[:, 1]]
     index_a.flags.writeable = index_b.flags.writeable = False
     return index_a, index_b
