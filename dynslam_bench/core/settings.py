@@ -147,17 +147,14 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
 
     A field of type `Path` counts as a file, too.
     """
-    differences = {}
+    values: dict[str, tuple[str, str]] = {}
     for name, field, _ in _leaves(type(settings)):
-        extra = field.json_schema_extra
-        note = extra.get(_NAMES) if isinstance(extra, dict) else None
-        value = attrgetter(name)(settings)
-        if isinstance(note, dict):
-            value = value or os.environ.get(str(note["otherwise"]), "")
-            differences[name] = (str(note["kind"]), str(value))
+        note, value = _annotation(field, _NAMES), attrgetter(name)(settings)
+        if note is not None:
+            values[name] = (note["kind"], value or os.environ.get(note["otherwise"], ""))
         elif isinstance(value, Path):
-            differences[name] = ("file", str(value))
-    return {name: pair for name, pair in differences.items() if pair[1]}
+            values[name] = ("file", str(value))
+    return {name: pair for name, pair in values.items() if pair[1]}
 
 
 def build(cls: type[S], values: Mapping[str, Any] | None = None) -> S:
@@ -281,9 +278,10 @@ def _nested(field: FieldInfo) -> type[Settings] | None:
     return None
 
 
-def _annotation(field: FieldInfo) -> dict[str, Any] | None:
+def _annotation(field: FieldInfo, key: str = _KEY) -> dict[str, Any] | None:
+    """What `tunable` or `names` stored with a field."""
     extra = field.json_schema_extra
-    return typing.cast("dict[str, Any]", extra[_KEY]) if isinstance(extra, dict) and _KEY in extra else None
+    return typing.cast("dict[str, Any] | None", extra.get(key)) if isinstance(extra, dict) else None
 
 
 def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
