@@ -125,9 +125,7 @@ class _Topics:
 
     def __init__(self, reader: Any, source: Path) -> None:
         self.reader, self.source = reader, source
-        self.connections: dict[str, list[Any]] = {}
-        for connection in reader.connections:
-            self.connections.setdefault(connection.topic, []).append(connection)
+        self.connections: dict[str, list[Any]] = {name: topic.connections for name, topic in reader.topics.items()}
 
     def of_types(self, types: Sequence[str]) -> list[str]:
         return sorted(topic for topic, connections in self.connections.items() if connections[0].msgtype in types)
