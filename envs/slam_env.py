@@ -29,6 +29,7 @@ from dynslam_bench.core import (
     stage_cache_folder,
 )
 from dynslam_bench.core.arguments import names_wrong_arguments
+from dynslam_bench.core.fingerprint import content_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
@@ -364,7 +365,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """Go back to a copied episode; the steps that follow are equal to the bit to those that followed the copy.
 
         Raises:
-            DynslamError: The state is of another sequence, tracker, control, settings, reward or version.
+            DynslamError: The state is of other frames, or of another tracker, control, reward, protocol, version, or of
+                other settings or another `lost_after`.
         """
         origin = self._origin()
         for name, value in state.origin.items():
@@ -381,12 +383,15 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _origin(self) -> dict[str, str]:
         whole = self._whole
+        frames = digest([whole.digest(), content_digest(whole.timestamps)])
         return {
-            "sequence": f"'{whole.id}' ({len(whole)} frames from {whole.timestamps[0]:.6f} s, {whole.digest()})",
+            "sequence": f"'{whole.id}' ({len(whole)} frames from {whole.timestamps[0]:.6f} s, {frames})",
             "tracker": f"'{self.tracker_spec.id}'",
             "control": str(list(self._control)),
             "settings": digest(self.settings.model_dump(mode="json")),
             "reward": getattr(self._reward, "__qualname__", repr(self._reward)),
+            "protocol": f"{self.protocol.id} [{self.protocol.digest()}]",
+            "lost_after": str(self._lost_after),
             "version": dynslam_bench.__version__,
         }
 

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 from typing import Annotated, Optional
 
 import typer
@@ -21,7 +22,7 @@ from dynslam_bench.cli import (
     trajectories,
 )
 from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START, ShortHelp
-from dynslam_bench.cli.output import download_bar, set_json_mode, write_error
+from dynslam_bench.cli.output import download_bar, set_json_mode, warn, write_error
 from dynslam_bench.core import DynslamError
 
 INTERRUPT_CODE = 130
@@ -84,7 +85,9 @@ def start(arguments: list[str] | None = None) -> None:
     """
     arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
     try:
-        app(args=arguments, prog_name="dynslam-bench")
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: warn(f"warning: {message}")
+            app(args=arguments, prog_name="dynslam-bench")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has ended, e.g. `| head`
         sys.exit(0)

@@ -5,9 +5,10 @@ only: no number is wrong because of it.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import get_args
 
 import numpy as np
@@ -79,7 +80,7 @@ class Fault:
 
 
 def faults(result: object, frame: Frame) -> Iterator[Fault]:
-    """What makes a result invalid: its type, its state, its pose, or a mask of another size than the image.
+    """What makes a result invalid: its type, state, pose, numbers, keypoints, or a mask of another size than the image.
 
     Lazily, the most basic first: what comes later takes for granted that the earlier is in order.
     """
@@ -98,6 +99,18 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
     mask = result.dynamic_mask
     if mask is not None and np.shape(mask) != frame.depth.shape:
         yield Fault(f"a dynamic mask of shape {np.shape(mask)}, the image has {frame.depth.shape}")
+    for name, values in (("stats", result.stats), ("timings", result.timings)):
+        if not isinstance(values, Mapping):
+            yield Fault(f"{name} of type {type(values).__name__}", "expected numbers by name")
+        elif bad := {key: value for key, value in values.items() if not isinstance(value, Real | np.bool_)}:
+            yield Fault(f"{name} with values that are no numbers: {bad}")
+    xy, keep = result.keypoints_xy, result.keypoints_keep
+    if xy is not None and (not isinstance(xy, np.ndarray) or xy.dtype.kind not in "fiu" or xy.shape[1:] != (2,)):
+        yield Fault(f"keypoints_xy of shape {np.shape(xy)}, expected an array [N, 2] of numbers")
+    elif xy is not None and not np.isfinite(xy).all():
+        yield Fault("keypoints_xy that are not finite", "leave out features without a pixel")
+    elif keep is not None and (xy is None or np.shape(keep) != (len(xy),)):
+        yield Fault("keypoints_keep that does not fit keypoints_xy")
 
 
 def blemishes(result: TrackResult) -> Iterator[Fault]:
@@ -108,13 +121,9 @@ def blemishes(result: TrackResult) -> Iterator[Fault]:
             yield Fault(f"{name} with values that are no finite numbers: {bad}")
     if any(_is_number(value) and value < 0 for value in result.timings.values()):
         yield Fault("a timing that is negative")
-    mask, xy, keep = result.dynamic_mask, result.keypoints_xy, result.keypoints_keep
+    mask = result.dynamic_mask
     if mask is not None and getattr(mask, "dtype", None) != np.bool_:
         yield Fault(f"a dynamic mask of type {getattr(mask, 'dtype', type(mask).__name__)}, expected bool")
-    if xy is not None and (xy.ndim != 2 or xy.shape[1] != 2):
-        yield Fault(f"keypoints_xy of shape {xy.shape}, expected [N, 2]")
-    if keep is not None and (xy is None or keep.shape != (len(xy),)):
-        yield Fault("keypoints_keep that does not fit keypoints_xy")
 
 
 def trajectory_faults(trajectory: object) -> Iterator[Fault]:

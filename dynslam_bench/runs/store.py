@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import sqlite3
+import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -575,8 +576,20 @@ class RunStore:
         Returns:
             The columns that `runs_frame` describes.
         """
-        listed = (record for record in self.all()[0] if trials or not record.trial_of)
+        records, unreadable = self.all()
+        warn_of_unreadable([f"{entry.path}: {entry.reason}" for entry in unreadable])
+        listed = (record for record in records if trials or not record.trial_of)
         return runs_frame((r, None if r.status == "stopped" else self.score(r, protocol)) for r in listed)
+
+
+def warn_of_unreadable(reasons: Sequence[str]) -> None:
+    """Warn of runs that a table leaves out."""
+    if reasons:
+        warnings.warn(
+            f"{len(reasons)} runs cannot be read and are left out, the first: {reasons[0]}",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True, eq=False)

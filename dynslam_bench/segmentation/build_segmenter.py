@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 from functools import cache, lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -237,6 +238,30 @@ def _code_of(name: str) -> str:
     return code_digest(SEGMENTERS.get(name).entry_point, _PACKAGES)
 
 
+class SharedNetwork:
+    """Loads a network at its first call; copies share it, and what was pickled loads it again.
+
+    Args:
+        load: Returns the network.
+    """
+
+    def __init__(self, load: Callable[[], Segmenter]) -> None:
+        self._load = load
+        self._network: Segmenter | None = None
+
+    def __call__(self) -> Segmenter:
+        """The network."""
+        if self._network is None:
+            self._network = self._load()
+        return self._network
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> SharedNetwork:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SharedNetwork, (self._load,)
+
+
 class CachedSegmenter:
     """A network whose masks are stored in the stage cache, addressed by the image and by the network's identity.
 
@@ -252,7 +277,7 @@ class CachedSegmenter:
     """
 
     def __init__(self, load: Callable[[], Segmenter], identity: object, cache: StageCache) -> None:
-        self.network = lru_cache(maxsize=1)(load)
+        self.network = SharedNetwork(load)
         self._cache = cache
         self._prefix = digest([identity, machine_digest()])
         self.hit = False
@@ -320,12 +345,16 @@ class ConfiguredSegmenter:
         instances = self.inner.segment(frame)
         if not isinstance(instances, Instances):
             raise SegmentationError(f"{self.source} gave {type(instances).__name__} instead of Instances")
-        if instances.masks.shape[1:] != frame.rgb.shape[:2] or len(instances.masks) != len(instances.class_names):
+        count, size = len(instances.class_names), frame.rgb.shape[:2]
+        shapes = [np.shape(part) for part in (instances.masks, instances.boxes, instances.scores)]
+        if shapes != [(count, *size), (count, 4), (count,)] or not isinstance(instances.masks, np.ndarray):
             raise SegmentationError(
-                f"{self.source} gave {len(instances)} objects with masks of shape {instances.masks.shape}, the frame "
-                f"is {frame.rgb.shape[1]}x{frame.rgb.shape[0]}",
-                "masks must be [K, H, W] at the frame's size",
+                f"{self.source} gave {count} objects with masks of shape {shapes[0]}, boxes of shape {shapes[1]} and "
+                f"scores of shape {shapes[2]}, the frame is {size[1]}x{size[0]}",
+                "masks must be an array [K, H, W] at the frame's size, boxes [K, 4], scores [K]",
             )
+        if not np.isfinite(instances.boxes).all():
+            raise SegmentationError(f"{self.source} gave boxes that are not finite", "leave out the objects without")
         return select(instances, self.settings, self.also)
 
 

@@ -27,7 +27,7 @@ from dynslam_bench.core.fingerprint import package_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
-from dynslam_bench.runs.store import RunStore, open_store
+from dynslam_bench.runs.store import RunStore, open_store, warn_of_unreadable
 
 T = TypeVar("T")
 OnProgress = Callable[[float, float | None, str], None]
@@ -197,6 +197,7 @@ def load_runs(
     everything = []
     for store in stores:
         everything += rows_of(store, store.ids(), protocol, loaded, on_progress, pool)
+    warn_of_unreadable(loaded.unreadable)
     ended = [row for row in everything if row.status != "stopped"]
     scaled = [row for row in ended if protocol.finds_scale or row.tracker.sensors != "rgb"]
     rows = [row for row in scaled if trials or not row.trial_of]

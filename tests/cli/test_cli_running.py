@@ -661,6 +661,18 @@ def test_one_unreadable_record_is_named_and_the_others_are_listed(cli, results: 
     assert err.startswith("unreadable: ") and err.count("\n") == 1 and "is not a text file" in err
 
 
+@pytest.mark.parametrize("command", ["export", "report", "compare"])
+def test_a_table_says_that_it_leaves_out_an_unreadable_run(cli, results: Path, tmp_path: Path, command: str) -> None:
+    (results / "runs" / hostile_run(results) / "run.json").write_bytes(b"")
+    arguments = {
+        "export": ("runs", "export", tmp_path / "all.csv", "--results", results),
+        "report": ("report", results, "-o", tmp_path),
+        "compare": ("report", "compare", results, results, "-o", tmp_path),
+    }
+    code, _, err = cli(*arguments[command])
+    assert code == 0 and "warning: 1 runs cannot be read and are left out" in err
+
+
 def test_half_characters_of_the_command_line_end_in_one_line(cli, results: Path) -> None:
     code, _, err = cli("run", "caf\udce9", "synthetic/walking_xyz", "--results", results)
     assert code == 1 and "caf\\udce9" in err and err.count("\n") == 1

@@ -65,6 +65,13 @@ def given(**changes: object) -> TrackResult:
         (given(T_world_cam=np.eye(4, dtype=bool)), "a pose of the type bool"),
         (given(T_world_cam=np.eye(4, dtype=np.float16)), "a pose of the type float16"),
         (given(dynamic_mask=np.zeros((4, 4), bool)), "a dynamic mask of shape (4, 4)"),
+        (given(stats=None), "stats of type NoneType"),
+        (given(stats={"n": np.zeros(2)}), "stats with values that are no numbers"),
+        (given(timings={"t": "soon"}), "timings with values that are no numbers"),
+        (given(keypoints_xy=np.zeros(4, np.float32)), "keypoints_xy of shape (4,)"),
+        (given(keypoints_xy=[[1.0, 2.0]]), "keypoints_xy of shape (1, 2), expected an array"),
+        (given(keypoints_xy=np.full((2, 2), np.nan)), "keypoints_xy that are not finite"),
+        (given(keypoints_keep=np.ones(3, bool)), "keypoints_keep that does not fit"),
     ],
 )
 def test_faults(result: object, words: str) -> None:
@@ -87,11 +94,9 @@ def test_a_pose_of_any_real_type_is_taken_as_float64(dtype: object) -> None:
     ("result", "words"),
     [
         (given(stats={"n": float("nan")}), "stats with values"),
-        (given(timings={"t": "soon"}), "timings with values"),
+        (given(timings={"t": float("nan")}), "timings with values"),
         (given(timings={"t": -1.0}), "a timing that is negative"),
         (given(dynamic_mask=np.zeros((4, 6), np.uint8)), "a dynamic mask of type uint8"),
-        (given(keypoints_xy=np.zeros(4, np.float32)), "keypoints_xy of shape (4,)"),
-        (given(keypoints_keep=np.ones(3, bool)), "keypoints_keep that does not fit"),
     ],
 )
 def test_blemishes_are_no_faults(result: TrackResult, words: str) -> None:

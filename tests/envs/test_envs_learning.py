@@ -162,6 +162,14 @@ def test_networks_are_shared_by_copies() -> None:
     assert copied.network is own.network
 
 
+def test_a_state_with_a_cached_network_can_be_pickled() -> None:
+    env = stepped(SlamEnv("synthetic/walking_xyz?scene=0&frames=5", "mask-rcnn", cache=True), 2)
+    state = pickle.loads(pickle.dumps(env.clone_state()))
+    expected = rest(env)
+    env.restore_state(state)
+    assert rest(env) == expected
+
+
 def test_counterfactual_actions_differ_and_windows_come_back() -> None:
     env = SlamEnv(ToySequence(30), TARGET, control=["noise.level_m"], window=10)
     stepped(env, 3)
@@ -193,6 +201,9 @@ def test_a_state_of_another_sequence_tracker_settings_or_version_is_refused(
         (SlamEnv(ToySequence(9), TARGET, control=["noise.clip"]), "of control"),
         (SlamEnv(ToySequence(9), TARGET, settings={"noise.passes": 3}), "of settings"),
         (SlamEnv(ToySequence(9), TARGET, reward="neg_pose_error"), "of reward neg_rpe"),
+        (SlamEnv(ToySequence(9), TARGET, protocol="evo-as/v1"), "of protocol tum-rgbd/v1"),
+        (SlamEnv(ToySequence(9), TARGET, lost_after=5), "of lost_after None"),
+        (SlamEnv(ToySequence(18), TARGET, stride=2), "of sequence"),
         (SlamEnv(ToySequence(9), TARGET), "of version 0.0.1"),
     ):
         if "version" in words:

@@ -86,7 +86,7 @@ class Benchmark:
         if not isinstance(settings, Mapping):
             raise SlamHpoError(f"the settings are {settings!r}: give a value for each of {', '.join(self.space)}")
         if settings.keys() != self.space.keys():
-            wrong = ", ".join(sorted(settings.keys() ^ self.space.keys()))
+            wrong = ", ".join(sorted(map(str, settings.keys() ^ self.space.keys())))
             raise SlamHpoError(f"{self.system} has the settings {', '.join(self.space)}; missing or unknown: {wrong}")
         for name, value in settings.items():
             low, high = self.space[name][:2]
@@ -110,7 +110,7 @@ class Benchmark:
         """
         where = _place(sequence, start, frames)
         unit = self.units(settings)
-        index = self._index.get(tuple(round(settings[name], 6) for name in self.space))
+        index = self._index.get(tuple(round(float(settings[name]), 6) for name in self.space))
         if index is None:
             nearest = int(np.abs(self._units - unit).sum(axis=1).argmin())
             raise SlamHpoError(

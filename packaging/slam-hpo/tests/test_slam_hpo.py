@@ -33,7 +33,8 @@ def test_every_run_is_there_and_the_default_is_first(bench):
 
 def test_a_measured_configuration_is_found(bench):
     last = len(bench.configurations) - 1
-    found = bench.measured(bench.configuration(last), slam_hpo.SEQUENCES[3], start=4, frames=40)
+    settings = {name: np.float32(value) for name, value in bench.configuration(last).items()}
+    found = bench.measured(settings, slam_hpo.SEQUENCES[3], start=4, frames=40)
     assert found[:3] == tuple(bench.values[last, 3, 1, 1]) and found.log_ate_std == 0
 
 
@@ -44,7 +45,7 @@ def test_a_measured_configuration_is_found(bench):
         ({"features.n_features": 30}, "features.n_features = 30 is outside 300 to 3000"),
         ({"features.n_features": 800.5}, "features.n_features = 800.5 is no whole number"),
         ({"features.n_features": "800"}, "features.n_features = '800' is no whole number"),
-        ({"flow.wrong": 1}, "missing or unknown: flow.wrong"),
+        ({"flow.wrong": 1, 2: 3}, "missing or unknown: 2, flow.wrong"),
     ],
 )
 def test_a_wrong_configuration_is_refused(bench, change, message):
