@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -99,7 +99,8 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
     mask = result.dynamic_mask
     if mask is not None and np.shape(mask) != frame.depth.shape:
         yield Fault(f"a dynamic mask of shape {np.shape(mask)}, the image has {frame.depth.shape}")
-    for name, values in (("stats", result.stats), ("timings", result.timings)):
+    numbers: dict[str, Any] = {"stats": result.stats, "timings": result.timings}
+    for name, values in numbers.items():
         if not isinstance(values, Mapping):
             yield Fault(f"{name} of type {type(values).__name__}", "expected numbers by name")
         elif bad := {key: value for key, value in values.items() if not isinstance(value, Real | np.bool_)}:
