@@ -83,8 +83,9 @@ class MaskScheduler:
     With schedule ``async`` the segmenter runs in a thread of its own, on one frame at a time. The masks of a frame are
     taken `latency_s` later by the frames' stamps, carried to the frame of that time, and the segmenter begins with that
     frame; they are at least one frame late. If it is slower than `latency_s`, tracking waits for it: the same settings
-    give the same masks everywhere. It works with the settings of the time when it begins, and without the stage cache,
-    so that the wait is measured.
+    give the same masks everywhere. With a `latency_s` of 0 masks are taken when they are done, and nothing waits. The
+    segmenter works with the settings of the time when it begins, and without the stage cache, so that the wait is
+    measured.
 
     Args:
         settings: When to segment, how to carry masks, how long to bridge missed detections.
@@ -156,7 +157,9 @@ class MaskScheduler:
         flow, request = dense_flow(self._gray, gray), self._request
         if request is not None:
             request.follow(flow)
-        taken = request is not None and frame.timestamp >= request.due - STAMP_TOLERANCE_S
+        live = self._settings.latency_s == 0  # then nothing waits for the segmenter
+        due = request is not None and frame.timestamp >= request.due - STAMP_TOLERANCE_S
+        taken = due if request is None or not live else request.answer.done()
         if request is not None and taken:
             self._request = None  # an error is raised once
             instances, self.beside_s = request.answer.result()

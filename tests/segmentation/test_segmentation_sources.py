@@ -4,7 +4,9 @@ import hashlib
 import json
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import wait
 from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import replace
@@ -705,6 +707,23 @@ def test_beside_tracking_masks_come_late_by_the_stamps_and_are_carried_to_the_fr
     assert stage.segmented, "a sequence begins with masks"
 
 
+def test_without_a_latency_masks_are_taken_when_they_are_done():
+    class Held(Square):
+        released = threading.Event()
+
+        def segment(self, frame):
+            assert frame.index == 0 or self.released.wait(30)
+            return super().segment(frame)
+
+    stage = MaskScheduler(ASYNC.model_copy(update={"latency_s": 0.0}), Held())
+    for index in range(5):
+        feed(stage, index)
+        assert stage.segmented == (index == 0)
+    Held.released.set()
+    wait([stage._request.answer])
+    assert feed(stage, 5)[1] > 0.85 and stage.segmented
+
+
 def test_beside_tracking_missed_detections_count_the_frames_between_those_segmented(monkeypatch):
     stage, apart = MaskScheduler(ASYNC, Square()), []
     update = stage._missed.update
@@ -747,6 +766,7 @@ def test_beside_tracking_nothing_comes_from_the_stage_cache(tmp_path):
 
 def test_a_process_waits_at_its_end_for_the_segmenter_beside_tracking():
     code = """
+import threading
 import time
 import numpy as np
 from dynslam_bench.contracts import Frame, Instances
