@@ -122,8 +122,7 @@ class SegmentationSettings(Settings):
     n: int = Field(3, ge=1, description="schedule every_nth: the segmenter runs on every n-th frame")
     latency_s: float = Field(
         0.1, ge=0, le=10,
-        description="schedule async: the segmenter runs beside tracking; masks are there so many seconds after a frame"
-        ", with 0 when they are done (not repeatable)",
+        description="schedule async: masks come so many seconds after a frame; 0: when they are done, not repeatable",
     )  # fmt: skip
     crowded_share: float = Field(
         1.0, ge=0, le=1, description="share of the view under masks above which every frame is segmented; 1 = off"
