@@ -328,7 +328,7 @@ def load(
     *,
     trials: bool = False,
 ) -> pd.DataFrame:
-    """All runs of results folders, one row a run.
+    """The runs of results folders, one row a run; of equal runs the newest, as in a report.
 
     Args:
         results: Results folders.
