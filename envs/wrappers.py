@@ -401,7 +401,7 @@ class DropFrames(SlamWrapper):
         self._speed, self._frame_time_s, self._share, self._seed = speed, frame_time_s, share, seed
         self._live = share is None and frame_time_s is None
         self._warm = not self._live
-        self._overhead_s = 0.0  # of the latest step beside tracking: it is a part of the wait
+        self._overhead_s = 0.0  # seconds of the latest step outside of tracking; the wait is shorter by them
 
     @property
     def dropped(self) -> int:

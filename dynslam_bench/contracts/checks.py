@@ -107,7 +107,10 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
             yield Fault(f"{name} with values that are no numbers: {bad}")
     xy, keep = result.keypoints_xy, result.keypoints_keep
     if xy is not None and (not isinstance(xy, np.ndarray) or xy.dtype.kind not in "fiu" or xy.shape[1:] != (2,)):
-        yield Fault(f"keypoints_xy of shape {np.shape(xy)}, expected an array [N, 2] of numbers")
+        yield Fault(
+            f"keypoints_xy of shape {np.shape(xy)} as {getattr(xy, 'dtype', type(xy).__name__)}",
+            "expected numbers [N, 2]",
+        )
     elif xy is not None and not np.isfinite(xy).all():
         yield Fault("keypoints_xy that are not finite", "leave out features without a pixel")
     elif keep is not None and (xy is None or np.shape(keep) != (len(xy),)):

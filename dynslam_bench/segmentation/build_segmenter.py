@@ -354,7 +354,7 @@ class ConfiguredSegmenter:
                 "masks must be an array [K, H, W] at the frame's size, boxes [K, 4], scores [K]",
             )
         if not np.isfinite(instances.boxes).all():
-            raise SegmentationError(f"{self.source} gave boxes that are not finite", "leave out the objects without")
+            raise SegmentationError(f"{self.source} gave boxes that are not finite", "give every object a finite box")
         return select(instances, self.settings, self.also)
 
 

@@ -69,7 +69,7 @@ def given(**changes: object) -> TrackResult:
         (given(stats={"n": np.zeros(2)}), "stats with values that are no numbers"),
         (given(timings={"t": "soon"}), "timings with values that are no numbers"),
         (given(keypoints_xy=np.zeros(4, np.float32)), "keypoints_xy of shape (4,)"),
-        (given(keypoints_xy=[[1.0, 2.0]]), "keypoints_xy of shape (1, 2), expected an array"),
+        (given(keypoints_xy=[[1.0, 2.0]]), "keypoints_xy of shape (1, 2) as list"),
         (given(keypoints_xy=np.full((2, 2), np.nan)), "keypoints_xy that are not finite"),
         (given(keypoints_keep=np.ones(3, bool)), "keypoints_keep that does not fit"),
     ],
