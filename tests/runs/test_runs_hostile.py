@@ -13,6 +13,7 @@ from multiprocessing.connection import Pipe
 from pathlib import Path
 
 import hostile
+import psutil
 import pytest
 from hostile import alive, until
 
@@ -20,7 +21,7 @@ from dynslam_bench.core.errors import InfrastructureError
 from dynslam_bench.core.files import SHARED_MEMORY
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one
 from dynslam_bench.runs.process import supervisor as memory_module
-from dynslam_bench.runs.process.fork_server import SERVERS
+from dynslam_bench.runs.process.fork_server import SERVERS, process_tree
 from dynslam_bench.runs.process.supervisor import supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
@@ -175,14 +176,22 @@ def started(pids: Path, count: int) -> list[int]:
 
 
 @linux
-def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store: RunStore) -> None:
+def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store: RunStore, monkeypatch) -> None:
     """It is started again once; killed again, the run is given up, and nothing of it is stored or left."""
     spec, pids = strays
+    trees: list[set[int]] = []
+
+    def look(pid: int) -> list[psutil.Process]:
+        tree = process_tree(pid)
+        trees.append({process.pid for process in tree})
+        return tree
+
+    monkeypatch.setattr(memory_module, "process_tree", look)
     with ThreadPoolExecutor(1) as pool:
         run = pool.submit(run_one, spec, store)
         for turn in (1, 2):
             seen = started(pids, 4 * turn)
-            time.sleep(1.0)  # until the supervisor has seen them
+            until(lambda: any(tree >= {*seen[-4:]} for tree in trees[:-1]))  # noqa: B023 (the supervisor knows them)
             os.kill(SERVERS["fork"]._process.pid, signal.SIGKILL)  # nothing else knows its number
             until(lambda: alive(seen) == [], 20)  # noqa: B023
         with pytest.raises(InfrastructureError, match=r"the fork server was ended from outside.*is not stored"):

@@ -201,7 +201,9 @@ class _Supervisor:
         self.tick()
         if now >= self.next_tree:
             self.next_tree = now + _TREE_S
-            self.child.members = process_tree(self.child.pid) or self.child.members
+            tree = process_tree(self.child.pid)  # only a part of it if the fork server is killed meanwhile
+            rest = [member for member in self.child.members if member not in tree and member.is_running()]
+            self.child.members = tree + rest
         used_mb = memory_mb(self.child.members)
         self.peak_mb = max(self.peak_mb, used_mb)
         if self.memory_mb is not None and used_mb > self.memory_mb:
