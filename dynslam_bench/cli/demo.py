@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from dynslam_bench.cli.output import SOME_RUNS_FAILED, note, progress, report_ta
 from dynslam_bench.cli.running import WatchedRuns
 from dynslam_bench.cli.studies import StudyBar, silence_optuna
 from dynslam_bench.core import find_data_root
+from dynslam_bench.core.plugins import python_command
 
 if TYPE_CHECKING:
     from dynslam_bench.reports import RunRow
@@ -158,7 +158,7 @@ def compiled_ahead() -> Iterator[None]:
     Two runs at a time would otherwise compile the same kernels twice. Kernels that cannot be compiled here are left to
     the first runs, which report it.
     """
-    command = [sys.executable, "-c", f"from {__name__} import compile_kernels; compile_kernels()"]
+    command = python_command(f"from {__name__} import compile_kernels; compile_kernels()")
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield

@@ -8,7 +8,6 @@ rest; the reason is kept and shown by ``trackers doctor``.
 """
 
 import importlib.util
-import json
 import os
 import signal
 import subprocess
@@ -261,15 +260,28 @@ ISOLATED_VARIABLE = "DYNSLAM_BENCH_ISOLATED"
 LIMIT_S = 120
 _IMPORTED = 113
 _PROBE = """
-import json, os, sys
-location, sys.path[:] = sys.argv[1], json.loads(sys.argv[2])
+import os
 from dynslam_bench.core.plugins import import_module
 try:
-    import_module(location)
+    import_module(sys.argv[1])
 except Exception:
     pass  # the caller meets it again and reports it
-os._exit(int(sys.argv[3]))
+os._exit(int(sys.argv[2]))
 """
+
+
+def python_command(code: str) -> list[str]:
+    """The command of a Python process that imports what this process imports.
+
+    ``python -m`` and ``python -c`` import from the working folder first: in a checkout they would run its code
+    instead of the installed package's.
+    """
+    return [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}\n{code}"]
+
+
+def module_command(module: str) -> list[str]:
+    """As `python_command`, for a module that is run as a program."""
+    return python_command(f"import runpy; runpy.run_module({module!r}, run_name='__main__')")
 
 
 @cache
@@ -288,7 +300,7 @@ def check_import(location: str) -> None:
     """
     if os.environ.get(ISOLATED_VARIABLE):
         return
-    command = [sys.executable, "-c", _PROBE, location, json.dumps(sys.path), str(_IMPORTED)]
+    command = [*python_command(_PROBE), location, str(_IMPORTED)]
     environment = {**os.environ, ISOLATED_VARIABLE: "1"}
     quiet = subprocess.DEVNULL
     try:

@@ -77,6 +77,21 @@ def test_nothing_survives_a_run_that_ends_or_is_killed(attack, monkeypatch, star
     assert (record.status, len(pids), alive(pids)) == (status, count, []), record.reason
 
 
+@pytest.mark.parametrize("start", ["fork", "fresh"])
+def test_a_run_has_the_code_of_its_parent_whatever_lies_in_the_working_folder(
+    attack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: str
+) -> None:
+    (tmp_path / "dynslam_bench").mkdir()
+    for name in ("dynslam_bench/__init__.py", "runpy.py"):
+        (tmp_path / name).write_text("raise SystemExit('another checkout')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    monkeypatch.setenv("DYNSLAM_BENCH_START", start)
+    SERVERS[start].close()  # the next one starts in this folder
+    record, _ = attack("ok")
+    assert record.status == "ok", record.reason
+
+
 @linux
 def test_memory_that_forks_share_counts_once(attack) -> None:
     """300 MB and three forks: four times as much by resident memory, which is not what the machine lacks."""

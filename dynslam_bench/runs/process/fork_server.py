@@ -34,6 +34,7 @@ from typing import Any
 import psutil
 
 from dynslam_bench.core import InfrastructureError, sweep
+from dynslam_bench.core.plugins import module_command
 
 _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (
@@ -105,13 +106,12 @@ class ForkServer:
         if self._socket is not None and self._process is not None and self._process.poll() is None:
             return self._socket
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        path = {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", __name__, str(theirs.fileno()), self._start],
+                [*module_command(__name__), str(theirs.fileno()), self._start],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1") | path,
+                env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1"),
                 start_new_session=True,
             )
         self._socket, self._owner = ours, os.getpid()
@@ -291,7 +291,7 @@ class _Server:
 def _spawn(connection_fd: int) -> int:
     """Start a child in a fresh interpreter."""
     os.set_inheritable(connection_fd, True)
-    command = [sys.executable, "-m", _CHILD, str(connection_fd)]
+    command = [*module_command(_CHILD), str(connection_fd)]
     return os.posix_spawn(sys.executable, command, os.environ, setsigdef=[signal.SIGINT, signal.SIGHUP])
 
 

@@ -13,13 +13,10 @@ import numpy as np
 
 from dynslam_bench.contracts import TrackerContext
 from dynslam_bench.core import MEGABYTE, TrackerError, raising, read_bytes, vocabularies_folder, write_atomic
+from dynslam_bench.core.plugins import module_command
 from dynslam_bench.geometry import Camera
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
-from dynslam_bench.trackers.adapters.subprocess_tracker import (
-    FinalizingProgramTracker,
-    ProgramTracker,
-    python_program,
-)
+from dynslam_bench.trackers.adapters.subprocess_tracker import FinalizingProgramTracker, ProgramTracker
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
 HINT = (
@@ -163,7 +160,7 @@ class OrbSlam3Program(ProgramTracker):
 
     def __init__(self, settings: OrbSlam3Settings, context: TrackerContext) -> None:
         self.settings, self._vocabulary = settings, find_vocabulary(settings.vocabulary)
-        super().__init__("orbslam3", settings, context, **python_program(WORKER))
+        super().__init__("orbslam3", settings, context, module_command(WORKER))
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Write its settings file from the camera, start it and load the vocabulary.

@@ -25,7 +25,6 @@ from typing import IO, Any, Literal, cast, get_args
 import cv2
 import numpy as np
 
-import dynslam_bench
 from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
 from dynslam_bench.core import (
     SHARED_MEMORY,
@@ -385,7 +384,6 @@ class ProgramTracker:
         command: Program and arguments.
         images: How it gets the images, see `ImageExchange`.
         folder: Its working folder; None for the current one.
-        environment: Variables to set beside the inherited ones.
     """
 
     def __init__(
@@ -397,11 +395,10 @@ class ProgramTracker:
         *,
         images: Literal["raw", "png"] = "raw",
         folder: Path | None = None,
-        environment: Mapping[str, str] | None = None,
     ) -> None:
         self._images: Literal["raw", "png"] = images
         self.name, self.limits, self.context = name, settings, context
-        self._command, self._folder, self._environment = list(command), folder, dict(environment or {})
+        self._command, self._folder = list(command), folder
         self._program: Program | None = None
         self._exchange: ImageExchange | None = None
 
@@ -421,7 +418,7 @@ class ProgramTracker:
         """
         self.close()
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        environment = dict.fromkeys(names, str(self.context.threads)) | self._environment
+        environment = dict.fromkeys(names, str(self.context.threads))
         self._exchange = ImageExchange(camera, self._images)
         self._program = Program(self.name, self._command, folder=self._folder, environment=environment)
         request = {
@@ -482,15 +479,6 @@ class ProgramTracker:
         if self._program is None:
             raise TrackerError(f"{self.name} was used before reset() or after close()")
         return self._program.ask(request, timeout_s, doing)
-
-
-def python_program(module: str) -> dict[str, Any]:
-    """``command`` and ``environment`` of a `ProgramTracker` that runs a module of this package."""
-    packages = [str(Path(dynslam_bench.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
-    return {
-        "command": [sys.executable, "-m", module],
-        "environment": {"PYTHONPATH": os.pathsep.join(filter(None, packages))},
-    }
 
 
 class FinalizingProgramTracker(ProgramTracker):

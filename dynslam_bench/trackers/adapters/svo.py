@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import TrackerContext
+from dynslam_bench.core.plugins import module_command
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.trackers.adapters.serve import serve
 from dynslam_bench.trackers.adapters.specs import SvoSettings
-from dynslam_bench.trackers.adapters.subprocess_tracker import ProgramTracker, python_program
+from dynslam_bench.trackers.adapters.subprocess_tracker import ProgramTracker
 
 STATES = {"DEFAULT_FRAME": "ok", "RELOCALIZING": "lost"}
 _VALUE = object.__basicsize__
@@ -31,7 +32,7 @@ class Svo(ProgramTracker):
 
     def __init__(self, settings: SvoSettings, context: TrackerContext) -> None:
         self._settings = settings
-        super().__init__("svo", settings, context, **python_program(__name__))
+        super().__init__("svo", settings, context, module_command(__name__))
 
     def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
         """The settings under SVO's names."""
