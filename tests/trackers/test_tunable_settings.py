@@ -38,7 +38,7 @@ from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
 
 SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)}
-SHORT = 5
+SHORT = 4
 """Frames of the episodes in which all settings of a tracker change at once."""
 IDENTITY = {"orb-slam2-mono", "orb-slam2"}
 SLOW_STARTERS = {"dynaslam-g", "dai-slam"}
@@ -430,7 +430,7 @@ def track(sitting, change: Callable[[Frame], Frame], bad: range = BAD):
     return states
 
 
-@pytest.mark.parametrize("value", [0, 127, 255], ids=["covered lens", "fog", "saturated"])
+@pytest.mark.parametrize("value", [0, 127], ids=["covered lens", "fog"])
 def test_frames_without_any_texture_are_lost_and_only_those(sitting, value: int) -> None:
     states = track(sitting, lambda frame: replace(frame, rgb=np.full_like(frame.rgb, value)))
     lost = [index for index, state in enumerate(states) if state == "lost"]
