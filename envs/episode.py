@@ -55,7 +55,8 @@ class Episode:
 
     Attributes:
         outcomes: One entry a frame, in order.
-        lost_streak: Frames without a tracked pose in a row, up to the last one; an initialising tracker is not lost.
+        lost_streak: Frames without a tracked pose in a row, up to the last one; an initialising tracker is not lost,
+            and a dropped frame changes nothing.
         over: Whether the last step ended the episode.
         free_at: Seconds, when the tracker is done with the last frame; of `DropFrames`.
     """
@@ -68,7 +69,8 @@ class Episode:
     def add(self, outcome: FrameOutcome) -> None:
         """Append a frame's outcome."""
         self.outcomes.append(outcome)
-        self.lost_streak = self.lost_streak + 1 if outcome.state == "lost" else 0
+        if outcome.state != "dropped":
+            self.lost_streak = self.lost_streak + 1 if outcome.state == "lost" else 0
 
     @property
     def next_index(self) -> int:

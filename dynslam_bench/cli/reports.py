@@ -88,7 +88,7 @@ def failure_lines(file: Path | None) -> list[str]:
     if file is None:
         return []
     failed = pd.read_csv(file, dtype=str, keep_default_na=False)
-    counts = (failed["tracker"] + " " + failed["ended"].str.extract(r"(\w[\w-]*)")[0]).value_counts()
+    counts = (failed["tracker"] + " " + failed["ended"].str.extract(r"(.*?)(?:,| at |$)")[0]).value_counts()
     words = [f"{name} ({count})" for name, count in counts.head(MOST_ROWS).items()]
     more = f" and {len(counts) - MOST_ROWS} more" * (len(counts) > MOST_ROWS)
     return [wrapped(f"{len(failed)} run{'s' * (len(failed) > 1)} failed: {', '.join(words)}{more}.")]

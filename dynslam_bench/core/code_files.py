@@ -120,7 +120,7 @@ def files_below(folder: Path) -> Iterator[Path]:
             continue
         if entry.is_file():
             yield entry
-        elif entry.is_dir() and not _is_left_out(entry) and not _leads_back(entry):
+        elif entry.is_dir() and not _is_left_out(entry) and not leads_back(entry):
             yield from files_below(entry)
 
 
@@ -239,7 +239,7 @@ def _is_file(path: Path) -> bool:
     return os.path.isfile(path) and os.access(path, os.R_OK)  # noqa: PTH113 - it takes words that cannot be a path
 
 
-def _leads_back(entry: Path) -> bool:
+def leads_back(entry: Path) -> bool:
     """Whether a folder is a link to one that it lies in: following it would never end."""
     return entry.is_symlink() and entry.resolve() in (entry.parent.resolve() / entry.name).parents
 

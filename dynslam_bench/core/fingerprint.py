@@ -29,6 +29,7 @@ from dynslam_bench.core.code_files import (
     imported_modules,
     is_code,
     is_installed,
+    leads_back,
     program_files,
 )
 from dynslam_bench.core.errors import DynslamError, PluginError, raising
@@ -105,7 +106,7 @@ def code_digest(entry_point: str, packages: Sequence[str]) -> str:
     Raises:
         PluginError: The plug-in's files cannot be found or read.
     """
-    return digest([package_digest(tuple(packages)), plugin_digest(entry_point)])
+    return digest([package_digest(packages), plugin_digest(entry_point)])
 
 
 def plugin_digest(entry_point: str) -> str:
@@ -166,12 +167,30 @@ def distribution_of_module(module: str) -> tuple[str, str]:
 _distributions = cache(importlib.metadata.packages_distributions)
 
 
-@cache
-def package_digest(packages: tuple[str, ...]) -> str:
+def package_digest(packages: Sequence[str]) -> str:
     """Digest of the code of packages of this package; read once a process, as its modules are."""
-    folders = [Path(folder) / package for folder in dynslam_bench.__path__ for package in packages]
-    codes = {folder: [file for file in files_below(folder) if is_code(file)] for folder in folders if folder.is_dir()}
-    return digest([[folder.name, contents_digest(files, folder)] for folder, files in codes.items()])
+    return digest([[folder.name, _package_code(folder)] for folder in _own_folders(packages)])
+
+
+def read_package_code() -> None:
+    """Read the digests of all packages of this package now, before their files change."""
+    for folder in _own_folders(["*"]):
+        _package_code(folder)
+
+
+def has_package_changed(packages: Sequence[str]) -> bool:
+    """Whether the code of packages of this package is other than this process has read."""
+    return any(_package_code.__wrapped__(folder) != _package_code(folder) for folder in _own_folders(packages))
+
+
+def _own_folders(packages: Sequence[str]) -> list[Path]:
+    places = map(Path, dynslam_bench.__path__)
+    return [folder for place in places for name in packages for folder in place.glob(name) if folder.is_dir()]
+
+
+@cache
+def _package_code(folder: Path) -> str:
+    return contents_digest([file for file in files_below(folder) if is_code(file)], folder)
 
 
 def _files_of(place: Path) -> list[Path]:
@@ -272,7 +291,11 @@ def path_digest(path: Path) -> str:
     """
     if path.is_file():
         return _remembered("file", [path], lambda: file_sha256(path))
-    return contents_digest((file for file in path.rglob("*") if file.is_file()), path, syntax=False)
+    files = []
+    for place, folders, names in os.walk(path, followlinks=True):
+        folders[:] = [name for name in folders if not leads_back(Path(place, name))]
+        files += [file for name in names if (file := Path(place, name)).is_file()]
+    return contents_digest(files, path, syntax=False)
 
 
 def syntax_digest(source: bytes) -> str:

@@ -51,8 +51,9 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         at, visible = pixel_index(pixels, (camera.height, camera.width))
         observed = ahead & visible
         surface, smallest = np.empty(ahead.shape, np.float32), {}
-        for number, (_, depth) in enumerate(keyframes):  # images are stored too, so that no id is used again
-            smallest[id(depth)] = self._smallest.get(id(depth)) or (depth, cv2.erode(depth, PATCH))
+        for number, (_, depth) in enumerate(keyframes):
+            kept = self._smallest.get(id(depth), (None, None))  # in a copied episode the id may be another image's
+            smallest[id(depth)] = kept if kept[0] is depth else (depth, cv2.erode(depth, PATCH))
             surface[number] = smallest[id(depth)][1][at[0][number], at[1][number]]
         self._smallest = smallest
         limit = np.maximum(self.settings.threshold_m, self.settings.threshold_sigma * depth_sigma(surface))

@@ -25,6 +25,8 @@ def relative_metrics(comparison: Comparison) -> dict[str, float]:
     for spec in comparison.protocol.rpe:
         take = tum_relative_errors if spec.pairs.startswith("tum") else evo_relative_errors
         errors, seconds = take(comparison, spec)
+        if spec.rate:  # across a gap TUM's rule pairs a pose with itself
+            errors, seconds = errors[seconds > 0], seconds[seconds > 0]
         comparison.n_pairs_rpe[spec.key] = len(errors)
         if not len(errors):
             comparison.diagnostics.append(f"no pair of poses for the relative error over {spec.key}; it is left out")

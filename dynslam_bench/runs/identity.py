@@ -13,6 +13,7 @@ from dynslam_bench.core.fingerprint import (
     code_digest,
     contents_digest,
     distribution_of_module,
+    has_package_changed,
     named_digests,
     plugin_digest,
     this_machine,
@@ -230,15 +231,18 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
     return digests
 
 
-def check_unchanged(start_map: StartMap | None, settings: Settings) -> None:
-    """A run began in the map that was looked up for it, and in no other at its path.
+def check_unchanged(run: ResolvedRun) -> None:
+    """A run was made with the code of this package, and began in the map, that were looked up for it.
 
     Raises:
-        RunError: The file has changed since.
-        PluginError: It is gone.
+        RunError: They have changed since.
+        PluginError: The map is gone.
     """
-    if start_map is not None and named_digests(settings)[MAP_SETTING] != start_map.digest:
-        raise RunError(f"the map {start_map.file} has changed since the run was asked for", "the run is not stored")
+    if has_package_changed(CODE_PACKAGES):
+        raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
+    begun_in = run.start_map
+    if begun_in is not None and named_digests(run.settings)[MAP_SETTING] != begun_in.digest:
+        raise RunError(f"the map {begun_in.file} has changed since the run was asked for", "the run is not stored")
 
 
 def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -263,8 +264,12 @@ class RunRecord(Record):
         return self.coverage is not None and self.coverage < 1
 
     def public(self) -> RunRecord:
-        """The record for others: without the command line and the folders of the machine that made it."""
-        return self.model_copy(update={"command": [], "place": ""})
+        """The record for others: without the command line and the folders of the machine that made it.
+
+        The path of a replayed file and the command of a program are what their trackers are called, and stay.
+        """
+        tracker = self.tracker.model_copy(update={"given": Path(self.tracker.given).name})
+        return self.model_copy(update={"command": [], "place": "", "tracker": tracker})
 
     @property
     def asked(self) -> dict[str, Any]:

@@ -136,7 +136,7 @@ def run_one(
             title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
             frames.write(work, title, exact_stamps(resolved.sequence))
             (work / FRAMES_FILE).unlink(missing_ok=True)
-        check_unchanged(resolved.start_map, resolved.settings)
+        check_unchanged(resolved)
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
             store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)

@@ -213,7 +213,7 @@ class _Track:
     def see(self, detections: Instances, index: int, frames: int) -> None:
         """Take over a detection of the object, `frames` frames after the last update."""
         box = detections.boxes[index]
-        velocity = (box - self.box) / np.float32(max(frames * (self.missed + 1), 1))
+        velocity = (box - self.box) / np.float32(max(frames, 1))
         self.velocity = np.asarray(SMOOTHING * velocity + (1 - SMOOTHING) * self.velocity, np.float32)
         self.box, self.mask, self.score = box, detections.masks[index], float(detections.scores[index])
         self.hits, self.missed = self.hits + 1, 0

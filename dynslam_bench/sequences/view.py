@@ -46,6 +46,11 @@ class SequenceView(Wrapped):
             raise SequenceError(f"frames {start}:{end} hold none of the {len(base)} frames of '{base.id}'")
 
     @property
+    def fps(self) -> float:
+        """Selected frames a second."""
+        return self.base.fps / self.range.step
+
+    @property
     def timestamps(self) -> NDArray[np.float64]:
         """Stamps of the selected frames."""
         return self.base.timestamps[self.range.start : self.range.stop : self.range.step]

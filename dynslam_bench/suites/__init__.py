@@ -154,13 +154,20 @@ class Suite(Record):
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
         chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
-        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in chosen}
+        everyone = {*chosen, *self.trackers, *self.optional}
+        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in everyone}
         named = {*self.tracker_settings, *(row.tracker for row in self.rows)}
         strangers = sorted(named - {*self.trackers, *self.optional})
         if strangers:
             raise RunError(
                 f"suite '{self.name}' has settings for '{strangers[0]}', which is none of its trackers",
                 did_you_mean(strangers[0], {*self.trackers, *self.optional}),
+            )
+        settable = set().union(*field_sets.values())
+        if unknown := sorted(self.settings.keys() - settable):
+            raise RunError(
+                f"suite '{self.name}' sets '{unknown[0]}', which none of its trackers has",
+                did_you_mean(unknown[0], settable),
             )
         rows: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
         rows += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]

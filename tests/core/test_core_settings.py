@@ -295,7 +295,10 @@ def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytes
     assert named_digests(Whole()) == {}, "a folder called like a word changes nothing"
     net = write(tmp_path / "net.onnx", "one")
     write(tmp_path / "voc.txt", "words")
-    masks = write(tmp_path / "masks" / "000000.png", "1111")
+    masks = write(tmp_path / "elsewhere" / "000000.png", "1111")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "linked").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "masks" / "itself").symlink_to(tmp_path / "masks")
     options = {"network": {"file": str(net)}, "side": 3, "masks": "recorded:masks"}
     settings = Whole(
         vocabulary="voc.txt",

@@ -18,6 +18,7 @@ from scenes import (
     on_rectangle,
     scene,
 )
+from scipy.spatial.transform import Rotation
 
 from dynslam_bench.contracts.filter import FilterState, FrameBundle, KeyframeView
 from dynslam_bench.culling.correlation_graph import CorrelationFilter, depth_variance, point_covariance
@@ -96,6 +97,17 @@ def test_free_space_culls_what_stands_where_a_recent_keyframe_measured_further(
     state = FilterState(CAMERA, made.state.keep, T_world_pred=SIDEWAYS, keyframes=(view,))
     keep = FreeSpaceFilter(FreeSpaceSettings(min_votes=1, min_share=0.0)).apply(made.frame, state).keep
     assert keep[made.frame.z < 3.9].any() != violated and keep.all() != violated
+
+
+def test_free_space_knows_an_image_by_itself_and_not_by_its_address() -> None:
+    made = scene(SIDEWAYS)
+    far, near = (np.full((CAMERA.height, CAMERA.width), depth_m, np.float32) for depth_m in (4.5, 0.5))
+    view = keyframe(np.eye(4), near, made.frame.timestamp - 0.5)
+    state = FilterState(CAMERA, made.state.keep, T_world_pred=SIDEWAYS, keyframes=(view,))
+    rule = FreeSpaceFilter(FreeSpaceSettings(min_votes=1, min_share=0.0))
+    rule.reset()
+    rule._smallest[id(near)] = (far, far)  # as after a copy, whose original is gone
+    assert rule.apply(made.frame, state).keep.all()
 
 
 @pytest.mark.parametrize(
@@ -211,6 +223,16 @@ def test_information_is_rotated_with_the_camera() -> None:
     expected = CORRELATION / np.array([9.0, 4.0, 1.0])  # x and z of the world have changed places
     np.testing.assert_allclose(np.diag(information)[:3], expected, rtol=1e-6)
     assert information == pytest.approx(information.T)
+    mixed = np.random.default_rng(0).normal(0, 0.01, (6, 6))
+    state.motion_covariance, predicted = mixed @ mixed.T, se3.exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))
+    world_cur = rotated @ predicted
+    moves = np.random.default_rng(1).multivariate_normal(np.zeros(6), state.motion_covariance, 20_000)
+    turned = np.tile(world_cur, (len(moves), 1, 1))
+    turned[:, :3, :3] = world_cur[:3, :3] @ np.swapaxes(Rotation.from_rotvec(moves[:, 3:]).as_matrix(), 1, 2)
+    turned[:, :3, 3] += moves[:, :3]
+    twists = se3.log(se3.inverse(rotated) @ turned @ se3.inverse(predicted))
+    said = np.linalg.inv(prior_information(state, predicted) / CORRELATION)
+    np.testing.assert_allclose(np.cov(twists.T), said, atol=0.05 * np.abs(said).max())
     assert not prior_information(FilterState(CAMERA, np.ones(0, bool)), np.eye(4)).any()
 
 

@@ -360,6 +360,12 @@ def test_the_windowed_error_is_the_relative_error_over_the_window() -> None:
         assert rewards[frame - 1] == pytest.approx(-error, abs=1e-12)
 
 
+def test_dropped_frames_do_not_end_a_row_of_lost_ones() -> None:
+    env = DropFrames(SlamEnv(ToySequence(60), TARGET, settings={"mode": "lost", "at": 1}, lost_after=5), share=0.5)
+    _, infos, ends = play(env)
+    assert len(ends) == 5 and ends[-1] == (True, False) and infos[-1]["episode_metrics"]["coverage"] < 0.1
+
+
 @pytest.mark.parametrize("lost_after", [None, 3])
 def test_under_the_windowed_error_a_loss_earns_what_standing_still_does(lost_after: int | None) -> None:
     settings = QUIET | {"mode": "lost", "at": 4}

@@ -64,6 +64,8 @@ class Hostile:
                 time.sleep(300)
             case "raise":
                 raise ValueError("too few\npoints")
+            case "variable":
+                raise ValueError(os.environ.get("DYNSLAM_BENCH_TESTED", "not set"))
             case "full":
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             case "gone":

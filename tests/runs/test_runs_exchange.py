@@ -392,6 +392,7 @@ def test_a_bank_is_a_results_folder_of_text_files(results, made):
     for run_id in RunStore(made).ids():
         record = json.loads((made / "runs" / run_id / "run.json").read_text())
         assert (record["command"], record["place"]) == ([], "")
+        assert "/" not in record["tracker"]["given"]
     assert db.report(made, protocol="evo-as/v1").html.is_file()
     assert bank.verify(made) == []  # what was computed beside it is no fault
     again = bank.add([results], made)

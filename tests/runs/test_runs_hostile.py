@@ -65,6 +65,16 @@ def test_every_bad_end_is_one_line(attack, mode: str, status: str, reason: str) 
     assert "\n" not in record.reason
 
 
+def test_a_run_has_the_environment_of_now(attack, monkeypatch: pytest.MonkeyPatch) -> None:
+    SERVERS["fork"].close()
+    for value in ("1", "2", None):
+        monkeypatch.delenv("DYNSLAM_BENCH_TESTED", raising=False)
+        if value:
+            monkeypatch.setenv("DYNSLAM_BENCH_TESTED", value)
+        record, _ = attack("variable")
+        assert f"ValueError: {value or 'not set'} " in record.reason
+
+
 @linux
 @pytest.mark.parametrize("start", ["fork", "fresh"])
 @pytest.mark.parametrize(

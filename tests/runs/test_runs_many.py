@@ -351,7 +351,7 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
         seeds = [0, 1]
         frames = [0, 20]
         [settings]
-        "features.count" = 500
+        "features.n_features" = 500
         [tracker_settings.orb-slam2]
         "guard.min_features" = 30
         [[variants]]
@@ -366,7 +366,7 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
     )
     assert [spec.degrade for spec in specs] == [{}] * 4 + [{"blur": 0.5}] * 4
     orb = next(spec for spec in specs if spec.tracker == "orb-slam2")
-    assert orb.settings["guard.min_features"] == 30
+    assert (orb.settings["guard.min_features"], orb.settings["features.n_features"]) == (30, 500)
     assert all(spec.settings == {} for spec in specs if spec.tracker == "never-move")
 
 
@@ -406,6 +406,9 @@ def test_frames_of_a_run_are_read_however_they_are_written() -> None:
 def test_rows_are_of_trackers_of_the_suite(tmp_path: Path) -> None:
     text = 'trackers = ["never-move"]\nsequences = ["synthetic/walking_xyz"]\n[[rows]]\ntracker = "{}"\nsettings = {}'
     stranger = write(tmp_path / "a.toml", text.format("orb-slam2", '{ "guard.min_features" = 30 }'))
+    common = 'trackers = ["orb-slam2"]\nsequences = ["synthetic/sitting_xyz"]\n[settings]\n"features.levls" = 4\n'
+    with pytest.raises(RunError, match=r"'features\.levls', which none of its trackers has.*features\.levels"):
+        load_suite(write(tmp_path / "c.toml", common)).specs()
     with pytest.raises(RunError, match="'orb-slam2', which is none of its trackers"):
         load_suite(stranger).specs()
     with pytest.raises(RunError, match=r"rows\.0\.settings"):

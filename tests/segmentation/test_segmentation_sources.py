@@ -604,6 +604,14 @@ def test_a_missed_detection_is_bridged_at_constant_velocity():
     assert len(bridge.update(instances())) == 0
 
 
+def test_an_object_that_is_seen_again_keeps_its_speed():
+    bridge = MissedDetections(5)
+    for k in range(9):
+        bridge.update(instances() if k in (5, 6) else instances(walker(k)))
+    (bridged,) = bridge.update(instances()).boxes
+    assert bridged[0] == pytest.approx(20 + 5 * 9, abs=0.5)
+
+
 @pytest.mark.parametrize("when", ["every", "every_nth"])
 @pytest.mark.parametrize("promised", [0, 1, 3, 5])
 def test_a_miss_is_bridged_for_as_many_segmented_frames_as_promised_however_weak_the_detection(promised, when):

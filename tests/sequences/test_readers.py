@@ -256,6 +256,7 @@ def test_frames_and_stride(tmp_path):
     view = open_sequence(folder, frames="1:6", stride=2)
     assert isinstance(view, SequenceView) and isinstance(view, Sequence)
     assert len(view) == 3 and [view[i].index for i in range(3)] == [0, 1, 2]
+    assert view.fps == open_sequence(folder).fps / 2
     assert (view[1].rgb == rgb[3]).all()
     assert view.dropped.pairs == 7
     assert len(open_sequence(folder, frames=(2, None))) == 5

@@ -39,7 +39,7 @@ from dynslam_bench.core import (
     TrajectoryError,
 )
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
-from dynslam_bench.runs.process.fork_server import adopt_orphans, die_with_parent
+from dynslam_bench.runs.process.fork_server import THREAD_VARIABLES, adopt_orphans, die_with_parent
 
 LOG_FILE = "log.txt"
 _LONGEST = 400
@@ -130,6 +130,8 @@ def _redirect(log: Path) -> None:
 def _prepare(job: dict[str, Any]) -> None:
     """Take over the parent's environment, working folder and import path, and limit the threads."""
     wanted = {name: text for name, text in job["environment"].items() if name != "TMPDIR"}
+    for name in os.environ.keys() - wanted.keys() - {"TMPDIR", *THREAD_VARIABLES}:
+        del os.environ[name]
     os.environ.update(wanted | {ISOLATED_VARIABLE: "1"})
     with contextlib.suppress(OSError):
         os.chdir(job["working_folder"])

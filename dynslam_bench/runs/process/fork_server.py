@@ -34,6 +34,7 @@ from typing import Any
 import psutil
 
 from dynslam_bench.core import InfrastructureError, sweep
+from dynslam_bench.core.fingerprint import read_package_code
 from dynslam_bench.core.plugins import module_command
 
 _CHILD = "dynslam_bench.runs.process.child"
@@ -311,6 +312,7 @@ def serve(fd: int, start: str) -> None:
     if start == "fork":
         with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
             importlib.import_module("dynslam_bench.core.compiled").load_kernels()
+        read_package_code()  # of the modules that are loaded now, for the keys of the children's stage caches
     adopt_orphans()
     _Server(control, start).run()
 
