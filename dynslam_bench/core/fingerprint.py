@@ -172,20 +172,14 @@ def package_digest(packages: Sequence[str]) -> str:
     return digest([[folder.name, _package_code(folder)] for folder in _own_folders(packages)])
 
 
-def read_package_code() -> None:
-    """Read the digests of all packages of this package now, before their files change."""
-    for folder in _own_folders(["*"]):
-        _package_code(folder)
-
-
 def has_package_changed(packages: Sequence[str]) -> bool:
     """Whether the code of packages of this package is other than this process has read."""
     return any(_package_code.__wrapped__(folder) != _package_code(folder) for folder in _own_folders(packages))
 
 
 def _own_folders(packages: Sequence[str]) -> list[Path]:
-    places = map(Path, dynslam_bench.__path__)
-    return [folder for place in places for name in packages for folder in place.glob(name) if folder.is_dir()]
+    folders = (Path(place, name) for place in dynslam_bench.__path__ for name in packages)
+    return [folder for folder in folders if folder.is_dir()]
 
 
 @cache

@@ -85,7 +85,9 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "multiview.tau_m": ("dynaslam-g", {
         "multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0,
     }),
-    "class_rule.depth_m": ("seg-slam", {"segmentation.classes": "chair", "class_rule.movable": "person", "class_rule.vote_share": 0.1}),
+    "class_rule.depth_m": ("seg-slam", {
+        "segmentation.classes": "chair", "class_rule.movable": "person", "class_rule.vote_share": 0.1,
+    }),
 }  # fmt: skip
 """The tracker in which a setting acts on the excerpt, if not in the first that has it, and what else is set."""
 MANY = {
