@@ -170,8 +170,7 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
         return NO_PRIOR
     rotation = np.zeros((6, 6))
     rotation[:3, :3] = state.T_world_prev[:3, :3].T
-    rotation[3:, 3:] = -T_prev_cur[:3, :3]  # the covariance is of R_cam_world, the inverse of what the motion ends with
-    rotation[:3, 3:] = -se3.hat(T_prev_cur[:3, 3]) @ T_prev_cur[:3, :3]
+    rotation[3:, 3:] = T_prev_cur[:3, :3]
     covariance = rotation @ state.motion_covariance @ rotation.T + 1e-12 * np.eye(6)
     return np.asarray(CORRELATION * np.linalg.inv(covariance))
 
