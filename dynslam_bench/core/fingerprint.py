@@ -173,7 +173,7 @@ def package_digest(packages: Sequence[str]) -> str:
 
 
 def has_package_changed(packages: Sequence[str]) -> bool:
-    """Whether the code of packages of this package is other than this process has read."""
+    """Whether the code of packages of this package differs from what this process read first."""
     return any(_package_code.__wrapped__(folder) != _package_code(folder) for folder in _own_folders(packages))
 
 

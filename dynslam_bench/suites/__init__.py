@@ -154,8 +154,8 @@ class Suite(Record):
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
         chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
-        everyone = {*chosen, *self.trackers, *self.optional}
-        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in everyone}
+        trackers_named = {*chosen, *self.trackers, *self.optional}
+        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in trackers_named}
         named = {*self.tracker_settings, *(row.tracker for row in self.rows)}
         strangers = sorted(named - {*self.trackers, *self.optional})
         if strangers:

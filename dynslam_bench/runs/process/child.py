@@ -130,6 +130,7 @@ def _redirect(log: Path) -> None:
 def _prepare(job: dict[str, Any]) -> None:
     """Take over the parent's environment, working folder and import path, and limit the threads."""
     wanted = {name: text for name, text in job["environment"].items() if name != "TMPDIR"}
+    # the fork server still has what its parent has removed since
     for name in os.environ.keys() - wanted.keys() - {"TMPDIR", *THREAD_VARIABLES}:
         del os.environ[name]
     os.environ.update(wanted | {ISOLATED_VARIABLE: "1"})
