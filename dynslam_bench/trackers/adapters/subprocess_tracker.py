@@ -20,12 +20,13 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Literal, cast, get_args
+from typing import IO, Any, Literal, cast
 
 import cv2
 import numpy as np
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
+from dynslam_bench.contracts.checks import faults
 from dynslam_bench.core import (
     SHARED_MEMORY,
     DynslamError,
@@ -226,34 +227,31 @@ def _kill_group(process: subprocess.Popen[bytes]) -> None:
         process.stdin.close()
 
 
-def read_track_answer(answer: Mapping[str, Any], who: str, elapsed_s: Callable[[], float]) -> TrackResult:
+def read_track_answer(answer: Mapping[str, Any], frame: Frame, who: str, elapsed_s: Callable[[], float]) -> TrackResult:
     """The result of one frame.
 
     Args:
         answer: The program's answer.
+        frame: The frame that it is of.
         who: Program and frame, for messages.
         elapsed_s: Seconds since the request; ``transfer`` is what its own timings leave of them.
 
     Raises:
-        TrackerError: It is no pose.
+        TrackerError: It is no valid result, see `faults`.
     """
-    state = answer.get("state")
-    if not isinstance(state, str) or state not in get_args(TrackingState):
-        states = ", ".join(get_args(TrackingState))
-        raise TrackerError(f"{who}: answered state {str(state)[:80]!r}", f"known: {states}")
-    value = answer.get("T_world_cam")
-    try:
+    value, fitting = answer.get("T_world_cam"), (AttributeError, TypeError, ValueError, OverflowError)
+    with raising(TrackerError, f"{who}: T_world_cam is not 16 numbers", "row by row, camera to world", of=fitting):
         pose = None if value is None else np.asarray(value, dtype=np.float64).reshape(4, 4)
-    except (TypeError, ValueError, OverflowError):
-        reason = f"{who}: T_world_cam is not 16 numbers: {str(value)[:80]}"
-        raise TrackerError(reason, "row by row, camera to world") from None
-    if pose is None and state == "ok":
-        raise TrackerError(f"{who}: answered state 'ok' without T_world_cam")
-    if pose is not None and not se3.is_pose(pose):
-        raise TrackerError(f"{who}: T_world_cam is no rigid pose: {pose.tolist()}")
-    stats, timings = (_numbers(answer.get(name), name, who) for name in ("stats", "timings"))
+    with raising(TrackerError, f"{who}: stats and timings are not objects of numbers", of=fitting):
+        stats, timings = (
+            {str(key): float(number) for key, number in (answer.get(name) or {}).items()}
+            for name in ("stats", "timings")
+        )
     timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
-    return TrackResult(pose, cast(TrackingState, state), stats, timings)
+    result = TrackResult(pose, cast(TrackingState, str(answer.get("state"))[:80]), stats, timings)
+    for fault in faults(result, frame):
+        raise TrackerError(f"{who}: answered {fault.found}", fault.cause)
+    return result
 
 
 def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
@@ -262,12 +260,13 @@ def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
     Raises:
         TrackerError: It is no trajectory.
     """
-    try:
+    with raising(
+        TrackerError,
+        f"{who}: 'trajectory' is not a list of rows of 8 numbers",
+        "timestamp tx ty tz qx qy qz qw",
+        of=(TypeError, ValueError, OverflowError),
+    ):
         rows = np.asarray(answer.get("trajectory"), dtype=np.float64).reshape(-1, 8)
-    except (TypeError, ValueError, OverflowError):
-        raise TrackerError(
-            f"{who}: 'trajectory' is not a list of rows of 8 numbers", "timestamp tx ty tz qx qy qz qw"
-        ) from None
     norms = np.linalg.norm(rows[:, 4:], axis=1)
     if not (np.abs(norms - 1) < 1e-3).all():  # also catches NaN
         raise TrackerError(f"{who}: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:g}")
@@ -275,13 +274,6 @@ def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
         return Trajectory(rows[:, 0], se3.from_quaternion(rows[:, 1:4], rows[:, 4:]))
     except DynslamError as error:
         raise TrackerError(f"{who}: {error}") from error
-
-
-def _numbers(value: Any, what: str, who: str) -> dict[str, float]:
-    try:
-        return {str(key): float(number) for key, number in (value or {}).items()}
-    except (AttributeError, TypeError, ValueError, OverflowError):
-        raise TrackerError(f"{who}: {what} is not an object of numbers: {str(value)[:80]}") from None
 
 
 class ImageExchange:
@@ -420,7 +412,6 @@ class ProgramTracker:
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
         environment = dict.fromkeys(names, str(self.context.threads))
         self._exchange = ImageExchange(camera, self._images)
-        self._program = Program(self.name, self._command, folder=self._folder, environment=environment)
         request = {
             "op": "reset",
             "protocol": PROTOCOL,
@@ -436,6 +427,7 @@ class ProgramTracker:
             "sequence": self.context.sequence_id,
             "options": self.options(camera, self._exchange.folder),
         }
+        self._program = Program(self.name, self._command, folder=self._folder, environment=environment)
         try:
             self._ask(request, self.limits.start_timeout_s, "at reset")
         except DynslamError:
@@ -464,7 +456,7 @@ class ProgramTracker:
                 f"{self.name} {doing}: answered index {str(answer.get('index'))[:20]}",
                 "each answer repeats the index of its track request",
             )
-        return read_track_answer(answer, f"{self.name} {doing}", lambda: time.perf_counter() - start)
+        return read_track_answer(answer, frame, f"{self.name} {doing}", lambda: time.perf_counter() - start)
 
     def close(self) -> None:
         """End the program (killed if it does not end by itself) and remove the exchanged files."""
