@@ -143,11 +143,12 @@ def export(
     """Write one of our networks as an ONNX file of fixed shapes, which lighter runtimes can serve."""
     from dynslam_bench.segmentation.networks.onnx_export import export_network, parse_size
 
-    done = export_network(source, output, size=parse_size(size), side=side)
+    height, width = parse_size(size)
+    classes = export_network(source, output, size=(height, width), side=side)
     facts = {
-        "file": done.path,
-        "megabytes": round(done.megabytes, 1),
-        "input": f"image [1, 3, {done.size[0]}, {done.size[1]}], RGB in [0, 1]",
-        "classes": len(done.classes),
+        "file": output,
+        "megabytes": round(output.stat().st_size / 1e6, 1),
+        "input": f"image [1, 3, {height}, {width}], RGB in [0, 1]",
+        "classes": len(classes),
     }
     present(facts, fields(facts))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dynslam_bench.contracts import Frame, Instances, MaskSource, Segmenter, SegmenterContext, SegmenterSpec, Sequence
-from dynslam_bench.core import SegmentationError
+from dynslam_bench.core import SegmentationError, raising
 from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, path_digest
 from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.records import digest
@@ -23,7 +23,6 @@ from dynslam_bench.segmentation.networks.checkpoints import (
     cached_checkpoint,
     embedded_weights,
     fetch_checkpoint,
-    require_embedded_weights,
 )
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
@@ -80,18 +79,15 @@ def resolve_source(
         optional: Whether the tracker also works without masks, for the hint.
 
     Returns:
-        ``auto`` becomes ``embedded``, ``oracle`` or ``coco``; everything else stays as it is.
+        ``auto`` becomes ``embedded`` or ``coco``; everything else stays as it is.
 
     Raises:
         NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; lists the alternatives.
     """
     if settings.source != "auto":
         return settings.source
-    rendered = sequence_id.startswith("synthetic/")
-    if rendered and embedded_weights() is not None:
+    if sequence_id.startswith("synthetic/"):
         return "embedded"
-    if rendered and masks is not None:
-        return "oracle"
     if cached_checkpoint(COCO) is not None:
         return "coco"
     options = [
@@ -140,8 +136,6 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
         path = Path(argument).expanduser()
         stat = path.stat() if path.is_file() else None
         _check_network(kind, argument, group, stat and (stat.st_size, stat.st_mtime_ns))
-    elif kind == "embedded":
-        require_embedded_weights()
     elif kind == "coco" and fetch:
         fetch_checkpoint(COCO)
     elif kind == "plugin":
@@ -374,7 +368,5 @@ def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks:
         return COCO.sha256_prefix
     if kind in ("onnx", "weights", "recorded"):
         path = Path(argument).expanduser()
-    try:
+    with raising(SegmentationError, f"cannot read {path}"):
         return path_digest(path)[:12] if path is not None and path.exists() else ""
-    except OSError as error:
-        raise SegmentationError(f"cannot read {error.filename}: {error.strerror}") from error

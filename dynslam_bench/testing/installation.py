@@ -82,7 +82,7 @@ def _weights() -> list[Finding]:
     coco = cached_checkpoint(COCO)
     where = f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
     fetched = Finding("weights", "coco", str(coco)) if coco else Finding("weights", "coco", "not here", True, where)
-    if embedded_weights():
+    if embedded_weights().is_file():
         return [Finding("weights", "embedded", "in the package, for rendered people"), fetched]
     return [Finding("weights", "embedded", "missing", True, "reinstall"), fetched]
 

@@ -59,7 +59,7 @@ def main() -> None:
         add(f"Mask R-CNN, ResNet-50, CFPN, shorter side {side}", network)
     network = untrained(RESNET18, 480, arguments.threads, arguments.objects, arguments.device)
     add("Mask R-CNN, ResNet-18, CFPN, shorter side 480", network)
-    if embedded_weights() is not None:
+    if embedded_weights().is_file():
         add(
             "embedded (half-width ResNet-18, CFPN, 320x240)",
             build_segmenter(

@@ -24,11 +24,11 @@ from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsEr
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
 from dynslam_bench.core.settings import apply_overrides, build, parameters
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.segmentation import build_segmenter as building
 from dynslam_bench.segmentation import schedule
 from dynslam_bench.segmentation.build_segmenter import (
     CachedSegmenter,
     ConfiguredSegmenter,
+    NetworkNotFetched,
     SegmenterSpec,
     build_segmenter,
     resolve_source,
@@ -207,11 +207,8 @@ def test_recorded_refuses_what_does_not_fit(tmp_path):
 def test_auto(monkeypatch, tmp_path):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
     auto = SegmentationSettings()
-    monkeypatch.setattr(building, "embedded_weights", lambda: tmp_path / "embedded.pt")
     assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "embedded"
-    monkeypatch.setattr(building, "embedded_weights", lambda: None)
-    assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "oracle"
-    with pytest.raises(building.NetworkNotFetched, match="'bonn/crowd'"):
+    with pytest.raises(NetworkNotFetched, match="'bonn/crowd'"):
         resolve_source(auto, "bonn/crowd")
     (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")
     assert resolve_source(auto, "bonn/crowd") == "coco"

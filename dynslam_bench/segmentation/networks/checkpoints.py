@@ -7,9 +7,6 @@ from dynslam_bench.core import DownloadError, SegmentationError, SequenceError, 
 from dynslam_bench.core.download import Report, download
 from dynslam_bench.sequences.synthetic import TUNE_SCENES, parse_synthetic_id
 
-ATTEMPTS = 3
-"""Connections in a row that may fail before a run is refused."""
-
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -45,22 +42,9 @@ COCO = Checkpoint(
 )
 
 
-def embedded_weights() -> Path | None:
-    """The file of the network that comes with this package; None if this installation has none."""
-    path = Path(__file__).parent / "weights" / "embedded.pt"
-    return path if path.is_file() else None
-
-
-def require_embedded_weights() -> Path:
-    """The file of the network that comes with this package.
-
-    Raises:
-        SegmentationError: This installation lacks it.
-    """
-    path = embedded_weights()
-    if path is None:
-        raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
-    return path
+def embedded_weights() -> Path:
+    """The file of the network that comes with this package."""
+    return Path(__file__).parent / "weights" / "embedded.pt"
 
 
 def cached_checkpoint(checkpoint: Checkpoint) -> Path | None:
@@ -86,7 +70,7 @@ def fetch_checkpoint(checkpoint: Checkpoint, progress: Report | None = None) -> 
     if path.is_file():
         return path
     try:
-        download(checkpoint.url, path, sha256=checkpoint.sha256_prefix, progress=progress, attempts=ATTEMPTS)
+        download(checkpoint.url, path, sha256=checkpoint.sha256_prefix, progress=progress, attempts=3)
     except DownloadError as error:
         raise SegmentationError(
             f"cannot fetch the checkpoint '{checkpoint.id}': {error.args[0]}",

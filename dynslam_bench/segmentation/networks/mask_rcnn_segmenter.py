@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Frame, Instances, SegmenterContext
 from dynslam_bench.core import SegmentationError
 from dynslam_bench.segmentation.networks import pinned_threads
-from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
+from dynslam_bench.segmentation.networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings, expand_classes
@@ -65,7 +65,7 @@ class MaskRCNNSegmenter:
 
 def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
     """The small network in this package, at the input size that it was trained with."""
-    return load_segmenter(require_embedded_weights(), settings.model_copy(update={"network_side": 0}), context)
+    return load_segmenter(embedded_weights(), settings.model_copy(update={"network_side": 0}), context)
 
 
 def build_coco(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
@@ -118,14 +118,15 @@ def paste(
         exact: Interpolate at the pixels' centres. Otherwise as in the published models: the mask gets a border of one
             pixel, the box grows by the same share and is cut to whole pixels, which shifts edges by up to a pixel.
     """
+    mask = np.zeros((height, width), bool)
     if exact:
-        return _paste_exactly(plane, box, height, width, threshold)
+        _paste_exactly(plane, box, threshold, mask)
+        return mask
     side = plane.shape[0]
     centre, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * ((side + 2) / side)
     (x0, y0), (x1, y1) = (np.trunc(corner).astype(int).tolist() for corner in (centre - half, centre + half))
     size = (max(x1 - x0 + 1, 1), max(y1 - y0 + 1, 1))
     patch = cv2.resize(np.pad(plane, 1), size, interpolation=cv2.INTER_LINEAR)
-    mask = np.zeros((height, width), bool)
     left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1 + 1, width), min(y1 + 1, height)
     if left < right and top < bottom:
         mask[top:bottom, left:right] = patch[top - y0 : bottom - y0, left - x0 : right - x0] >= threshold
@@ -133,13 +134,13 @@ def paste(
 
 
 def _paste_exactly(
-    plane: NDArray[np.float32], box: NDArray[np.float32], height: int, width: int, threshold: float
-) -> NDArray[np.bool_]:
-    mask = np.zeros((height, width), bool)
+    plane: NDArray[np.float32], box: NDArray[np.float32], threshold: float, mask: NDArray[np.bool_]
+) -> None:
+    """Set the pixels of an empty mask by interpolation at their centres."""
     left, top = max(math.floor(box[0]), 0), max(math.floor(box[1]), 0)
-    right, bottom = min(math.ceil(box[2]), width), min(math.ceil(box[3]), height)
+    right, bottom = min(math.ceil(box[2]), mask.shape[1]), min(math.ceil(box[3]), mask.shape[0])
     if left >= right or top >= bottom or box[2] <= box[0] or box[3] <= box[1]:
-        return mask
+        return
     scale = plane.shape[0] / (box[2:] - box[:2])
     to_plane = np.array(
         [[scale[0], 0, (left + 0.5 - box[0]) * scale[0] - 0.5], [0, scale[1], (top + 0.5 - box[1]) * scale[1] - 0.5]]
@@ -149,4 +150,3 @@ def _paste_exactly(
     columns, rows = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
     inside = ((rows >= box[1]) & (rows <= box[3]))[:, None] & ((columns >= box[0]) & (columns <= box[2]))[None]
     mask[top:bottom, left:right] = (patch >= threshold) & inside
-    return mask

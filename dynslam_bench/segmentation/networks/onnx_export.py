@@ -4,7 +4,6 @@ import logging
 import re
 import warnings
 from contextlib import redirect_stdout
-from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from torch.nn import functional
 
 from dynslam_bench.core import SegmentationError, raising, replacing
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.segmentation.networks.checkpoints import COCO, fetch_checkpoint, require_embedded_weights
+from dynslam_bench.segmentation.networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import (
     BOX_POOL,
@@ -47,26 +46,7 @@ CHUNK = 100
 """Boxes whose features are gathered at a time, which bounds the memory."""
 
 
-@dataclass(frozen=True)
-class ExportedNetwork:
-    """What `export_network` wrote.
-
-    Attributes:
-        path: The file.
-        size: Height and width of its input.
-        classes: Names of what it finds, by number.
-        megabytes: Size of the file.
-    """
-
-    path: Path
-    size: tuple[int, int]
-    classes: dict[int, str]
-    megabytes: float
-
-
-def export_network(
-    source: str, path: Path, *, size: tuple[int, int] = SIZE, side: int | None = None
-) -> ExportedNetwork:
+def export_network(source: str, path: Path, *, size: tuple[int, int] = SIZE, side: int | None = None) -> dict[int, str]:
     """Write a Mask R-CNN checkpoint as an ONNX file that ``onnx:PATH`` takes.
 
     The input ``image [1, 3, H, W]`` is RGB in [0, 1]. The outputs are those of torchvision's exports: boxes, labels,
@@ -79,6 +59,9 @@ def export_network(
         size: Height and width of the images; others are fitted in when it is used.
         side: Shorter side in pixels at which the network works; 0 for its own, None for that of a run.
 
+    Returns:
+        The names of what the network finds, by number.
+
     Raises:
         SegmentationError: There is no such checkpoint, it cannot be fetched or read, `onnx` or `onnxscript` is missing,
             or torch cannot export it.
@@ -86,7 +69,7 @@ def export_network(
     """
     kind, _, argument = source.partition(":")
     if source == "embedded":
-        weights = require_embedded_weights()
+        weights = embedded_weights()
     elif source == "coco":
         weights = fetch_checkpoint(COCO)
     elif kind == "weights" and argument:
@@ -116,7 +99,7 @@ def parse_size(text: str) -> tuple[int, int]:
     return height, width
 
 
-def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -> ExportedNetwork:
+def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -> dict[int, str]:
     """`export_network` of a network in memory.
 
     Raises:
@@ -155,8 +138,7 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
         onnx.helper.set_model_props(model, {"names": repr(classes), "producer": "dynslam-bench"})
         onnx.checker.check_model(model)
         onnx.save(model, str(temporary))
-        megabytes = temporary.stat().st_size / 1e6
-    return ExportedNetwork(path, size, classes, megabytes)
+    return classes
 
 
 class StaticMaskRCNN(nn.Module):
