@@ -281,6 +281,7 @@ COCO = {
 }
 _DEPTH = cv2.imencode(".png", np.full((8, 8), 5000, np.uint16))[1].tobytes()
 _PNG = cv2.imencode(".png", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
+_FRAME = Frame(1, 1.0, np.zeros((12, 16, 3), np.uint8), np.zeros((12, 16), np.float32))
 
 
 class FewSettings(settings.Settings):
@@ -324,7 +325,7 @@ def _read_manifest(data: bytes | None, folder: Path) -> None:
 def _read_coco(data: bytes | None, folder: Path) -> None:
     at(folder, "a.png", _PNG)
     at(folder, "b/c.png", _PNG)
-    labelled = labelled_images.coco_images(at(folder, "annotations.json", data))
+    labelled = labelled_images.coco_images(str(at(folder, "annotations.json", data)))
     assert labelled.name and labelled.version
     for index in range(min(len(labelled), 4)):
         labelled[index]
@@ -333,7 +334,7 @@ def _read_coco(data: bytes | None, folder: Path) -> None:
 def _read_yolo(data: bytes | None, folder: Path) -> None:
     at(folder, "images/a.png", _PNG)
     at(folder, "labels/a.txt", data)
-    labelled = labelled_images.yolo_images(folder)
+    labelled = labelled_images.yolo_images(str(folder))
     assert labelled.name and labelled.version and len(labelled) == 1
     labelled[0]
 
@@ -341,7 +342,7 @@ def _read_yolo(data: bytes | None, folder: Path) -> None:
 def _read_answer(text: str) -> None:
     answer = subprocess_tracker.parse_answer(text)
     with suppress(TrackerError):
-        subprocess_tracker.read_track_answer(answer, "program at frame 1", lambda: 0.1)
+        subprocess_tracker.read_track_answer(answer, _FRAME, "program at frame 1", lambda: 0.1)
     subprocess_tracker.read_final_answer(answer, "program at finalize")
 
 
@@ -585,7 +586,7 @@ def _read_mask(data: bytes | None, folder: Path) -> None:
     at(folder, "0.9.png" if stamped else "0.png", b"")
     at(folder, "1.0.png" if stamped else "1.png", data)
     at(folder, recorded.CLASSES_FILE, b'{"1": "person"}')
-    frame = Frame(1, 1.0, np.zeros((12, 16, 3), np.uint8), np.zeros((12, 16), np.float32))
+    frame = _FRAME
     segmenter = recorded.RecordedSegmenter(folder)
     segmenter.missing(np.array([1.0, 2.0]))
     segmenter.segment(frame)
@@ -737,7 +738,7 @@ BINARIES = [
     Target("prepared images", _read_prepared, lambda: [PREPARED, PREPARED + b"x"]),
     Target(
         "vocabulary",
-        lambda data, folder: orbslam3._check(orbslam3._unpack(data or b""), folder / "voc.txt"),
+        lambda data, folder: orbslam3._check(lzma.decompress(data or b""), folder / "voc.txt"),
         _vocabularies,
         _repressed,
         allowed=(orbslam3.TrackerError, lzma.LZMAError, EOFError, ValueError),

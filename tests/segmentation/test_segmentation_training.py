@@ -56,7 +56,7 @@ def write_yolo(folder, count=6, seed=0):
 
 
 def test_yolo_polygons(tmp_path):
-    images = yolo_images(write_yolo(tmp_path))
+    images = yolo_images(str(write_yolo(tmp_path)))
     assert len(images) == 6
     image = images[2]
     assert image.class_names == ("person", "chair") and image.rgb.shape == (120, 160, 3)
@@ -65,7 +65,7 @@ def test_yolo_polygons(tmp_path):
     (tmp_path / "labels" / "2.txt").unlink()
     assert images[2].masks.shape == (0, 120, 160)
     with pytest.raises(SegmentationError, match="there are no images"):
-        yolo_images(tmp_path / "none")
+        yolo_images(str(tmp_path / "none"))
 
 
 def test_coco_polygons_and_run_lengths(tmp_path):
@@ -74,10 +74,10 @@ def test_coco_polygons_and_run_lengths(tmp_path):
     polygon = [[2, 1, 6, 1, 6, 4, 2, 4]]
     counts = [13, 3, 3, 3, 3, 3, 3, 3, 14]
     for segmentation in (polygon, {"size": [6, 8], "counts": counts}):
-        image = coco_images(coco(tmp_path, segmentation))[0]
+        image = coco_images(str(coco(tmp_path, segmentation)))[0]
         assert image.class_names == ("person",)
         assert np.count_nonzero(image.masks[0] != expected) == 0
-    assert len(coco_images(coco(tmp_path, polygon, iscrowd=1))[0].masks) == 0
+    assert len(coco_images(str(coco(tmp_path, polygon, iscrowd=1)))[0].masks) == 0
 
 
 def test_rendered_frames_are_a_function_of_their_name():
@@ -249,7 +249,7 @@ SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1,
     ],
 )
 def test_a_damaged_mask_is_one_clear_line(tmp_path: Path, segmentation: Any) -> None:
-    images = coco_images(coco(tmp_path, segmentation))
+    images = coco_images(str(coco(tmp_path, segmentation)))
     with pytest.raises(SegmentationError, match="a segmentation is"):
         images[0]
 
@@ -268,7 +268,7 @@ def test_a_damaged_mask_is_one_clear_line(tmp_path: Path, segmentation: Any) -> 
 )
 def test_damaged_annotations_are_one_clear_line(tmp_path: Path, changes: dict[str, object], words: str) -> None:
     with pytest.raises(SegmentationError, match=words):
-        coco_images(coco(tmp_path, [], changes=changes))
+        coco_images(str(coco(tmp_path, [], changes=changes)))
 
 
 def test_run_lengths_of_any_text_end(tmp_path: Path) -> None:
@@ -287,7 +287,7 @@ def test_damaged_yolo_labels_are_one_clear_line(tmp_path: Path, line: bytes) -> 
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "labels" / "a.txt").write_bytes(line)
     with pytest.raises(SegmentationError, match=r"is no polygon label|is not a text file"):
-        yolo_images(tmp_path)[0]
+        yolo_images(str(tmp_path))[0]
 
 
 def refused(path: Path, content: object, words: str) -> None:

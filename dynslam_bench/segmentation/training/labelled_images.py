@@ -37,9 +37,6 @@ from dynslam_bench.sequences.synthetic.settings import RENDERER_VERSION
 
 FINER = 4
 """Polygons are filled at this many times the image's resolution."""
-FARTHEST_PX = 1e6
-"""Corners of polygons farther away than any image is wide are refused: OpenCV counts in 32 bits."""
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,33 +77,33 @@ class LabelledImages:
         return self.read(range(self.count)[index])
 
 
-def coco_images(annotations: Path, images: Path | None = None) -> LabelledImages:
+def coco_images(text: str) -> LabelledImages:
     """Images of a COCO annotation file (``images``, ``annotations``, ``categories``); crowds are left out.
 
     Polygons and uncompressed and compressed run lengths are understood.
 
     Args:
-        annotations: The JSON file.
-        images: Folder of the images; None means the folder of the file.
+        text: ``ANNOTATIONS.json`` or ``ANNOTATIONS.json:IMAGES``, the folder of the images if it is another.
 
     Raises:
         SegmentationError: The file is missing or not in COCO's format.
     """
-    path = annotations.expanduser()
-    folder = images.expanduser() if images is not None else path.parent
+    annotations, _, images = text.partition(":")
+    path = Path(annotations).expanduser()
+    folder = Path(images).expanduser() if images else path.parent
     content = read_json(path, limit=TABLE_BYTES, kind=SegmentationError)
-    try:
+    with raising(
+        SegmentationError,
+        f"{path} is not in COCO's annotation format",
+        "it needs images, annotations and categories",
+        of=(ValueError, LookupError, TypeError, AttributeError, OverflowError),
+    ):
         names = {int(entry["id"]): str(entry["name"]) for entry in content["categories"]}
         shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
         for entry in content["annotations"]:
             if not entry.get("iscrowd"):
                 shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
         files = [(str(entry["file_name"]), shapes[int(entry["id"])]) for entry in content["images"]]
-    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-        raise SegmentationError(
-            f"{path} is not in COCO's annotation format: {type(error).__name__} {str(error)[:200]}",
-            "it needs images, annotations and categories",
-        ) from error
     if not files:
         raise SegmentationError(f"{path} lists no images")
     entries = [(inside(folder, name, where=str(path), kind=SegmentationError), objects) for name, objects in files]
@@ -120,21 +117,21 @@ def _read_coco(path: Path, objects: list[tuple[str, Any]]) -> LabelledImage:
     return _labelled(rgb, masks, [name for name, _ in objects])
 
 
-def yolo_images(folder: Path) -> LabelledImages:
+def yolo_images(text: str) -> LabelledImages:
     """Images with YOLO polygon labels: ``images/**/NAME.jpg`` beside ``labels/**/NAME.txt``.
 
     A label's line is ``class x1 y1 x2 y2 ...`` with COCO's class numbers from 0 and coordinates in [0, 1]. An image
     without a label file has no objects.
 
     Args:
-        folder: Holds ``images`` and ``labels``.
+        text: The folder that holds ``images`` and ``labels``.
 
     Raises:
         SegmentationError: The folder or its images are missing.
     """
-    folder = folder.expanduser()
+    folder = Path(text).expanduser()
     root, labels = folder / "images", folder / "labels"
-    images = sorted(path for path in root.rglob("*") if path.suffix.lower() in SUFFIXES)
+    images = sorted(path for path in root.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp"))
     if not images:
         raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
 
@@ -150,17 +147,17 @@ def _read_yolo(path: Path, label: Path) -> LabelledImage:
     masks, names = [], []
     lines = read_lines(label, kind=SegmentationError) if label.is_file() else []
     for number, line in enumerate(lines, 1):
-        if line.strip():
-            with raising(
-                SegmentationError,
-                f"{label} line {number} is no polygon label",
-                "expected class x1 y1 x2 y2 ...",
-                of=(ValueError, LookupError, OverflowError),
-            ):
-                kind, *points = line.split()
-                names.append(dict(enumerate(COCO_NAMES))[int(kind)])
-                polygon = _polygon(points) * [rgb.shape[1], rgb.shape[0]]
-            masks.append(_fill([polygon], rgb.shape[:2]))
+        if not line.strip():
+            continue
+        with raising(
+            SegmentationError,
+            f"{label} line {number} is no polygon label",
+            "expected class x1 y1 x2 y2 ...",
+            of=(ValueError, LookupError, OverflowError),
+        ):
+            kind, *points = line.split()
+            names.append(dict(enumerate(COCO_NAMES))[int(kind)])
+            masks.append(_fill([_polygon(points) * [rgb.shape[1], rgb.shape[0]]], rgb.shape[:2]))
     return _labelled(rgb, masks, names)
 
 
@@ -197,8 +194,8 @@ def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArra
 def _polygon(points: Any) -> NDArray[np.float64]:
     """Corners ``[N, 2]``; raises ValueError where one is no number or far outside of any image."""
     polygon = np.array(points, np.float64).reshape(-1, 2)
-    if not (np.abs(polygon) < FARTHEST_PX).all():  # also catches NaN
-        raise ValueError(f"a corner is not finite, or more than {FARTHEST_PX:g} pixels away")
+    if not (np.abs(polygon) < 1e6).all():  # also catches NaN; OpenCV counts in 32 bits
+        raise ValueError("a corner is not finite, or more than a million pixels away")
     return polygon
 
 
@@ -218,8 +215,7 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
         total = sum(runs)
         if (height, width) != tuple(shape) or total != height * width or min(runs) < 0:
             raise ValueError(f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}")
-        flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-        return np.ascontiguousarray(flat.reshape(width, height).T)
+        return np.ascontiguousarray(np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T)
 
 
 def decode_runs(text: str) -> list[int]:
@@ -341,25 +337,18 @@ def open_labelled(text: str) -> LabelledImages:
         SegmentationError: Another form, or the set does not exist.
     """
     kind, _, rest = text.partition(":")
-    path, _, images = rest.partition(":")
-    if kind == "synthetic":
-        return rendered_frames(rest)
-    if kind == "sequence" and rest:
-        return sequence_frames(rest)
-    if kind == "coco" and rest:
-        return coco_images(Path(path), Path(images) if images else None)
-    if kind == "yolo" and rest:
-        return yolo_images(Path(rest))
-    hint = did_you_mean(kind, ["synthetic", "sequence", "coco", "yolo"])
-    raise SegmentationError(f"'{text}' names no set of labelled images; the forms are {FORMS}", hint)
+    kinds = {"synthetic": rendered_frames, "sequence": sequence_frames, "coco": coco_images, "yolo": yolo_images}
+    if kind in kinds and (rest or kind == "synthetic"):
+        return kinds[kind](rest)
+    raise SegmentationError(
+        f"'{text}' names no set of labelled images; the forms are {FORMS}", did_you_mean(kind, list(kinds))
+    )
 
 
 # Labelled images at the network's input size, kept in one file on disk, and their random variation for training.
 
 MIN_VISIBLE_PX = 16
 """Objects with fewer pixels at the network's input size are not learned."""
-
-_AGAIN = "delete the folder, they are prepared again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -394,14 +383,17 @@ class PreparedImages:
 
     def __init__(self, folder: Path, classes: Sequence[str]) -> None:
         with raising(
-            SegmentationError, f"the prepared images in {folder} are damaged", _AGAIN, of=Exception
+            SegmentationError,
+            f"the prepared images in {folder} are damaged",
+            "delete the folder, they are prepared again",
+            of=Exception,
         ):  # numpy raises many types for a damaged header
             self.images, self.labels = (
                 np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("images", "labels")
             )
-        self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
-        if not len(self.images) == len(self.labels) == len(self.names):
-            raise SegmentationError(f"the prepared images in {folder} are damaged: their numbers differ", _AGAIN)
+            self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
+            if not len(self.images) == len(self.labels) == len(self.names):
+                raise ValueError("their numbers differ")
         self.classes = tuple(classes)
 
     def __len__(self) -> int:
@@ -464,8 +456,7 @@ def shrink(image: LabelledImage, height: int, width: int) -> tuple[NDArray[np.ui
     ratio = min(height / rows, width / columns)
     size = (max(1, round(columns * ratio)), max(1, round(rows * ratio)))
     how = cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR
-    rgb = np.full((height, width, 3), 114, np.uint8)
-    labels = np.zeros((height, width), np.uint8)
+    rgb, labels = np.full((height, width, 3), 114, np.uint8), np.zeros((height, width), np.uint8)
     top, left = (height - size[1]) // 2, (width - size[0]) // 2
     rgb[top : top + size[1], left : left + size[0]] = cv2.resize(image.rgb, size, interpolation=how)
     patch = labels[top : top + size[1], left : left + size[0]]

@@ -30,9 +30,6 @@ from dynslam_bench.segmentation.training.labelled_images import (
 from dynslam_bench.segmentation.training.settings import TrainProgress, TrainResult, TrainSettings
 
 LOSSES = ("objectness", "anchor", "class", "box", "mask")
-SCORES = ("iou", "pixel_iou", "recall")
-CONFIDENCE = 0.5
-"""Least score of a detection in the validation."""
 
 
 def train(
@@ -258,7 +255,7 @@ def draw_curve(table: pd.DataFrame, path: Path, title: str) -> None:
     from plotly.subplots import make_subplots
 
     figure = make_subplots(cols=2, subplot_titles=("losses", "validation scores"))
-    for column, names in enumerate((("loss", *LOSSES), SCORES), start=1):
+    for column, names in enumerate((("loss", *LOSSES), ("iou", "pixel_iou", "recall")), start=1):
         for name in table.columns.intersection(list(names)):
             figure.add_scatter(x=table["step"], y=table[name], name=name, row=1, col=column)
     figure.update_layout(title=title, yaxis_type="log", yaxis2_range=[0, 1])
@@ -298,7 +295,7 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
         example = images.example(index)
         height, width = example.rgb.shape[:2]
         image = torch.from_numpy(example.rgb).to(device).permute(2, 0, 1).float() / 255
-        boxes, labels, _, planes = (part.cpu().numpy() for part in network.detect(image, score=CONFIDENCE))
+        boxes, labels, _, planes = (part.cpu().numpy() for part in network.detect(image, score=0.5))
         masks = [paste(plane, box, height, width, 0.5, exact=True) for plane, box in zip(planes, boxes, strict=True)]
         for truth, label in zip(example.masks, example.labels.tolist(), strict=True):
             same_class = [mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]
