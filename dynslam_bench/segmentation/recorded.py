@@ -20,8 +20,6 @@ from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings
 CLASSES_FILE = "classes.json"
 MAX_DIFFERENCE_S = 0.02
 """Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
-PERSONS = dict.fromkeys(range(1 << 16), "person")
-"""Classes of the numbers in label images without a file of classes."""
 ORIGIN_FILE = "recorded.json"
 """Beside the masks: the sequence and the settings that they were made of."""
 
@@ -69,10 +67,9 @@ class RecordedSegmenter:
             numbers = np.array([float(file.stem if self.by_stamp else int(file.stem)) for file in files])
             if not np.isfinite(numbers).all():
                 raise ValueError("a stamp is not finite")
-        order = np.argsort(numbers, kind="stable")
-        self._keys: NDArray[np.float64] = numbers[order]
-        self._files = [files[i] for i in order]
-        self._names = read_classes(self.folder / CLASSES_FILE) or PERSONS
+        self._keys: NDArray[np.float64] = numbers
+        self._files = files
+        self._names = read_classes(self.folder / CLASSES_FILE) or dict.fromkeys(range(1 << 16), "person")
 
     def segment(self, frame: Frame) -> Instances:
         """The recorded objects of a frame.
@@ -89,7 +86,7 @@ class RecordedSegmenter:
                 f"the nearest is {path.name}" + (f", {distance:.3f} s away" if self.by_stamp else ""),
             )
         height, width = frame.rgb.shape[:2]
-        labels = read_image(
+        image = read_image(
             path,
             size=(width, height),
             mismatch=f"but the frame is {width}x{height}",
@@ -97,7 +94,7 @@ class RecordedSegmenter:
             flags=cv2.IMREAD_UNCHANGED,
             kind=SegmentationError,
         )
-        labels = np.atleast_3d(labels)
+        labels = np.atleast_3d(image)
         if (labels[:, :, :3] != labels[:, :, :1]).any():
             raise SegmentationError(
                 f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
@@ -127,8 +124,7 @@ def _objects(labels: NDArray[Any], names: Mapping[int, str], where: str) -> tupl
         SegmentationError: A number in the image has no class name.
     """
     numbers = [int(number) for number in np.unique(labels) if number != 0]
-    nameless = [number for number in numbers if number not in names]
-    if nameless:
+    if nameless := [number for number in numbers if number not in names]:
         named = ", ".join(map(str, sorted(names))) or "none"
         raise SegmentationError(f"{where}: object {nameless[0]} has no class name", f"known numbers: {named}")
     masks = np.asarray(labels[None] == np.array(numbers, labels.dtype)[:, None, None])

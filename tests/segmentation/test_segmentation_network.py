@@ -561,7 +561,7 @@ def test_a_written_network_runs_through_opencv(tmp_path):
     logits[0, 0] = 1.0
     logits[0, 15, 10:30, 20:40] = 5.0
     path = write(tmp_path, (1, 3, 240, 320), {"out": logits})
-    assert [str(i) for i in read_header(path).inputs] == ["image 1x3x240x320"]
+    assert [str(i) for i in read_header(path)[0]] == ["image 1x3x240x320"]
     segmenter = OnnxSegmenter(path, SETTINGS)
     assert segmenter.layout.kind == "semantic"
     for shape in ((480, 640, 3), (240, 320, 3), (100, 333, 3), (37, 21, 3)):

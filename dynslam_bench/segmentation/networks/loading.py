@@ -23,8 +23,15 @@ CFPN_PREFIX = "backbone.cfpn."
 _RENAMES = (
     (re.compile(r"^(backbone\.fpn\.(?:inner|layer)_blocks\.\d+)\.(weight|bias)$"), r"\1.0.\2"),
     (re.compile(r"^(rpn\.head\.conv)\.(weight|bias)$"), r"\1.0.0.\2"),
+    *(
+        (
+            re.compile(rf"^roi_heads\.mask_head\.mask_fcn{layer + 1}\.(weight|bias)$"),
+            rf"roi_heads.mask_head.{layer}.0.\1",
+        )
+        for layer in range(4)
+    ),
 )
-_MASK_FCN = re.compile(r"^roi_heads\.mask_head\.mask_fcn([1-9][0-9]?)\.(weight|bias)$")
+"""Names of the file published in 2019, and today's."""
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
 MAX_EXPANSION = 4
 """Largest ratio of a checkpoint's unpacked size to its file size; torch stores weights uncompressed."""
@@ -113,14 +120,11 @@ def _renamed(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     prefix = "module." if all(key.startswith("module.") for key in state) else ""
     result = {}
     for key, value in state.items():
-        name = key[len(prefix) :]
-        if name.endswith("num_batches_tracked"):
-            continue
+        name = key.removeprefix(prefix)
         for pattern, replacement in _RENAMES:
             name = pattern.sub(replacement, name)
-        if match := _MASK_FCN.match(name):
-            name = f"roi_heads.mask_head.{int(match[1]) - 1}.0.{match[2]}"
-        result[name] = value.float() if value.is_floating_point() else value
+        if not name.endswith("num_batches_tracked"):
+            result[name] = value.float() if value.is_floating_point() else value
     return result
 
 

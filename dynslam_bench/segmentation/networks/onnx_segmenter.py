@@ -68,8 +68,8 @@ class OnnxSegmenter:
 
     def __init__(self, path: Path, settings: SegmentationSettings, *, threads: int = 1, floor: float = 0.1) -> None:
         self.path, self.settings, self.threads, self.floor = path.expanduser(), settings, threads, floor
-        header = read_header(self.path)
-        self._size = _input_size(header, self.path)
+        inputs, outputs, metadata = read_header(self.path)
+        self._size = _input_size(inputs, self.path)
         with raising(
             SegmentationError,
             f"OpenCV {cv2.__version__} cannot load {self.path}",
@@ -77,8 +77,8 @@ class OnnxSegmenter:
             of=(cv2.error, RuntimeError),
         ):
             self._net = cv2.dnn.readNetFromONNX(str(self.path))
-        self._input = header.inputs[0].name
-        self.layout = self._find_layout(header)
+        self._input = inputs[0].name
+        self.layout = self._find_layout(outputs, metadata)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied and pickled by its arguments: OpenCV's network cannot be, nor be used by two threads."""
@@ -96,19 +96,18 @@ class OnnxSegmenter:
         values = self._forward(image, list(self.layout.outputs))
         return decode(self.layout, values, place, self.settings, self.floor)
 
-    def _find_layout(self, header: OnnxHeader) -> Layout:
+    def _find_layout(self, outputs: Sequence[TensorInfo], metadata: Mapping[str, str]) -> Layout:
         size = self._size or (480, 640)
-        names = [output.name for output in header.outputs]
+        names = [output.name for output in outputs]
         available = {str(name) for name in self._net.getUnconnectedOutLayersNames()}
-        if set(names) <= available and all(None not in output.shape and output.shape for output in header.outputs):
-            return detect_layout(header.outputs, header.metadata, size, str(self.path))
         if not set(names) <= available:  # older OpenCV names outputs by their layers
             names = sorted(available)
-        grey = np.full((*size, 3), PAD, np.uint8)
-        self.layout = Layout("semantic", tuple(names), {})  # only for the scaling of this image
-        shapes = [value.shape for value in self._forward(grey, names)]
-        outputs = tuple(TensorInfo(name, tuple(shape)) for name, shape in zip(names, shapes, strict=True))
-        return detect_layout(outputs, header.metadata, size, str(self.path))
+        if names != [output.name for output in outputs if output.shape and None not in output.shape]:
+            grey = np.full((*size, 3), PAD, np.uint8)
+            self.layout = Layout("semantic", tuple(names), {})  # only for the scaling of this image
+            values = self._forward(grey, names)
+            outputs = [TensorInfo(name, value.shape) for name, value in zip(names, values, strict=True)]
+        return detect_layout(outputs, metadata, size, str(self.path))
 
     def _forward(self, image: NDArray[np.uint8], names: list[str]) -> list[NDArray[np.float32]]:
         scaling: str = self.settings.onnx_normalisation
@@ -175,15 +174,15 @@ def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> 
     return canvas, place
 
 
-def _input_size(header: OnnxHeader, path: Path) -> tuple[int, int] | None:
-    if len(header.inputs) != 1:
+def _input_size(inputs: Sequence[TensorInfo], path: Path) -> tuple[int, int] | None:
+    if len(inputs) != 1:
         raise SegmentationError(
-            f"{path} has {len(header.inputs)} inputs: {'; '.join(map(str, header.inputs))}",
+            f"{path} has {len(inputs)} inputs: {'; '.join(map(str, inputs))}",
             "a segmentation network takes one image",
         )
-    shape = header.inputs[0].shape
+    shape = inputs[0].shape
     if len(shape) != 4 or shape[1] not in (3, None) or shape[0] not in (1, None):
-        raise SegmentationError(f"{path}: the input {header.inputs[0]} is no image", "expected 1x3xHxW")
+        raise SegmentationError(f"{path}: the input {inputs[0]} is no image", "expected 1x3xHxW")
     height, width = shape[2:]
     return None if height is None or width is None else (height, width)
 
@@ -232,14 +231,18 @@ def detect_layout(
     rank4 = [output for output in outputs if len(output.shape) == 4 and None not in output.shape[1:]]
     if rank3 and rank4 and (yolo := _yolo(rank3[0], rank4[-1], names)):
         return yolo
+    reason = "no known layout fits"
     if rank4 and not rank3:
-        full = max(rank4, key=lambda output: (output is rank4[0], math.prod(s or 1 for s in output.shape[1:])))
-        classes = int(full.shape[1] or 0)
+        classes = int(rank4[0].shape[1] or 0)
         labels = names or _SEMANTIC_NAMES.get(classes)
         if labels is not None and classes >= 2:
-            return Layout("semantic", (full.name,), labels, aligned=_aligned(full.shape[2:], size))
-        raise _unknown(outputs, where, f"{classes} semantic classes without names in the file's metadata")
-    raise _unknown(outputs, where, "no known layout fits")
+            return Layout("semantic", (rank4[0].name,), labels, aligned=_aligned(rank4[0].shape[2:], size))
+        reason = f"{classes} semantic classes without names in the file's metadata"
+    raise SegmentationError(
+        f"{where}: the network's outputs are not understood ({reason}): {'; '.join(map(str, outputs)) or 'none'}",
+        "known: YOLO-seg [1, 4+C+M, N] with [1, M, h, w], semantic logits [1, C, h, w], "
+        "or boxes, labels, scores, masks as torchvision exports them",
+    )
 
 
 def _yolo(detections: TensorInfo, prototypes: TensorInfo, names: dict[int, str] | None) -> Layout | None:
@@ -270,14 +273,6 @@ def _metadata_names(metadata: Mapping[str, str], where: str) -> dict[int, str] |
         value = ast.literal_eval(metadata["names"])
         pairs = value.items() if isinstance(value, dict) else enumerate(value)
         return {int(number): str(name) for number, name in pairs}
-
-
-def _unknown(outputs: Sequence[TensorInfo], where: str, reason: str) -> SegmentationError:
-    return SegmentationError(
-        f"{where}: the network's outputs are not understood ({reason}): {'; '.join(map(str, outputs)) or 'none'}",
-        "known: YOLO-seg [1, 4+C+M, N] with [1, M, h, w], semantic logits [1, C, h, w], "
-        "or boxes, labels, scores, masks as torchvision exports them",
-    )
 
 
 def decode(
@@ -487,17 +482,8 @@ class TensorInfo:
         return f"{self.name} {'x'.join('?' if size is None else str(size) for size in self.shape) or 'scalar'}"
 
 
-@dataclass(frozen=True)
-class OnnxHeader:
-    """Inputs, outputs and metadata that a file declares."""
-
-    inputs: tuple[TensorInfo, ...]
-    outputs: tuple[TensorInfo, ...]
-    metadata: dict[str, str]
-
-
-def read_header(path: Path) -> OnnxHeader:
-    """Decode the header of an ONNX file.
+def read_header(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], dict[str, str]]:
+    """The inputs, outputs and metadata that an ONNX file declares.
 
     Raises:
         SegmentationError: The file is missing, truncated or no ONNX model.
@@ -513,12 +499,12 @@ def read_header(path: Path) -> OnnxHeader:
         model = _fields(memoryview(data))
         graph = _message(model, 7)
         initialised = {_text(_fields(tensor), 8) for tensor in graph.get(5, ())}
-        inputs, outputs = (tuple(_tensor(_fields(value)) for value in graph.get(number, ())) for number in (11, 12))
-        inputs = tuple(tensor for tensor in inputs if tensor.name not in initialised)
+        declared, outputs = ([_tensor(_fields(value)) for value in graph.get(number, ())] for number in (11, 12))
+        inputs = [tensor for tensor in declared if tensor.name not in initialised]
         metadata = {_text(entry, 1): _text(entry, 2) for entry in map(_fields, model.get(14, ()))}
         if not inputs or not outputs:
             raise ValueError(f"it declares {len(inputs)} inputs and {len(outputs)} outputs")
-    return OnnxHeader(inputs, outputs, metadata)
+    return inputs, outputs, metadata
 
 
 def _tensor(value: Fields) -> TensorInfo:

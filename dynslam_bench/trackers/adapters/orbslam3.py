@@ -9,8 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dynslam_bench.contracts import TrackerContext
 from dynslam_bench.core import MEGABYTE, TrackerError, raising, read_bytes, vocabularies_folder, write_atomic
 from dynslam_bench.core.plugins import module_command
@@ -74,21 +72,12 @@ def _prepared(path: Path, size: int, modified_ns: int) -> Path:
         TrackerError,
         f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file",
         HINT,
-        of=(lzma.LZMAError, EOFError, ValueError),
+        of=lzma.LZMAError,
     ):
-        text = _unpack(packed)
+        text = lzma.decompress(packed, format=lzma.FORMAT_XZ, memlimit=MAX_MEMORY)
     _check(text, path)
     write_atomic(target, text)
     return target
-
-
-def _unpack(packed: bytes) -> bytes:
-    """The content of an .xz file; ValueError for one that unpacks to far more than a vocabulary."""
-    reader = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=MAX_MEMORY)
-    text = reader.decompress(packed, max_length=MAX_BYTES)
-    if not reader.eof:
-        raise ValueError(f"it is truncated, or unpacks to more than {MAX_BYTES >> 20} MB")
-    return text
 
 
 def _check(text: bytes, path: Path) -> None:
@@ -110,8 +99,7 @@ def _check(text: bytes, path: Path) -> None:
             f"orbslam3: {path} is no ORB vocabulary: line 1 is '{shown}', not '<branching> <depth> <score> <weight>'",
             HINT,
         )
-    fault = _first_fault(text.rstrip().splitlines()[1:])
-    if fault:
+    if fault := _first_fault(text.rstrip().splitlines()[1:]):
         raise TrackerError(f"orbslam3: the vocabulary {path} ({len(lines)} lines) is damaged: {fault}", HINT)
 
 
@@ -162,17 +150,13 @@ class OrbSlam3Program(ProgramTracker):
         self.settings, self._vocabulary = settings, find_vocabulary(settings.vocabulary)
         super().__init__("orbslam3", settings, context, module_command(WORKER))
 
-    def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
-        """Write its settings file from the camera, start it and load the vocabulary.
+    def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
+        """Paths of the vocabulary and of the settings file, which is written here.
 
         Raises:
-            TrackerError: ORB-SLAM3 cannot take the camera, or does not start; names its last message.
+            TrackerError: ORB-SLAM3 cannot take the camera.
         """
         check_camera(camera, self.settings)
-        super().reset(camera, rng=rng)
-
-    def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
-        """Paths of the vocabulary and of the settings file, which is written here."""
         path = folder / "settings.yaml"
         path.write_text(settings_yaml(camera, self.settings, self.context.fps))
         return {"vocabulary": str(self._vocabulary), "settings_file": str(path), "sensor": self.sensor}

@@ -78,13 +78,8 @@ class Worker:
         return self._final
 
 
-def main() -> None:
-    """Serve one parent, then leave without ORB-SLAM3's destructors, which may wait for its threads for ever."""
+if __name__ == "__main__":
     worker = Worker()
     serve(worker.reset, worker.track, worker.finalize)
     sys.stderr.flush()
-    os._exit(0)
-
-
-if __name__ == "__main__":
-    main()
+    os._exit(0)  # without ORB-SLAM3's destructors, which may wait for its threads for ever

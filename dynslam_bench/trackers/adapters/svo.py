@@ -97,11 +97,6 @@ def pose_of(T_cam_world: Any) -> NDArray[np.float64]:
     return se3.inverse(inverse)
 
 
-def main() -> None:
-    """Serve one parent."""
+if __name__ == "__main__":
     worker = Worker()
     serve(worker.reset, worker.track)
-
-
-if __name__ == "__main__":
-    main()

@@ -42,41 +42,37 @@ VOTE: Groups = {"segmentation": ObjectSettings(), "epipolar": EpipolarSettings(m
 """Without mask culling: the epipolar vote of its points decides on an object (`EpipolarFilter`)."""
 PAPER: Groups = {"flow": DenseFlowSettings(terms=3), "epipolar": UNGUARDED}
 """The paper's flow, dense and with all terms, and its test on every frame, without the guard."""
-WHOSE = (
-    "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; ours are the flow at the "
-    "points alone without aggregated costs, the conditions under which the epipolar test may cull, and the tests of "
-    "motion and free space in depth"
-)
-SKIPPED = "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"
-SENSOR = "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)"
-NOT_STATED = "epipolar threshold 1 px and RANSAC (not stated in the paper)"
-GUARDS = "a failing point goes only where its neighbours fail too, and an F that depth contradicts is not used (ours)"
-GUARD_WITHOUT_DEPTH = "a failing point goes only where its neighbours fail too (ours)"
-SPARSE = "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; no Eq. 2 and 3 (ours)"
-DENSE = (
-    "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, 7 and 2 grey levels",
-    "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried on every pixel of the region "
-    "(as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the smoothing by regions are ours)",
-)
-DEPTH_TESTS = "rigid motion in depth and free space seen before are tested as well (ours, no part of the paper)"
 
 
 def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[str]:
     masks, monocular, tested = base is not SystemSettings, base is MonocularSemanticSettings, "epipolar" in groups
     paper, sparse = name.startswith("emfoa-oft-paper"), isinstance(groups.get("flow"), FlowSettings)
-    sentences: list[tuple[bool, tuple[str, ...]]] = [
-        (name == "emfoa-oft", (WHOSE,)),
-        (masks, ("{masks}", CFPN)),
-        (masks and "segmentation" not in groups, ("{dilation}",)),
-        (tested, (NOT_STATED,)),
-        (not monocular, (SENSOR,)),
-        (sparse, (SPARSE,)),
-        (paper and not sparse, DENSE),
-        (tested and not paper, (SKIPPED, GUARD_WITHOUT_DEPTH if monocular else GUARDS)),
-        ("motion" in groups, (DEPTH_TESTS,)),
-        (monocular, (BACKEND,)),
-    ]
-    return [sentence for holds, stated in sentences if holds for sentence in stated]
+    guarded = tested and not paper
+    sentences: list[tuple[bool, str]] = [
+        (name == "emfoa-oft", "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; "
+         "ours are the flow at the points alone without aggregated costs, the conditions under which the epipolar test "
+         "may cull, and the tests of motion and free space in depth"),
+        (masks, "{masks}"),
+        (masks, CFPN),
+        (masks and "segmentation" not in groups, "{dilation}"),
+        (tested, "epipolar threshold 1 px and RANSAC (not stated in the paper)"),
+        (not monocular, "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)"),
+        (sparse, "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; "
+         "no Eq. 2 and 3 (ours)"),
+        (paper and not sparse, "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, "
+         "7 and 2 grey levels"),
+        (paper and not sparse, "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried "
+         "on every pixel of the region (as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the "
+         "smoothing by regions are ours)"),
+        (guarded, "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"),
+        (guarded and monocular, "a failing point goes only where its neighbours fail too (ours)"),
+        (guarded and not monocular, "a failing point goes only where its neighbours fail too, and an F that depth "
+         "contradicts is not used (ours)"),
+        ("motion" in groups, "rigid motion in depth and free space seen before are tested as well "
+         "(ours, no part of the paper)"),
+        (monocular, BACKEND),
+    ]  # fmt: skip
+    return [sentence for holds, sentence in sentences if holds]
 
 
 def _spec(name: str, label: str, base: type[SystemSettings], groups: Groups, summary: str, **more: Any) -> TrackerSpec:
