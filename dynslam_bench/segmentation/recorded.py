@@ -1,10 +1,9 @@
 """Masks that no network computes here: read from PNG files, written to them, or exact masks of the sequence."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -99,7 +98,8 @@ class RecordedSegmenter:
             raise SegmentationError(
                 f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
             )
-        return _objects(labels[:, :, 0], self._names, str(path))[0]
+        instances = instances_of(FrameMasks(labels[:, :, 0], self._names, frozenset()), where=str(path))
+        return replace(instances, moving=None)
 
     def missing(self, timestamps: NDArray[np.float64]) -> list[int]:
         """Indices of the frames that have no file.
@@ -115,21 +115,6 @@ class RecordedSegmenter:
         distance = np.abs(self._keys - key)
         nearest = int(np.argmin(distance))
         return nearest, float(distance[nearest])
-
-
-def _objects(labels: NDArray[Any], names: Mapping[int, str], where: str) -> tuple[Instances, list[int]]:
-    """The objects of a label image in order of their numbers, with exact boxes and score 1; and the numbers.
-
-    Raises:
-        SegmentationError: A number in the image has no class name.
-    """
-    numbers = [int(number) for number in np.unique(labels) if number != 0]
-    if nameless := [number for number in numbers if number not in names]:
-        named = ", ".join(map(str, sorted(names))) or "none"
-        raise SegmentationError(f"{where}: object {nameless[0]} has no class name", f"known numbers: {named}")
-    masks = np.asarray(labels[None] == np.array(numbers, labels.dtype)[:, None, None])
-    classes = tuple(names[number] for number in numbers)
-    return Instances(masks, boxes_of(masks), classes, np.ones(len(numbers), np.float32)), numbers
 
 
 def read_classes(path: Path) -> dict[int, str]:
@@ -252,8 +237,15 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
     Raises:
         SegmentationError: An id in the image has no class name.
     """
-    instances, numbers = _objects(np.asarray(masks.instances), masks.class_names, where)
-    return replace(instances, moving=np.array([number in masks.moving for number in numbers], dtype=bool))
+    labels, names = np.asarray(masks.instances), masks.class_names
+    numbers = [int(number) for number in np.unique(labels) if number != 0]
+    if nameless := [number for number in numbers if number not in names]:
+        named = ", ".join(map(str, sorted(names))) or "none"
+        raise SegmentationError(f"{where}: object {nameless[0]} has no class name", f"known numbers: {named}")
+    stack = np.asarray(labels[None] == np.array(numbers, labels.dtype)[:, None, None])
+    classes = tuple(names[number] for number in numbers)
+    moving = np.array([number in masks.moving for number in numbers], dtype=bool)
+    return Instances(stack, boxes_of(stack), classes, np.ones(len(numbers), np.float32), moving)
 
 
 class OracleSegmenter:

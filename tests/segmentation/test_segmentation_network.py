@@ -321,13 +321,6 @@ def test_it_finds_people_of_a_held_out_instance(tmp_path):
     assert np.array_equal(found.masks, again.masks) and np.array_equal(found.scores, again.scores)
 
 
-@pytest.mark.parametrize("shape", [(480, 640, 3), (97, 211, 3)])
-def test_nobody_there(shape):
-    segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz")
-    found = segmenter.segment(Frame(0, 0.0, np.full(shape, 128, np.uint8), np.zeros(shape[:2], np.float32)))
-    assert found.masks.shape == (0, *shape[:2])
-
-
 # Whole models against torchvision's own, on random weights; skipped where torchvision cannot be imported.
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import subprocess
 import sys
 import threading
 import time
@@ -767,28 +766,6 @@ def test_beside_tracking_nothing_comes_from_the_stage_cache(tmp_path):
             feed(stage, index)
         stage.reset()
     assert network.calls == [0, 1, 4, 1, 4], "the first frame is segmented before it is tracked, and stored"
-
-
-def test_a_process_waits_at_its_end_for_the_segmenter_beside_tracking():
-    code = """
-import threading
-import time
-import numpy as np
-from dynslam_bench.contracts import Frame, Instances
-from dynslam_bench.segmentation.schedule import MaskScheduler
-from dynslam_bench.segmentation.settings import SegmentationSettings
-class Slow:
-    def segment(self, frame):
-        time.sleep(0.3 * frame.index)
-        print(frame.index)
-        return Instances.empty(60, 80)
-stage = MaskScheduler(SegmentationSettings(schedule="async"), Slow())
-for index in range(2):
-    frame = Frame(index, index / 30, np.zeros((60, 80, 3), np.uint8), np.zeros((60, 80), np.float32))
-    stage.masks_for(frame, frame.rgb[:, :, 0], keyframe=False)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "0\n1\n"), done.stderr
 
 
 @pytest.mark.parametrize("end", ["masks are taken", "settle", "reset", "configure", "a copy's settle"])

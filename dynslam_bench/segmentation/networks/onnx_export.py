@@ -216,9 +216,8 @@ class StaticMaskRCNN(nn.Module):
 
     def _pooled(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         """RoIAlign ``[K, C, size, size]`` of one image's boxes; see `roi_align`."""
-        return torch.cat([self._pooled_chunk(levels, chunk, size, canonical) for chunk in torch.split(boxes, CHUNK)])
-
-    def _pooled_chunk(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
+        if len(boxes) > CHUNK:
+            return torch.cat([self._pooled(levels, chunk, size, canonical) for chunk in torch.split(boxes, CHUNK)])
         count, channels = len(boxes), levels[0].shape[1]
         side = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)  # padding may be empty
         level = levels_of(torch.cat([boxes[:, :2], boxes[:, :2] + side], dim=1), canonical, len(levels))

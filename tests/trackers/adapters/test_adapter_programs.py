@@ -265,23 +265,6 @@ def test_faults_become_one_line(program, fault):
     assert tracker.track(frame(0)).state == "ok", "a reset starts the program again"
 
 
-def test_a_second_answer_is_never_taken_for_the_next_frame(program):
-    """However late it comes, it is seen before the next pose is believed."""
-    for pause in ("", "time.sleep(0.2);"):
-        tracker = reset(
-            program(f"""
-            for request in requests:
-                say({{"state": "ok", "T_world_cam": STILL}})
-                if request["op"] == "track":
-                    {pause} say({{"state": "ok", "T_world_cam": STILL}})
-            """)
-        )
-        with pytest.raises(TrackerError, match="answered index 0"):
-            for index in range(3):
-                tracker.track(frame(index))
-        tracker.close()
-
-
 def test_refusals_at_reset(program):
     with pytest.raises(TrackerError, match="at reset: fisheye cameras only"):
         reset(program("next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)", close_timeout_s=0.1))
@@ -543,10 +526,7 @@ def test_the_record_and_the_board_say_that_only_the_final_trajectory_exists(toml
 ROWS = {
     "no file": ("print('loading'); sys.exit('no licence')", "crashed", "exit code 1, and wrote no .*'no licence'"),
     "half a file": ("write([[row[0], 0] for row in rows[:3]]); print('lost')", "lost", "tracked on 3 of 12.*'lost'"),
-    "no stamps": ("write(rows, '1 0 0 0 0 1 0 0 0 0 1 0'); print('bye')", "crashed", "line 1.*'bye'"),
-    "another clock": ("write([[9e5 + i, 0] for i in range(12)]); print('bye')", "crashed", "stamps from 900000.*'bye'"),
     "never ends": ("print('frame 3', flush=True); time.sleep(60)", "timeout", "not done within 2 s.*'frame 3'"),
-    "needs a display": ("sys.exit('Failed to open X display')", "crashed", "'Failed to open X display'.*xvfb-run"),
 }
 
 
@@ -577,11 +557,6 @@ def test_the_conformance_kit_checks_the_final_trajectory(toml, tmp_path, inverte
     assert [check.name for check in report.failed] == ["camera to world"] * inverted, report.checks
     assert statuses["results"] == statuses["final trajectory"] == statuses["two resets"] == "passed"
     assert statuses["one frame"] == "skipped"
-
-
-def test_the_conformance_kit_names_what_a_program_does_wrong(toml):
-    report = isolated_tracker_report(f"batch:{toml('sys.exit(7)')}", frames=4)
-    assert [check.name for check in report.failed] == ["results"] and "exit code 7" in report.failed[0].message
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)

@@ -8,9 +8,11 @@ import cv2
 import numpy as np
 import pytest
 from envs_play import play
-from quick_dense import QUICK_DENSE, quick
+from quick_dense import quick
 from reports_fake_store import add_run
 from scenes import ACROSS, BOX, SIDEWAYS, Scene, box_instance, on_rectangle, scene
+from steering_scene import SmallScene, construct
+from steering_scene import play as play_small
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.tracker import TrackResult
@@ -198,7 +200,6 @@ def test_masks_are_grown_and_repaired_only_where_the_system_does_it(name: str) -
 
 @pytest.mark.parametrize(("name", "terms"), [("emfoa-oft", 1), ("emfoa-oft-paper", 3)])
 def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch, name: str, terms: int) -> None:
-    sequence = open_sequence("synthetic/walking_xyz?frames=9")
     calls: list[bool] = []
     chosen = dense.aggregate_and_choose
 
@@ -207,11 +208,9 @@ def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch, 
         chosen(*arguments)
 
     monkeypatch.setattr(dense, "aggregate_and_choose", spy)
-    quick = QUICK_DENSE | {"flow.second_round": True} if terms == 3 else {}
-    context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks)
-    tracker = build_tracker(name, {"segmentation.source": "oracle", **quick}, context)
-    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
-    stats = [tracker.track(sequence[index]).stats for index in range(2)][1]
+    small = SmallScene(frames=2)
+    rounds = {"flow.second_round": True} if terms == 3 else {}
+    stats = list(play_small(construct(TRACKERS.get(name), small, **rounds), small))[1].stats
     assert stats["flow_valid"] > 100 and stats["epipolar_f_asked"] == 1
     assert terms == 1 or stats["epipolar_f_judged"] == 1, "the paper knows no guard"
     assert calls == [True] * (4 if terms == 3 else 0)  # there and back, two rounds
