@@ -53,9 +53,8 @@ def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     A pixel is set if a set pixel lies within `radius` of it (Euclidean distance between pixel centres). For radius 15,
     DynaSLAM's 31 x 31 ellipse approximates this disc.
     """
-    if radius <= 0:
-        return mask
-    if (part := region(mask, radius + 1)) is None:
+    part = region(mask, radius + 1)
+    if radius <= 0 or part is None:
         return mask
     grown = mask.copy()
     distance = cv2.distanceTransform((~mask[part]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -93,7 +94,7 @@ class RecordedSegmenter:
             flags=cv2.IMREAD_UNCHANGED,
             kind=SegmentationError,
         )
-        labels = np.atleast_3d(image)
+        labels: NDArray[Any] = np.atleast_3d(image)
         if (labels[:, :, :3] != labels[:, :, :1]).any():
             raise SegmentationError(
                 f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"

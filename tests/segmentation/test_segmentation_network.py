@@ -236,7 +236,8 @@ def test_foreign_checkpoints_say_what_is_wrong(tmp_path):
     )
     refused({**good, "extra.weight": torch.zeros(1)}, "1 keys are unknown (extra.weight)")
     refused(
-        {**good, "rpn.head.bbox_pred.bias": torch.zeros(8)}, "1 shapes differ (rpn.head.bbox_pred.bias 8 instead of 12)"
+        {**good, "rpn.head.bbox_pred.bias": torch.zeros(8)},
+        "1 shapes differ (rpn.head.bbox_pred.bias [8] instead of [12])",
     )
     refused({**good, "rpn.head.bbox_pred.bias": torch.full((12,), float("nan"))}, "rpn.head.bbox_pred.bias holds NaN")
     refused({"fc.weight": torch.zeros(3, 3)}, "is no Mask R-CNN", "backbone.body.conv1.weight is missing")

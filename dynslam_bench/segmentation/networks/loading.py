@@ -189,7 +189,7 @@ def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> No
     missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
     unknown = [key for key in state if key not in own]
     shapes = [
-        f"{key} {_shape(state[key])} instead of {_shape(own[key])}"
+        f"{key} {list(state[key].shape)} instead of {list(own[key].shape)}"
         for key in own
         if key in state and state[key].shape != own[key].shape
     ]
@@ -221,7 +221,3 @@ def _some(keys: Iterable[str]) -> str:
     listed = list(keys)
     more = f", and {len(listed) - KEYS_SHOWN} more" if len(listed) > KEYS_SHOWN else ""
     return ", ".join(listed[:KEYS_SHOWN]) + more
-
-
-def _shape(value: Tensor) -> str:
-    return "x".join(map(str, value.shape)) or "scalar"

@@ -18,25 +18,19 @@ from torch.nn import functional
 
 from dynslam_bench.segmentation.networks.backbone import Backbone, NetworkConfig, initialise
 
-MEAN = (0.485, 0.456, 0.406)
-DEVIATION = (0.229, 0.224, 0.225)
 MIN_PROPOSAL_PX = 1e-3
 BOX_POOL = 7
 SAMPLES = 2
 """Sampling points a side of a bin of `roi_align`."""
 MIN_BOX_PX = 1e-2
-POSITIVE_SHARE = 0.25
 
 
 def anchor_cells(config: NetworkConfig) -> list[Tensor]:
     """Anchors ``[A, 4]`` of each level around the origin, rounded to pixels as the published models have them."""
     ratios = torch.tensor(config.anchor_ratios, device="cpu")
     heights, widths = ratios.sqrt(), 1 / ratios.sqrt()
-    cells = []
-    for size in config.anchor_sizes:
-        half = torch.stack([widths * size, heights * size], dim=1)
-        cells.append(torch.cat([-half, half], dim=1).div(2).round())
-    return cells
+    sides = [torch.stack([widths * size, heights * size], dim=1) for size in config.anchor_sizes]
+    return [torch.cat([-side, side], dim=1).div(2).round() for side in sides]
 
 
 def anchors_of(cells: list[Tensor], levels: list[Tensor], height: int, width: int) -> list[Tensor]:
@@ -65,12 +59,9 @@ class RPNHead(nn.Module):
 
     def forward(self, levels: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Objectness logits ``[B, H W A]`` and codes ``[B, H W A, 4]`` of each level, in the anchors' order."""
-        scores, codes = [], []
-        for level in levels:
-            x = self.conv(level)
-            batch = x.shape[0]
-            scores.append(self.cls_logits(x).permute(0, 2, 3, 1).reshape(batch, -1))
-            codes.append(self.bbox_pred(x).permute(0, 2, 3, 1).reshape(batch, -1, 4))
+        maps = [self.conv(level) for level in levels]
+        scores = [self.cls_logits(x).permute(0, 2, 3, 1).reshape(x.shape[0], -1) for x in maps]
+        codes = [self.bbox_pred(x).permute(0, 2, 3, 1).reshape(x.shape[0], -1, 4) for x in maps]
         return scores, codes
 
 
@@ -239,10 +230,14 @@ def _initialise(weight: Tensor) -> None:
 
 def box_head(config: NetworkConfig) -> nn.Sequential:
     """Two fully connected layers on the pooled features of a box: ``[K, C, 7, 7]`` to ``[K, hidden]``."""
-    fc6 = nn.Linear(config.channels * BOX_POOL**2, config.box_hidden)
-    fc7 = nn.Linear(config.box_hidden, config.box_hidden)
-    layers = {"flatten": nn.Flatten(), "fc6": fc6, "relu6": nn.ReLU(), "fc7": fc7, "relu7": nn.ReLU()}
-    return nn.Sequential(OrderedDict(layers))
+    layers = OrderedDict[str, nn.Module](
+        flatten=nn.Flatten(),
+        fc6=nn.Linear(config.channels * BOX_POOL**2, config.box_hidden),
+        relu6=nn.ReLU(),
+        fc7=nn.Linear(config.box_hidden, config.box_hidden),
+        relu7=nn.ReLU(),
+    )
+    return nn.Sequential(layers)
 
 
 class BoxPredictor(nn.Module):
@@ -361,7 +356,7 @@ class RoIHeads(nn.Module):
         for proposal, truth, label, mask in zip(proposals, truths, labels, masks, strict=True):
             candidates = torch.cat([proposal, truth])
             matched = match(candidates, truth, high=0.5, low=0.5, keep_best=False)
-            positive, negative = sample(matched, count=per_image, positive_share=POSITIVE_SHARE, generator=generator)
+            positive, negative = sample(matched, count=per_image, positive_share=0.25, generator=generator)
             hits, boxes = matched[positive], candidates[positive]
             rois.append(torch.cat([boxes, candidates[negative]]))
             classes.append(torch.cat([label[hits], label.new_zeros(len(negative))]))
@@ -500,8 +495,9 @@ class MaskRCNN(nn.Module):
 
 def normalise(images: Tensor) -> Tensor:
     """Subtract ImageNet's mean and divide by its deviation, ``[B, 3, H, W]``."""
-    mean = images.new_tensor(MEAN).reshape(1, 3, 1, 1)
-    return (images - mean) / images.new_tensor(DEVIATION).reshape(1, 3, 1, 1)
+    statistics = images.new_tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]])
+    mean, deviation = statistics.reshape(2, 1, 3, 1, 1).unbind(dim=0)
+    return (images - mean) / deviation
 
 
 @torch.no_grad()

@@ -337,7 +337,9 @@ def open_labelled(text: str) -> LabelledImages:
         SegmentationError: Another form, or the set does not exist.
     """
     kind, _, rest = text.partition(":")
-    kinds = {"synthetic": rendered_frames, "sequence": sequence_frames, "coco": coco_images, "yolo": yolo_images}
+    kinds: dict[str, Callable[[str], LabelledImages]] = {
+        "synthetic": rendered_frames, "sequence": sequence_frames, "coco": coco_images, "yolo": yolo_images,
+    }  # fmt: skip
     if kind in kinds and (rest or kind == "synthetic"):
         return kinds[kind](rest)
     raise SegmentationError(

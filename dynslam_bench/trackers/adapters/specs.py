@@ -253,60 +253,6 @@ NEVER_MOVE = TrackerSpec(
     remarks="Its error is the spread of the ground truth; a tracker above it is worse than none.",
 )
 
-CONSTANT_VELOCITY = TrackerSpec(
-    id="constant-velocity",
-    entry_point=f"{_HERE}.controls:ConstantVelocity",
-    label="constant velocity",
-    settings=ConstantVelocitySettings,
-    summary="Control: measures the camera's velocity over the first frames, then only extrapolates it.",
-    provenance="control",
-    ranked=False,
-    license="MIT",
-    remarks="The motion model of a SLAM system without its measurements; drifts without bound.",
-)
-
-REPLAY = TrackerSpec(
-    id="replay",
-    entry_point=f"{_HERE}.controls:Replay",
-    label="replay",
-    settings=ReplaySettings,
-    summary="Gives each frame its pose in a trajectory file (TUM format): replay:FILE.",
-    provenance="external",
-    parameter="file",
-    remarks="A frame without a pose within the tolerance is lost; frame times mean nothing.",
-)
-
-SUBPROCESS = TrackerSpec(
-    id="subprocess",
-    entry_point=f"{_HERE}.subprocess_tracker:build",
-    label="program",
-    settings=SubprocessSettings,
-    summary="A tracker in a program of its own, in any language, over JSON lines: subprocess:COMMAND.",
-    deterministic=False,
-    provenance="external",
-    parameter="command",
-    files=f"{_HERE}.subprocess_tracker:files",
-    remarks=(
-        "The program, its libraries, the files and folders among its arguments and what scripts and configurations "
-        "name are part of a run's identity; change the setting `version` when something else that it opens has changed."
-    ),
-)
-
-BATCH = TrackerSpec(
-    id="batch",
-    entry_point=f"{_HERE}.batch:BatchTracker",
-    label="batch program",
-    settings=BatchSettings,
-    summary="A program that reads a sequence folder and writes a trajectory at its end: batch:FILE.toml.",
-    deterministic=False,
-    provenance="external",
-    parameter="program",
-    files=f"{_HERE}.batch:files",
-    online=False,
-    describe=f"{_HERE}.batch:describe",
-    remarks="Only its final trajectory exists. The time of a frame is the program's whole time over the frames.",
-)
-
 ORBSLAM3 = TrackerSpec(
     id="orbslam3",
     entry_point=f"{_HERE}.orbslam3:OrbSlam3",
@@ -330,67 +276,119 @@ ORBSLAM3 = TrackerSpec(
     ),
 )
 
-ORBSLAM3_MONO = replace(
-    ORBSLAM3,
-    id="orbslam3-mono",
-    entry_point=f"{_HERE}.orbslam3:OrbSlam3Monocular",
-    label="ORB-SLAM3, monocular",
-    summary="The real ORB-SLAM3 in its monocular mode, untouched, in a process of its own.",
-    sensors="rgb",
-    remarks=(
-        "Assumes a static world. Its scale is free, and another after each loss that begins a new map; its poses are "
-        "taken as they come, and it saves none of single frames at the end. Threads and vocabulary: see orbslam3."
-    ),
-)
-
-SVO = TrackerSpec(
-    id="svo",
-    entry_point=f"{_HERE}.svo:Svo",
-    label="SVO",
-    settings=SvoSettings,
-    summary="The real SVO (monocular, semi-direct), untouched, in a process of its own.",
-    presets={"handheld": {"init_disparity_px": 15.0, "max_lost_features": 200}},
-    sensors="rgb",
-    deterministic=False,
-    provenance="external",
-    license="GPL-3.0-or-later",
-    citation="C. Forster, M. Pizzoli, D. Scaramuzza, SVO: Fast semi-direct monocular visual odometry, ICRA 2014",
-    requires={"svo_cpp": "pip install --no-deps svo-cpp (Linux x86-64)"},
-    remarks=(
-        "Made for cameras that look down with a wide view. Assumes a static world, and after a loss only relocalises. "
-        "Its scale is free. Images are undistorted for it. Its package asks for a second OpenCV, which it never loads."
-    ),
-)
-
-OPENCV_ODOMETRY = TrackerSpec(
-    id="opencv-odometry",
-    entry_point=f"{_HERE}.odometry:OpenCvOdometry",
-    label="OpenCV RGB-D odometry",
-    settings=OpenCvOdometrySettings,
-    summary="OpenCV's dense frame-to-frame RGB-D odometry.",
-    provenance="external",
-    license="Apache-2.0",
-    citation="F. Steinbruecker, J. Sturm, D. Cremers, Real-time visual odometry from dense RGB-D images, ICCV-W 2011",
-    requires={"cv2": "pip install opencv-python-headless"},
-    check=f"{_HERE}.odometry:unavailable",
-    remarks="No map and no loop closing: it drifts. Assumes a static world.",
-)
-
-OPEN3D_ODOMETRY = TrackerSpec(
-    id="open3d-odometry",
-    entry_point=f"{_HERE}.odometry:Open3dOdometry",
-    label="Open3D RGB-D odometry",
-    settings=Open3dOdometrySettings,
-    summary="Open3D's dense multi-scale frame-to-frame RGB-D odometry.",
-    provenance="external",
-    license="MIT",
-    citation="Q.-Y. Zhou, J. Park, V. Koltun, Open3D: A modern library for 3D data processing, arXiv:1801.09847",
-    requires={"open3d": install_hint("open3d")},
-    remarks="No map and no loop closing: it drifts. Assumes a static world.",
-)
-
 ADAPTERS = (
-    NEVER_MOVE, CONSTANT_VELOCITY, REPLAY, SUBPROCESS, BATCH, ORBSLAM3, ORBSLAM3_MONO, SVO, OPENCV_ODOMETRY,
-    OPEN3D_ODOMETRY,
-)  # fmt: skip
+    NEVER_MOVE,
+    TrackerSpec(
+        id="constant-velocity",
+        entry_point=f"{_HERE}.controls:ConstantVelocity",
+        label="constant velocity",
+        settings=ConstantVelocitySettings,
+        summary="Control: measures the camera's velocity over the first frames, then only extrapolates it.",
+        provenance="control",
+        ranked=False,
+        license="MIT",
+        remarks="The motion model of a SLAM system without its measurements; drifts without bound.",
+    ),
+    TrackerSpec(
+        id="replay",
+        entry_point=f"{_HERE}.controls:Replay",
+        label="replay",
+        settings=ReplaySettings,
+        summary="Gives each frame its pose in a trajectory file (TUM format): replay:FILE.",
+        provenance="external",
+        parameter="file",
+        remarks="A frame without a pose within the tolerance is lost; frame times mean nothing.",
+    ),
+    TrackerSpec(
+        id="subprocess",
+        entry_point=f"{_HERE}.subprocess_tracker:build",
+        label="program",
+        settings=SubprocessSettings,
+        summary="A tracker in a program of its own, in any language, over JSON lines: subprocess:COMMAND.",
+        deterministic=False,
+        provenance="external",
+        parameter="command",
+        files=f"{_HERE}.subprocess_tracker:files",
+        remarks=(
+            "The program, its libraries, the files and folders among its arguments and what scripts and configurations "
+            "name are part of a run's identity; change the setting `version` when something else that it opens "
+            "has changed."
+        ),
+    ),
+    TrackerSpec(
+        id="batch",
+        entry_point=f"{_HERE}.batch:BatchTracker",
+        label="batch program",
+        settings=BatchSettings,
+        summary="A program that reads a sequence folder and writes a trajectory at its end: batch:FILE.toml.",
+        deterministic=False,
+        provenance="external",
+        parameter="program",
+        files=f"{_HERE}.batch:files",
+        online=False,
+        describe=f"{_HERE}.batch:describe",
+        remarks="Only its final trajectory exists. The time of a frame is the program's whole time over the frames.",
+    ),
+    ORBSLAM3,
+    replace(
+        ORBSLAM3,
+        id="orbslam3-mono",
+        entry_point=f"{_HERE}.orbslam3:OrbSlam3Monocular",
+        label="ORB-SLAM3, monocular",
+        summary="The real ORB-SLAM3 in its monocular mode, untouched, in a process of its own.",
+        sensors="rgb",
+        remarks=(
+            "Assumes a static world. Its scale is free, and another after each loss that begins a new map; its "
+            "poses are "
+            "taken as they come, and it saves none of single frames at the end. Threads and vocabulary: see orbslam3."
+        ),
+    ),
+    TrackerSpec(
+        id="svo",
+        entry_point=f"{_HERE}.svo:Svo",
+        label="SVO",
+        settings=SvoSettings,
+        summary="The real SVO (monocular, semi-direct), untouched, in a process of its own.",
+        presets={"handheld": {"init_disparity_px": 15.0, "max_lost_features": 200}},
+        sensors="rgb",
+        deterministic=False,
+        provenance="external",
+        license="GPL-3.0-or-later",
+        citation="C. Forster, M. Pizzoli, D. Scaramuzza, SVO: Fast semi-direct monocular visual odometry, ICRA 2014",
+        requires={"svo_cpp": "pip install --no-deps svo-cpp (Linux x86-64)"},
+        remarks=(
+            "Made for cameras that look down with a wide view. Assumes a static world, and after a loss only "
+            "relocalises. "
+            "Its scale is free. Images are undistorted for it. Its package asks for a second OpenCV, which it "
+            "never loads."
+        ),
+    ),
+    TrackerSpec(
+        id="opencv-odometry",
+        entry_point=f"{_HERE}.odometry:OpenCvOdometry",
+        label="OpenCV RGB-D odometry",
+        settings=OpenCvOdometrySettings,
+        summary="OpenCV's dense frame-to-frame RGB-D odometry.",
+        provenance="external",
+        license="Apache-2.0",
+        citation=(
+            "F. Steinbruecker, J. Sturm, D. Cremers, Real-time visual odometry from dense RGB-D images, ICCV-W 2011"
+        ),
+        requires={"cv2": "pip install opencv-python-headless"},
+        check=f"{_HERE}.odometry:unavailable",
+        remarks="No map and no loop closing: it drifts. Assumes a static world.",
+    ),
+    TrackerSpec(
+        id="open3d-odometry",
+        entry_point=f"{_HERE}.odometry:Open3dOdometry",
+        label="Open3D RGB-D odometry",
+        settings=Open3dOdometrySettings,
+        summary="Open3D's dense multi-scale frame-to-frame RGB-D odometry.",
+        provenance="external",
+        license="MIT",
+        citation="Q.-Y. Zhou, J. Park, V. Koltun, Open3D: A modern library for 3D data processing, arXiv:1801.09847",
+        requires={"open3d": install_hint("open3d")},
+        remarks="No map and no loop closing: it drifts. Assumes a static world.",
+    ),
+)
 """The control trackers and the adapters."""
