@@ -7,11 +7,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.ego_motion import depth_sigma
+from dynslam_bench.culling.ego_motion import NEAR, depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
-from dynslam_bench.culling.regions import NEAR
 from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
@@ -38,7 +37,6 @@ class CorrelationFilter(Rule[CorrelationSettings]):
 
     name = "correlation"
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "tracked", "settled", "edges", "cut", "components")
 
     def reset(self, camera: Camera | None = None) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
@@ -24,7 +24,6 @@ class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
 
     name = "depth_ransac"
     needs: frozenset[Need] = frozenset({"boxes", "depth"})
-    provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "objects", "in_boxes")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -83,7 +82,6 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
 
     name = "box_depth"
     needs: frozenset[Need] = frozenset({"boxes", "depth"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "objects", "ignored", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -133,7 +131,6 @@ class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
 
     name = "depth_blocks"
     needs: frozenset[Need] = frozenset({"masks", "depth"})
-    provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "objects", "touched", "blocks", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:

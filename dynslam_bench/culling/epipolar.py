@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Number, ObjectRule, Rule
-from dynslam_bench.culling.ego_motion import rigid_flow
-from dynslam_bench.culling.regions import NEAR, failing_regions
+from dynslam_bench.culling.ego_motion import NEAR, failing_regions, rigid_flow
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import (
     BoxEpipolarSettings,
@@ -140,7 +139,6 @@ class EpipolarFilter(Rule[EpipolarSettings]):
 
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
-    provenance: Provenance = "faithful-paper"
     stats_names = (
         *("dropped", "matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate"),
         *("moving_objects", "f_asked", "f_judged"),
@@ -257,7 +255,6 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
 
     name = "box_epipolar"
     needs: frozenset[Need] = frozenset({"flow", "boxes", "previous"})
-    provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "matches", "lost", "failed", "boxes", "f_asked", "f_judged")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -298,7 +295,6 @@ class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
 
     name = "class_rule"
     needs: frozenset[Need] = frozenset({"masks", "flow", "previous", "depth"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "on_people", "on_movable", "moving_objects", "lost", "f_asked", "f_judged")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -355,7 +351,6 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
 
     name = "moving_vote"
     needs: frozenset[Need] = frozenset({"masks", "previous"})
-    provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "corners", "moving", "votes", "f_asked", "f_judged")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:

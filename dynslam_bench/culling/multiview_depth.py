@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FlowResult, FrameBundle, KeyframeView, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FlowResult, FrameBundle, KeyframeView, Need
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
@@ -35,7 +35,6 @@ class MultiViewFilter(Rule[MultiViewSettings]):
 
     name = "multiview"
     needs: frozenset[Need] = frozenset({"keyframes", "prediction", "depth"})
-    provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "references", "seeds", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.orb import EDGE, level_quotas, spread
@@ -31,7 +31,6 @@ class ReseedingFilter(Rule[ReseedingSettings]):
 
     name = "reseeding"
     needs: frozenset[Need] = frozenset()
-    provenance: Provenance = "inspired"
     stats_names = ("static", "reseeded", "missing", "dropped")
 
     def __init__(self, settings: ReseedingSettings, features: FeatureSettings) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
@@ -29,7 +29,6 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
 
     name = "residual"
     needs: frozenset[Need] = frozenset({"depth", "previous", "prediction", "masks"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "clusters", "moving", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:

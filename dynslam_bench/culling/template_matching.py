@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
@@ -18,7 +18,6 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
 
     name = "template"
     needs: frozenset[Need] = frozenset({"boxes", "depth", "prediction", "previous"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "in_boxes", "tested", "median_zncc")
 
     def reset(self, camera: Camera | None = None) -> None:

@@ -135,7 +135,7 @@ class RgbdBackend:
         """
         begin = perf_counter()
         self._refined = None
-        observations = observe(frame, keep, weight, self.camera, self._features.scales)
+        observations = observe(frame, keep, weight, self.camera, self.world.scales)
         result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
         stages = {"tracking": perf_counter() - begin - sum(result.timings.values())}
         return replace(result, timings={**stages, "mapping": 0.0, "bundle_adjustment": 0.0, **result.timings})
@@ -168,7 +168,7 @@ class RgbdBackend:
             if first is not None and velocity is not None:
                 return self._restart(frame, raw, first, velocity, fit.count)
             result = self._update_map(frame, tracked, fit, root)
-        counts = {"matches": len(fit.matches), "inliers": fit.count, "relocalised": initial.relocalised}
+        counts = {"matches": len(fit.matches.feature), "inliers": fit.count, "relocalised": initial.relocalised}
         return replace(result, stats={**result.stats, **counts})
 
     def _initial_pose(
@@ -214,7 +214,7 @@ class RgbdBackend:
                 "make the map with the same features",
             )
         nothing = np.zeros(len(frame.xy))
-        none = observe(frame, nothing.astype(bool), nothing.astype(np.float32), self.camera, self._features.scales)
+        none = observe(frame, nothing.astype(bool), nothing.astype(np.float32), self.camera, self.world.scales)
         return TrackedFrame(none, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
     def _accept(self, frame: FrameBundle, observations: Observations, fit: MapFit, last: TrackedFrame) -> TrackedFrame:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.gauss_newton import apply_twist
@@ -72,6 +73,14 @@ def _transition(dt: float) -> Array:
     return np.eye(12) + dt * np.eye(12, k=6)
 
 
+@kernel
+def _rotated(rotation: Array, vector: Array) -> Array:
+    """A rotation matrix ``[3, 3]`` rotated further by a rotation vector ``[3]``, and kept orthonormal."""
+    pose, twist = np.eye(4), np.zeros(6)
+    pose[:3, :3], twist[3:] = rotation, vector
+    return apply_twist(pose, twist)[:3, :3]
+
+
 @dataclass(eq=False)
 class MotionState:
     """Pose, velocities and their covariance.
@@ -113,9 +122,7 @@ class MotionState:
 
     def moved(self, correction: Array, covariance: Array) -> MotionState:
         """The state after a correction ``[12]``."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.rotation
-        rotation = apply_twist(pose, np.append(np.zeros(3), correction[3:6]))[:3, :3]  # keeps it orthonormal
+        rotation = _rotated(self.rotation, correction[3:6])
         return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
 
     def transformed(self, rotation: Array, scale: float) -> MotionState:

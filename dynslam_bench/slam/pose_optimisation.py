@@ -42,19 +42,16 @@ class PoseEstimate:
     Attributes:
         T_cam_world: World-to-camera pose ``[4, 4]``.
         inliers: bool ``[N]``.
+        count: Number of inliers.
         residual_px: Median reprojection error of the inliers in pixels of octave 0; NaN without any.
         information: Gauss-Newton matrix ``[6, 6]`` of (translation, rotation) in the camera frame.
     """
 
     T_cam_world: Array
     inliers: NDArray[np.bool_]
+    count: int
     residual_px: float
     information: Array
-
-    @property
-    def count(self) -> int:
-        """Number of inliers."""
-        return int(np.count_nonzero(self.inliers))
 
 
 @kernel
@@ -223,10 +220,10 @@ def optimise_pose(
         The pose; with fewer than six points the start pose and no inliers.
     """
     if len(points) < 6:
-        return PoseEstimate(T_cam_world, np.zeros(len(points), bool), float("nan"), np.zeros((6, 6)))
+        return PoseEstimate(T_cam_world, np.zeros(len(points), bool), 0, np.nan, np.zeros((6, 6)))
     start = np.ascontiguousarray(T_cam_world, np.float64)
     points, uv, right, info, info_right = map(np.ascontiguousarray, (points, uv, right, info, info_right))
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m
     pose, inliers, error, h = _optimise(start, points, uv, right, info, info_right, *lens, rounds, iterations)
-    residual = float(np.median(error[inliers])) if inliers.any() else float("nan")
-    return PoseEstimate(pose, inliers, residual, h)
+    residual_px = float(np.median(error[inliers])) if inliers.any() else np.nan
+    return PoseEstimate(pose, inliers, int(np.count_nonzero(inliers)), residual_px, h)
