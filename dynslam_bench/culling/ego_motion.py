@@ -12,7 +12,7 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, twist_of
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point, twist_of
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -223,12 +223,9 @@ def _squared_errors(pose: Array, points: Array, pixels: Array, fx: float, fy: fl
     """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
     errors = np.full(len(points), np.inf)
     for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        x, y, z = moved_point(pose, points[i])
         if z > 0:
-            x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z
-            y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z
-            errors[i] = (fx * x + cx - pixels[i, 0]) ** 2 + (fy * y + cy - pixels[i, 1]) ** 2
+            errors[i] = (fx * (x / z) + cx - pixels[i, 0]) ** 2 + (fy * (y / z) + cy - pixels[i, 1]) ** 2
     return errors
 
 
@@ -241,12 +238,10 @@ def _linearise(
     hessian, gradient, total = np.zeros((6, 6)), np.zeros(6), 0.0
     j = np.zeros((2, 6))
     for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        x, y, z = moved_point(pose, points[i])
         if z <= NEAR_M:
             continue
-        x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z
-        y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z
+        x, y = x / z, y / z
         du, dv = fx * x + cx - pixels[i, 0], fy * y + cy - pixels[i, 1]
         weight = prior_weight[i] / (1 + (du * du + dv * dv) / (scale2 + shutter[i])) ** 2
         total += weight

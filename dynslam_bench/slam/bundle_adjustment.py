@@ -15,14 +15,9 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point
 from dynslam_bench.slam.map import Array, Map, Slots
-from dynslam_bench.slam.pose_optimisation import (
-    CHI2_DEPTH,
-    CHI2_MONO,
-    cauchy_width,
-    observation_chi2,
-)
+from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, cauchy_width, observation_chi2
 
 FIXED_KEYFRAMES = 6
 """Further keyframes that observe the same points and stay where they are."""
@@ -119,14 +114,10 @@ def _step(
             weight = 1.0 / (1.0 + chi2[k] / width)
             c = obs_pose[k]
             r = poses[c]
-            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-            xc = r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + r[0, 3]
-            yc = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]
-            zc = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + r[2, 3]
+            xc, yc, zc = moved_point(r, points[i])
             iz = 1.0 / zc
             a, d = fx * iz, fy * iz
             au, dv = -a * xc * iz, -d * yc * iz
-            rows = 3 if depth else 2
             u = fx * xc * iz + cx
             e[0] = uv[k, 0] - u
             e[1] = uv[k, 1] - (fy * yc * iz + cy)
@@ -136,10 +127,9 @@ def _step(
                 jl[0, m] = a * r[0, m] + au * r[2, m]
                 jl[1, m] = d * r[1, m] + dv * r[2, m]
                 jl[2, m] = a * r[0, m] + ar * r[2, m]
-            lu = weight * info[k]
-            lr = weight * info_right[k]
+            lu, lr = weight * info[k], weight * info_right[k]
             for m in range(3):
-                f0, f1, f2 = lu * jl[0, m], lu * jl[1, m], (lr * jl[2, m] if rows == 3 else 0.0)
+                f0, f1, f2 = lu * jl[0, m], lu * jl[1, m], (lr * jl[2, m] if depth else 0.0)
                 b[i, m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
                 for o in range(m + 1):
                     hll[m, o] += f0 * jl[0, o] + f1 * jl[1, o] + f2 * jl[2, o]
@@ -152,7 +142,7 @@ def _step(
                 jc[2, 3], jc[2, 4], jc[2, 5] = ar * yc, a * zc - ar * xc, -a * yc
                 base = 6 * c
                 for m in range(6):
-                    f0, f1, f2 = lu * jc[0, m], lu * jc[1, m], (lr * jc[2, m] if rows == 3 else 0.0)
+                    f0, f1, f2 = lu * jc[0, m], lu * jc[1, m], (lr * jc[2, m] if depth else 0.0)
                     g[base + m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
                     for o in range(m + 1):
                         s[base + m, base + o] += f0 * jc[0, o] + f1 * jc[1, o] + f2 * jc[2, o]

@@ -15,6 +15,7 @@ from dynslam_bench.contracts import KeyframeRecord, KeyframeView, Keypoints, Map
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import Camera, se3
+from dynslam_bench.geometry.gauss_newton import moved_point
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.tracking import Observations
@@ -182,8 +183,8 @@ class Map:
         order = np.lexsort((-self.kf_id[slots], -counts[slots]))
         return slots[order], counts[slots[order]]
 
-    def move_submap(self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0) -> None:
-        """Merge a submap into another: all its keyframes and points move, and become part of that.
+    def move_submap(self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0) -> Slots:
+        """Merge a submap into another: all its keyframes and points move, and become part of that; returns their slots.
 
         Args:
             number: The submap.
@@ -191,7 +192,7 @@ class Map:
             merged_into: The other's number.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """
-        slots = np.flatnonzero(self.kf_alive & (self.kf_map == number))
+        slots = self.submap(number)
         points = self.points_of(slots)
         self.kf_pose[slots, :3, 3] *= scale
         for slot in slots.tolist():
@@ -199,6 +200,7 @@ class Map:
         self.position[points] = se3.transform(T_new_old, scale * self.position[points])
         self.kf_map[slots] = merged_into
         self.refresh(points)
+        return slots
 
     def remove_keyframe(self, slot: int) -> None:
         """Remove a keyframe, its observations, and the points that no keyframe observes any more."""
@@ -474,19 +476,15 @@ def _refresh(
         for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
             words[p, w] = kf_words[obs_kf[p, best], obs_ft[p, best], w]
         sx, sy, sz = 0.0, 0.0, 0.0
-        reference_distance = 0.0
         for o in range(n):
             c = kf_centre[obs_kf[p, o]]
             x, y, z = position[p, 0] - c[0], position[p, 1] - c[1], position[p, 2] - c[2]
             d = np.sqrt(x * x + y * y + z * z) + 1e-12
-            sx += x / d
-            sy += y / d
-            sz += z / d
+            sx, sy, sz = sx + x / d, sy + y / d, sz + z / d
             if o == 0:
-                reference_distance = d * scales[kf_octave[obs_kf[p, o], obs_ft[p, o]]]
+                far[p] = d * scales[kf_octave[obs_kf[p, o], obs_ft[p, o]]]
         length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
         normal[p, 0], normal[p, 1], normal[p, 2] = sx / length, sy / length, sz / length
-        far[p] = reference_distance
 
 
 @kernel
@@ -501,11 +499,8 @@ def _project(
         Points, pixels, right coordinates, predicted octaves and cosines of the viewing angle.
     """
     n = candidates.shape[0]
-    index = np.empty(n, np.int64)
-    uv = np.empty((n, 2))
-    right = np.empty(n)
-    octave = np.empty(n, np.int64)
-    cosine = np.empty(n)
+    index, octave = np.empty(n, np.int64), np.empty(n, np.int64)
+    uv, right, cosine = np.empty((n, 2)), np.empty(n), np.empty(n)
     r, t = pose[:3, :3], pose[:3, 3]
     ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
     oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
@@ -515,15 +510,13 @@ def _project(
     count = 0
     for i in range(n):
         p = candidates[i]
-        x, y, z = position[p, 0], position[p, 1], position[p, 2]
-        zc = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        xc, yc, zc = moved_point(pose, position[p])
         if zc < 0.05:
             continue
-        u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / zc + cx
-        v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / zc + cy
+        u, v = fx * xc / zc + cx, fy * yc / zc + cy
         if u < 0.0 or u >= width or v < 0.0 or v >= height:
             continue
-        dx, dy, dz = x - ox, y - oy, z - oz
+        dx, dy, dz = position[p, 0] - ox, position[p, 1] - oy, position[p, 2] - oz
         d = np.sqrt(dx * dx + dy * dy + dz * dz)
         if d > WIDEN_RANGE * far[p] or d * WIDEN_RANGE < far[p] / nearest:
             continue
@@ -531,11 +524,8 @@ def _project(
         if c < MIN_COSINE:
             continue
         level = int(np.ceil(np.log(far[p] / d) * inverse_log - 1e-9))
-        index[count] = p
-        uv[count, 0], uv[count, 1] = u, v
-        right[count] = u - bf / zc
-        octave[count] = min(max(level, 0), levels - 1)
-        cosine[count] = c
+        index[count], octave[count] = p, min(max(level, 0), levels - 1)
+        uv[count, 0], uv[count, 1], right[count], cosine[count] = u, v, u - bf / zc, c
         count += 1
     return index[:count].copy(), uv[:count].copy(), right[:count].copy(), octave[:count].copy(), cosine[:count].copy()
 
