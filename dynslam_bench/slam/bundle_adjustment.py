@@ -95,25 +95,19 @@ def _step(
     damping: float, chi2: Array, new_poses: Array, new_points: Array,
 ) -> bool:  # fmt: skip
     """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
-    n, q = obs_pose.shape[0], points.shape[0]
-    size = 6 * variable
-    s = np.zeros((size, size))
-    g = np.zeros(size)
+    n, q, size = obs_pose.shape[0], points.shape[0], 6 * variable
+    s, g = np.zeros((size, size)), np.zeros(size)
     w = np.zeros((n, 6, 3))  # J_pose^T Lambda J_point
-    inverse = np.zeros((q, 3, 3))
-    b = np.zeros((q, 3))
+    inverse, b = np.zeros((q, 3, 3)), np.zeros((q, 3))
     jc, jl, e = np.zeros((3, 6)), np.zeros((3, 3)), np.zeros(3)
-    hll = np.zeros((3, 3))
-    y = np.zeros((6, 3))
+    hll, y = np.zeros((3, 3)), np.zeros((6, 3))
     for i in range(q):
         hll[:] = 0.0
         for k in range(start[i], start[i + 1]):
-            depth = info_right[k] > 0.0
             if chi2[k] == np.inf:
                 continue
-            weight = 1.0 / (1.0 + chi2[k] / width)
-            c = obs_pose[k]
-            r = poses[c]
+            depth, weight = info_right[k] > 0.0, 1.0 / (1.0 + chi2[k] / width)
+            c, r = obs_pose[k], poses[obs_pose[k]]
             xc, yc, zc = moved_point(r, points[i])
             iz = 1.0 / zc
             a, d = fx * iz, fy * iz
@@ -156,8 +150,7 @@ def _step(
         det = h00 * c00 + h10 * c10 + h20 * c20
         if not det > 1e-18:
             continue
-        t = 1.0 / det
-        v = inverse[i]
+        t, v = 1.0 / det, inverse[i]
         v[0, 0], v[0, 1], v[0, 2] = c00 * t, c10 * t, c20 * t
         v[1, 0], v[1, 1], v[1, 2] = c10 * t, (h00 * h22 - h20 * h20) * t, (h10 * h20 - h00 * h21) * t
         v[2, 0], v[2, 1], v[2, 2] = c20 * t, (h10 * h20 - h00 * h21) * t, (h00 * h11 - h10 * h10) * t
@@ -200,9 +193,7 @@ def _step(
             if c < variable:
                 for m in range(6):
                     x = g[6 * c + m]
-                    b0 -= w[k, m, 0] * x
-                    b1 -= w[k, m, 1] * x
-                    b2 -= w[k, m, 2] * x
+                    b0, b1, b2 = b0 - w[k, m, 0] * x, b1 - w[k, m, 1] * x, b2 - w[k, m, 2] * x
         v = inverse[i]
         for m in range(3):
             new_points[i, m] = points[i, m] + v[m, 0] * b0 + v[m, 1] * b1 + v[m, 2] * b2
@@ -232,12 +223,9 @@ def _adjust(
                 trial,
             )  # fmt: skip
             if new < cost:
-                poses, points = new_poses, new_points
-                for k in range(chi2.shape[0]):
-                    chi2[k] = trial[k]
-                gain = cost - new
-                cost = new
-                damping = max(damping * 0.2, 1e-8)
+                gain, damping = cost - new, max(damping * 0.2, 1e-8)
+                poses, points, cost = new_poses, new_points, new
+                chi2[:] = trial
                 if gain < 1e-5 * cost:
                     break
                 continue
@@ -252,10 +240,8 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
         problem: Start values and observations; every point should have two observations or depth.
         iterations: Levenberg-Marquardt iterations at most.
     """
-    c = problem.camera
-    count = len(problem.points)
-    start = np.searchsorted(problem.obs_point, np.arange(count + 1)).astype(np.int64)
-    chi2 = np.zeros(len(problem.obs_pose))
+    c, chi2 = problem.camera, np.zeros(len(problem.obs_pose))
+    start = np.searchsorted(problem.obs_point, np.arange(len(problem.points) + 1)).astype(np.int64)
     guess = np.ascontiguousarray(problem.poses), problem.variable, np.ascontiguousarray(problem.points)
     measured = problem.uv, problem.right, problem.info, problem.info_right
     lens = c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m
@@ -324,16 +310,14 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, max_observ
     support = np.bincount(of_point[pose >= 0], minlength=len(points))
     supported = np.flatnonzero(support >= 2)
     order = supported[np.lexsort((world.id[points[supported]], -support[supported]))]  # long tracks first
-    order = order[np.cumsum(support[order]) <= max_observations]
-    order.sort()
+    order = np.sort(order[np.cumsum(support[order]) <= max_observations])
     if not len(order):
         return None
     point_number = np.full(len(points), -1, np.int64)
     point_number[order] = np.arange(len(order))
     used = (pose >= 0) & (point_number[of_point] >= 0)
     obs_point, obs_pose, points = point_number[of_point[used]], pose[used], points[order]
-    features = all_features[used].astype(np.int64)
-    at = poses[obs_pose]
+    features, at = all_features[used].astype(np.int64), poses[obs_pose]
     problem = BundleProblem(
         world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point,
         world.kf_xy[at, features], world.kf_right[at, features], world.kf_info[at, features],

@@ -401,10 +401,8 @@ class LoopCloser:
         for slot in slots.tolist():
             near, shared = self.world.covisible(slot)
             older = self.world.kf_id[near] < self.world.kf_id[slot]
-            pairs |= {
-                (other, slot)
-                for other in [*near[older][:1].tolist(), *near[older & (shared >= STRONG_COVISIBILITY)].tolist()]
-            }
+            linked = [*near[older][:1], *near[older & (shared >= STRONG_COVISIBILITY)]]
+            pairs |= {(int(other), slot) for other in linked}
         return [self._edge(a, b, self.world.kf_pose[b]) for a, b in sorted(pairs)]
 
     def _fuse(self, slot: int, candidate: int) -> None:
