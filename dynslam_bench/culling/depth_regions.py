@@ -65,9 +65,7 @@ def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.r
         variance = np.cumsum(chosen**2) / n - np.square(np.cumsum(chosen) / n)
         size = int(np.argmax(np.append(variance, np.inf) >= settings.variance_m2))
         if size > np.count_nonzero(best):
-            best[:] = False
-            best[order[:size]] = True
-            share = size / count
+            best, share = np.isin(np.arange(count), order[:size]), size / count
             needed = np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12)) if share < 1 else 0
             draws = min(draws, max(drawn, int(np.ceil(needed))))
     return best
@@ -164,10 +162,8 @@ def covered_blocks(
     Returns:
         Bool ``[H, W]`` of the pixels in such blocks, and the number of blocks.
     """
-    z = np.nan_to_num(np.asarray(depth, np.float32), posinf=0.0, neginf=0.0)
-    valid = (z > 0) & (z <= settings.max_depth_m)
-    z = np.where(valid, z, 0).astype(np.float32)
-    square = np.ones((2, 2), np.uint8)
+    valid = (depth > 0) & (depth <= settings.max_depth_m)
+    z, square = np.where(valid, depth, 0).astype(np.float32), np.ones((2, 2), np.uint8)
     edge = cv2.dilate(z, square) - cv2.erode(z, square) > settings.edge_m
     count, label = cv2.connectedComponents((valid & ~edge).view(np.uint8), connectivity=4)
     size = np.bincount(label.ravel(), minlength=count)

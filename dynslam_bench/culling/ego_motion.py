@@ -210,9 +210,8 @@ def _align(
             hessian[:3], hessian[:, :3], gradient[:3] = 0.0, 0.0, 0.0
             hessian[:3, :3] = np.trace(hessian) * np.eye(3)
         step = -gradient
-        if not cholesky_solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), step):
-            return pose, 0.0
-        if not np.linalg.norm(step[3:]) <= 1.0:
+        solved = cholesky_solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), step)
+        if not solved or not np.linalg.norm(step[3:]) <= 1.0:
             return pose, 0.0
         pose = apply_twist(pose, step)
     return pose, total
@@ -328,8 +327,7 @@ def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) 
     Returns:
         Means ``[M, K]``; 0 where there is no such point.
     """
-    order = np.argsort(xy[:, 1])
-    rows = xy[order, 1]
+    order, rows = np.argsort(xy[:, 1]), np.sort(xy[:, 1])
     means = np.zeros((len(at), values.shape[1]))
     for i in range(len(at)):
         total, count = means[i], 0

@@ -53,11 +53,9 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         """At most `budget` of the allowed features, bool ``[N]``, shared among levels and cells."""
         if np.count_nonzero(allowed) <= self.settings.budget:
             return allowed.copy()
-        chosen = np.zeros(len(allowed), dtype=bool)
-        octave = frame.keypoints.octave
+        octave, chosen, missing = frame.keypoints.octave, np.zeros(len(allowed), dtype=bool), 0
         levels = max(self._features.levels, int(octave.max()) + 1)
         quotas = level_quotas(self.settings.budget, levels, self._features.scale_factor)
-        missing = 0
         for level in range(levels - 1, -1, -1):
             rows = np.flatnonzero((octave == level) & allowed)
             quota = quotas[level] + missing

@@ -44,8 +44,7 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
             pixels = np.full((len(rows), 2), -1e3)
             pixels[ahead] = state.camera.distort_points(state.camera.project(local[ahead]))
             scores[number] = zncc(current, patches(gray, pixels, self.settings.patch_px))
-        tested = np.isfinite(scores).any(axis=0)
-        median = np.full(len(rows), -1.0)
+        tested, median = np.isfinite(scores).any(axis=0), np.full(len(rows), -1.0)
         median[tested] = np.nanmedian(scores[:, tested], axis=0)
         keep[rows] = median >= self.settings.zncc
         if tested.any():
@@ -55,8 +54,7 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
 
 def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Square patches ``[N, size * size]`` around rounded pixels ``[N, 2]``; NaN where they leave the image."""
-    half = size // 2
-    height, width = gray.shape
+    half, (height, width) = size // 2, gray.shape
     centre = np.rint(xy.clip(-1e6, 1e6)).astype(np.intp)
     fits = ((centre >= half) & (centre < (width - half, height - half))).all(axis=1)
     span = np.arange(-half, half + 1)
