@@ -104,7 +104,8 @@ class Map:
 
     def submap(self, number: int) -> Slots:
         """Slots of the keyframes of a submap, oldest first."""
-        return self.keyframes[self.kf_map[self.keyframes] == number]
+        slots = self.keyframes
+        return slots[np.flatnonzero(self.kf_map[slots] == number)]
 
     def points_of(self, keyframes: Slots | int) -> Slots:
         """Slots of the points that keyframes observe, ascending."""

@@ -103,7 +103,9 @@ class MotionState:
     @property
     def T_cam_world(self) -> Array:
         """World-to-camera pose ``[4, 4]``."""
-        return se3.from_matrix(-self.rotation @ self.position, self.rotation)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.rotation, -self.rotation @ self.position
+        return pose
 
     def difference(self, T_cam_world: Array) -> Array:
         """(position, rotation) ``[6]`` that leads from this state's pose to another."""
