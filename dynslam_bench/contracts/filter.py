@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.features import Keypoints
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.contracts.tracker import Provenance as Provenance
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry import Camera
 
@@ -144,13 +143,11 @@ class DynamicFilter(Protocol):
     Attributes:
         name: Short name, the prefix of its stats.
         needs: What must be there for it to work; `FilterState` fields that are None make it keep all.
-        provenance: How closely it follows its source.
         stats_names: Names of the stats that every verdict holds, with the ``dropped`` that `FilterResult.of` adds.
     """
 
     name: str
     needs: frozenset[Need]
-    provenance: Provenance
     stats_names: tuple[str, ...] = ("dropped",)
 
     @property

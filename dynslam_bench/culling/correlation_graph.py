@@ -7,11 +7,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.ego_motion import depth_sigma
+from dynslam_bench.culling.ego_motion import NEAR, depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
-from dynslam_bench.culling.regions import NEAR
 from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
@@ -38,13 +37,12 @@ class CorrelationFilter(Rule[CorrelationSettings]):
 
     name = "correlation"
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "tracked", "settled", "edges", "cut", "components")
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget all tracks."""
         self._past = np.zeros((0, 0, 12))  # [frames ago - 1, point of the previous frame, position and covariance]
-        self._last: NDArray[np.float64] | None = None  # the previous frame's points in its camera
+        self._last = np.zeros((0, 12))  # the previous frame's points in its camera
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Build the graph over the points that have been observed before."""
@@ -83,13 +81,7 @@ class CorrelationFilter(Rule[CorrelationSettings]):
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
         """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
         previous, pose, flow = state.previous, state.T_world_prev, state.flow
-        if (
-            previous is None
-            or pose is None
-            or flow is None
-            or self._last is None
-            or len(self._last) != len(previous.xy)
-        ):
+        if previous is None or pose is None or flow is None or len(self._last) != len(previous.xy):
             return np.zeros((0, len(frame.xy), 12))
         link = link_to_previous(frame, state)
         before = np.concatenate([_in_world(self._last, pose)[None], self._past])[: self.settings.window]
@@ -107,14 +99,10 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         self, xy: Numbers, raw: Numbers, z: Numbers, depth: NDArray[np.float32], camera: Camera
     ) -> NDArray[np.float64]:
         """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
-        points = np.full((len(xy), 12), np.nan)
-        valid = np.isfinite(z) & (z > 0)
-        points[valid, :3] = camera.unproject(xy[valid], z[valid])
-        variance = depth_variance(depth, raw[valid])
-        pixels = np.asarray(xy[valid], np.float64)
-        points[valid, 3:] = point_covariance(pixels, z[valid], variance, camera, self.settings.pixel_sigma).reshape(
-            -1, 9
-        )
+        points, valid = np.full((len(xy), 12), np.nan), np.isfinite(z) & (z > 0)
+        pixels, z = np.asarray(xy[valid], np.float64), z[valid]
+        covariance = point_covariance(pixels, z, depth_variance(depth, raw[valid]), camera, self.settings.pixel_sigma)
+        points[valid] = np.column_stack([camera.unproject(pixels, z), covariance.reshape(-1, 9)])
         return points
 
     def _agree(
@@ -128,19 +116,17 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         change = now[first, :3] - now[second, :3] - then[0][:, :3] + then[1][:, :3]
         total = (now[first, 3:] + now[second, 3:] + then[0][:, 3:] + then[1][:, 3:]).reshape(-1, 3, 3)
         comparable = both.any(axis=0)
-        distance = np.zeros(len(edges))
         solved = np.linalg.solve(total[comparable], change[comparable, :, None])[:, :, 0]
-        distance[comparable] = (change[comparable] * solved).sum(axis=1)
-        return np.asarray(distance <= chi2.ppf(self.settings.quantile, 3))
+        cut = np.zeros(len(edges), bool)
+        cut[comparable] = (change[comparable] * solved).sum(axis=1) > chi2.ppf(self.settings.quantile, 3)
+        return ~cut
 
     def _static_component(self, edges: NDArray[np.intp], points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], int]:
-        count = len(points)
-        graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+        graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(points), len(points)))
         _, label = connected_components(graph, directed=False)
         size = np.bincount(label)
-        if self.settings.largest == "count":
-            measure = size.astype(np.float64)
-        else:
+        measure = size.astype(np.float64)
+        if self.settings.largest == "volume":
             measure = np.array([_volume(points[label == body]) for body in range(len(size))])
         static = int(np.lexsort((size, measure))[-1])  # with equal volumes the one with more points
         return np.asarray(label == static), len(size)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
@@ -24,7 +24,6 @@ class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
 
     name = "depth_ransac"
     needs: frozenset[Need] = frozenset({"boxes", "depth"})
-    provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "objects", "in_boxes")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -66,9 +65,7 @@ def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.r
         variance = np.cumsum(chosen**2) / n - np.square(np.cumsum(chosen) / n)
         size = int(np.argmax(np.append(variance, np.inf) >= settings.variance_m2))
         if size > np.count_nonzero(best):
-            best[:] = False
-            best[order[:size]] = True
-            share = size / count
+            best, share = np.isin(np.arange(count), order[:size]), size / count
             needed = np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12)) if share < 1 else 0
             draws = min(draws, max(drawn, int(np.ceil(needed))))
     return best
@@ -83,7 +80,6 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
 
     name = "box_depth"
     needs: frozenset[Need] = frozenset({"boxes", "depth"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "objects", "ignored", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -133,7 +129,6 @@ class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
 
     name = "depth_blocks"
     needs: frozenset[Need] = frozenset({"masks", "depth"})
-    provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "objects", "touched", "blocks", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -167,10 +162,8 @@ def covered_blocks(
     Returns:
         Bool ``[H, W]`` of the pixels in such blocks, and the number of blocks.
     """
-    z = np.nan_to_num(np.asarray(depth, np.float32), posinf=0.0, neginf=0.0)
-    valid = (z > 0) & (z <= settings.max_depth_m)
-    z = np.where(valid, z, 0).astype(np.float32)
-    square = np.ones((2, 2), np.uint8)
+    valid = (depth > 0) & (depth <= settings.max_depth_m)
+    z, square = np.where(valid, depth, 0).astype(np.float32), np.ones((2, 2), np.uint8)
     edge = cv2.dilate(z, square) - cv2.erode(z, square) > settings.edge_m
     count, label = cv2.connectedComponents((valid & ~edge).view(np.uint8), connectivity=4)
     size = np.bincount(label.ravel(), minlength=count)

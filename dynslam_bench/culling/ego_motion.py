@@ -3,16 +3,16 @@
 The test finds motion along epipolar lines, and any motion while the camera only rotates or stands still.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.regions import NEAR, cell_index, cell_mean, failing_regions
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, twist_of
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point, twist_of
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -36,7 +36,7 @@ NOISE_PX = (0.2, 1.0)
 """Least and greatest scale of the kernel that the residuals of distant points ask for."""
 ROLLING_SHUTTER_SHARE = 0.05
 """Added to the scale, as a share of a point's flow: a rolling shutter distorts fast motion."""
-CELL = 32
+STATIC_CELL = 32
 """Side of the cells of `static_share`, pixels."""
 CORRELATION = 100.0
 """Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
@@ -55,6 +55,15 @@ MAX_FAILURES = 2.5
 after an object has stopped. It would otherwise become a part of the map, and take the camera along when it moves on. A
 whole image that fails in a frame or two, as after a wrong stamp, stays below."""
 
+CELL = 16
+"""Side of the cells in which failing points are counted, pixels."""
+NEIGHBOURHOOD = (5, 5)
+"""Cells around a point in which it needs company: 80 x 80 px."""
+MIN_FAILING = 3
+"""Fewest failing points of a moving region."""
+NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+"""Offsets of the 3x3 pixels around a pixel, row by row."""
+
 
 def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
     """Standard deviation of a structured-light depth camera at depth z, metres (Nguyen et al. 2012, axial noise)."""
@@ -67,16 +76,18 @@ def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floa
     Args:
         frame: The current frame.
         state: With the previous frame and which of its keypoints were kept.
-        before: Raw pixels of the points in the previous image, ``[N, 2]``; not finite gives 1.
+        before: Raw pixels of the points in the previous image, ``[N, 2]``.
 
     Returns:
         Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there were none.
     """
-    share, finite, shape = np.ones(len(before)), np.isfinite(before).all(axis=1), frame.gray.shape
-    if state.previous is not None and state.previous_keep is not None:
-        kept = cell_mean(state.previous_keep, *cell_index(state.previous.keypoints.xy, CELL, shape), empty=1.0)
-        share[finite] = kept[cell_index(before[finite], CELL, shape)[0]]
-    return share
+    if state.previous is None or state.previous_keep is None:
+        return np.ones(len(before))
+    cell, cells = cell_index(state.previous.keypoints.xy, STATIC_CELL, frame.gray.shape)
+    count = np.bincount(cell, minlength=np.prod(cells))
+    kept = np.bincount(cell, weights=state.previous_keep, minlength=np.prod(cells))
+    share = np.where(count > 0, kept / np.maximum(count, 1), 1.0)
+    return np.asarray(share[cell_index(before, STATIC_CELL, frame.gray.shape)[0]])
 
 
 def rigid_flow(
@@ -199,9 +210,8 @@ def _align(
             hessian[:3], hessian[:, :3], gradient[:3] = 0.0, 0.0, 0.0
             hessian[:3, :3] = np.trace(hessian) * np.eye(3)
         step = -gradient
-        if not cholesky_solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), step):
-            return pose, 0.0
-        if not np.linalg.norm(step[3:]) <= 1.0:
+        solved = cholesky_solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), step)
+        if not solved or not np.linalg.norm(step[3:]) <= 1.0:
             return pose, 0.0
         pose = apply_twist(pose, step)
     return pose, total
@@ -212,12 +222,9 @@ def _squared_errors(pose: Array, points: Array, pixels: Array, fx: float, fy: fl
     """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
     errors = np.full(len(points), np.inf)
     for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        x, y, z = moved_point(pose, points[i])
         if z > 0:
-            x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z
-            y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z
-            errors[i] = (fx * x + cx - pixels[i, 0]) ** 2 + (fy * y + cy - pixels[i, 1]) ** 2
+            errors[i] = (fx * (x / z) + cx - pixels[i, 0]) ** 2 + (fy * (y / z) + cy - pixels[i, 1]) ** 2
     return errors
 
 
@@ -230,12 +237,10 @@ def _linearise(
     hessian, gradient, total = np.zeros((6, 6)), np.zeros(6), 0.0
     j = np.zeros((2, 6))
     for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        x, y, z = moved_point(pose, points[i])
         if z <= NEAR_M:
             continue
-        x = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) / z
-        y = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) / z
+        x, y = x / z, y / z
         du, dv = fx * x + cx - pixels[i, 0], fy * y + cy - pixels[i, 1]
         weight = prior_weight[i] / (1 + (du * du + dv * dv) / (scale2 + shutter[i])) ** 2
         total += weight
@@ -261,7 +266,6 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
 
     name = "motion"
     needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
-    provenance: Provenance = "assumed"
     stats_names = ("dropped", "tested", "failed")
 
     def reset(self, camera: Camera | None = None) -> None:
@@ -323,8 +327,7 @@ def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) 
     Returns:
         Means ``[M, K]``; 0 where there is no such point.
     """
-    order = np.argsort(xy[:, 1])
-    rows = xy[order, 1]
+    order, rows = np.argsort(xy[:, 1]), np.sort(xy[:, 1])
     means = np.zeros((len(at), values.shape[1]))
     for i in range(len(at)):
         total, count = means[i], 0
@@ -361,3 +364,48 @@ def nearest_depth(
     patch[~visible | ~np.isfinite(patch)] = 0
     gap = np.where(patch > 0, np.abs(patch - np.asarray(expected)[:, None]), np.inf)
     return np.asarray(np.take_along_axis(patch, gap.argmin(axis=1)[:, None], axis=1)[:, 0])
+
+
+# The region rule: in a moving region many points fail, and a lone failure is noise.
+
+
+def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
+    """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
+    rows, columns = -(-shape[0] // size), -(-shape[1] // size)
+    cell = np.floor(xy / size).astype(np.intp)
+    return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
+
+
+def _neighbourhood_sum(
+    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Sum of values ``[N]`` in the neighbourhood of each cell of a grid; cells as in `cell_index`."""
+    total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1]).reshape(grid)
+    summed = cv2.boxFilter(total, -1, NEIGHBOURHOOD, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(summed, dtype=np.float64).ravel()
+
+
+def failing_regions(
+    failing: NDArray[np.bool_],
+    tested: NDArray[np.bool_],
+    xy: NDArray[np.floating],
+    share: float,
+    size: tuple[int, ...],
+) -> NDArray[np.bool_]:
+    """The region rule: failing points of whose tested neighbours enough fail too.
+
+    Args:
+        failing: bool ``[N]``, points that failed a test.
+        tested: bool ``[N]``, points that were tested.
+        xy: Raw pixels ``[N, 2]``.
+        share: Share of the tested points in the neighbourhood that must fail; 0 keeps all failures.
+        size: Image height and width.
+
+    Returns:
+        Bool ``[N]``, a subset of `failing`.
+    """
+    if share <= 0 or not failing.any():
+        return failing
+    index, grid = cell_index(xy, CELL, size)
+    failures, tests = (_neighbourhood_sum(flags, index, grid)[index] for flags in (failing & tested, tested))
+    return np.asarray(failing & (failures >= MIN_FAILING) & (failures >= share * tests))

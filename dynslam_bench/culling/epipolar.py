@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Number, ObjectRule, Rule
-from dynslam_bench.culling.ego_motion import rigid_flow
-from dynslam_bench.culling.regions import NEAR, failing_regions
+from dynslam_bench.culling.ego_motion import NEAR, failing_regions, rigid_flow
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import (
     BoxEpipolarSettings,
@@ -140,7 +139,6 @@ class EpipolarFilter(Rule[EpipolarSettings]):
 
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
-    provenance: Provenance = "faithful-paper"
     stats_names = (
         *("dropped", "matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate"),
         *("moving_objects", "f_asked", "f_judged"),
@@ -236,8 +234,7 @@ def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[
     Returns:
         bool ``[N]`` keep, and the number of moving objects.
     """
-    keep = np.ones(len(frame.xy), dtype=bool)
-    moving = 0
+    keep, moving = np.ones(len(frame.xy), dtype=bool), 0
     for mask in () if frame.instances is None else frame.instances.masks:
         on_object = inside(mask, frame.keypoints.xy)
         voters = on_object & tested
@@ -257,7 +254,6 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
 
     name = "box_epipolar"
     needs: frozenset[Need] = frozenset({"flow", "boxes", "previous"})
-    provenance: Provenance = "faithful-paper"
     stats_names = ("dropped", "matches", "lost", "failed", "boxes", "f_asked", "f_judged")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -298,7 +294,6 @@ class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
 
     name = "class_rule"
     needs: frozenset[Need] = frozenset({"masks", "flow", "previous", "depth"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "on_people", "on_movable", "moving_objects", "lost", "f_asked", "f_judged")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -355,7 +350,6 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
 
     name = "moving_vote"
     needs: frozenset[Need] = frozenset({"masks", "previous"})
-    provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "corners", "moving", "votes", "f_asked", "f_judged")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -368,18 +362,16 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
         near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
         votes = np.count_nonzero(inside(near_people, moving))
-        mask = people if votes >= self.settings.min_votes else None
-        if mask is not None:
-            keep = ~inside(people, frame.keypoints.xy)
-        return self.verdict(
-            keep, mask, corners=corners, moving=len(moving), votes=votes, f_asked=asked, f_judged=judged
-        )
+        stats = {"corners": corners, "moving": len(moving), "votes": votes, "f_asked": asked, "f_judged": judged}
+        if votes < self.settings.min_votes:
+            return self.verdict(keep, **stats)
+        return self.verdict(~inside(people, frame.keypoints.xy), people, **stats)
 
     def _moving_corners(
         self, previous: NDArray[np.uint8], current: NDArray[np.uint8], camera: Camera
     ) -> tuple[NDArray[np.float32], int, bool]:
         """Pixels ``[M, 2]`` of the corners off their line, the number of tracked corners, whether F was estimated."""
-        no_corners = np.zeros((0, 2), np.float32)
+        no_corners, border = np.zeros((0, 2), np.float32), VOTE_BORDER_PX
         corners = cv2.goodFeaturesToTrack(
             previous, self.settings.corners, 0.01, 8, blockSize=3, useHarrisDetector=True, k=HARRIS_K
         )
@@ -397,17 +389,14 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
             criteria=(criteria[0], 20, 0.01),
         )
         before, after = corners.reshape(-1, 2), tracked.reshape(-1, 2)
-        low, high = VOTE_BORDER_PX, np.array(current.shape[::-1]) - VOTE_BORDER_PX - 1
-        good = status.ravel().astype(bool)
-        for xy in (before, after):
-            good &= (xy >= low).all(axis=1) & (xy <= high).all(axis=1)
+        both = np.stack([before, after])
+        inner = (both >= border) & (both <= np.array(current.shape[::-1]) - border - 1)
+        good = status.ravel().astype(bool) & inner.all(axis=(0, 2))
         good[good] = _patch_difference(previous, current, before[good], after[good]) <= self.settings.sad_limit
         before, after = before[good], after[good]
         first, second = camera.undistort_points(before), camera.undistort_points(after)
-        inlier_px = self.settings.inlier_px
-        matrix = fundamental_matrix(
-            first, second, inlier_px=inlier_px, max_draws=1000, min_matches=VOTE_MATCHES, refits=0
-        )
+        as_published = {"max_draws": 1000, "min_matches": VOTE_MATCHES, "refits": 0}
+        matrix = fundamental_matrix(first, second, inlier_px=self.settings.inlier_px, **as_published)
         if matrix is None:
             return no_corners, len(before), False
         return after[epipolar_distance(matrix, first, second) > self.settings.threshold_px], len(before), True

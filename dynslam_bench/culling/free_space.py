@@ -5,10 +5,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.ego_motion import depth_sigma
-from dynslam_bench.culling.regions import failing_regions
+from dynslam_bench.culling.ego_motion import depth_sigma, failing_regions
 from dynslam_bench.culling.settings import FreeSpaceSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 
@@ -28,7 +27,6 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
 
     name = "free_space"
     needs: frozenset[Need] = frozenset({"keyframes", "prediction", "depth"})
-    provenance: Provenance = "assumed"
     stats_names = ("dropped", "asked", "tested")
 
     def reset(self, camera: Camera | None = None) -> None:

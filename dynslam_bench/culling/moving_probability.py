@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import ProbabilitySettings
@@ -36,7 +36,6 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
 
     name = "probability"
     needs: frozenset[Need] = frozenset({"masks", "flow", "previous"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "linked", "mean_probability")
 
     def __init__(

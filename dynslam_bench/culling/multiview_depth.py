@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FlowResult, FrameBundle, KeyframeView, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FlowResult, FrameBundle, KeyframeView, Need
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
@@ -15,8 +15,7 @@ from dynslam_bench.features.matching import CellGrid, Features, as_words, search
 from dynslam_bench.geometry import Camera, inside, se3
 from dynslam_bench.segmentation.postprocess import dilate
 
-MAX_REFERENCE_DEPTH_M = 6.0
-MAX_PROJECTED_DEPTH_M = 7.0
+MAX_REFERENCE_DEPTH_M, MAX_PROJECTED_DEPTH_M = 6.0, 7.0
 MAX_DEPTH_M = 40.0
 """Measured depth beyond this counts as missing, as in the back end."""
 GROW_M = 0.2
@@ -35,7 +34,6 @@ class MultiViewFilter(Rule[MultiViewSettings]):
 
     name = "multiview"
     needs: frozenset[Need] = frozenset({"keyframes", "prediction", "depth"})
-    provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "references", "seeds", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -46,8 +44,8 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         pose = refine_by_matches(frame, state)
         assert pose is not None
         references = self._choose(state.keyframes, pose)
-        depth = np.nan_to_num(frame.depth, posinf=0.0, neginf=0.0)
-        depth = np.ascontiguousarray(np.where((depth > 0) & (depth < MAX_DEPTH_M), depth, 0), dtype=np.float32)
+        measured = (frame.depth > 0) & (frame.depth < MAX_DEPTH_M)
+        depth = np.ascontiguousarray(np.where(measured, frame.depth, 0), dtype=np.float32)
         seeds = self._seeds(references, depth, pose, state.camera)
         if not len(seeds):
             return self.verdict(keep, references=len(references))

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.orb import EDGE, level_quotas, spread
@@ -31,7 +31,6 @@ class ReseedingFilter(Rule[ReseedingSettings]):
 
     name = "reseeding"
     needs: frozenset[Need] = frozenset()
-    provenance: Provenance = "inspired"
     stats_names = ("static", "reseeded", "missing", "dropped")
 
     def __init__(self, settings: ReseedingSettings, features: FeatureSettings) -> None:
@@ -54,11 +53,9 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         """At most `budget` of the allowed features, bool ``[N]``, shared among levels and cells."""
         if np.count_nonzero(allowed) <= self.settings.budget:
             return allowed.copy()
-        chosen = np.zeros(len(allowed), dtype=bool)
-        octave = frame.keypoints.octave
+        octave, chosen, missing = frame.keypoints.octave, np.zeros(len(allowed), dtype=bool), 0
         levels = max(self._features.levels, int(octave.max()) + 1)
         quotas = level_quotas(self.settings.budget, levels, self._features.scale_factor)
-        missing = 0
         for level in range(levels - 1, -1, -1):
             rows = np.flatnonzero((octave == level) & allowed)
             quota = quotas[level] + missing

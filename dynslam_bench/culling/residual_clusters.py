@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
@@ -29,7 +29,6 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
 
     name = "residual"
     needs: frozenset[Need] = frozenset({"depth", "previous", "prediction", "masks"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "clusters", "moving", "mask_fraction")
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -84,12 +83,11 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         self, residual: NDArray[np.float64], label: NDArray[np.intp], people: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Which clusters move, ``[K]``: posterior of the two-component mixture above the threshold."""
-        count = self.settings.clusters
-        measured = np.isfinite(residual)
-        members = np.bincount(label[measured], minlength=count)
-        mean = np.bincount(label[measured], weights=residual[measured], minlength=count) / np.maximum(members, 1)
+        count, measured = self.settings.clusters, np.isfinite(residual)
         if not measured.any():
             return np.zeros(count, dtype=bool)
+        members = np.bincount(label[measured], minlength=count)
+        mean = np.bincount(label[measured], weights=residual[measured], minlength=count) / np.maximum(members, 1)
         static = max(float(np.median(mean[members > 0])), 1e-4)
         share = np.bincount(label, weights=people, minlength=count) / np.maximum(np.bincount(label, minlength=count), 1)
         prior = STATIC_PRIOR + (self.settings.prior - STATIC_PRIOR) * share

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
 from dynslam_bench.geometry import inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, select
@@ -18,7 +18,6 @@ class SemanticFilter(Rule[SegmentationSettings]):
 
     name = "semantic"
     needs: frozenset[Need] = frozenset({"masks"})
-    provenance: Provenance = "faithful-code"
     stats_names = ("dropped", "objects", "mask_fraction")
     group = "segmentation"
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need, Provenance
+from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Number, ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
@@ -18,7 +18,6 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
 
     name = "template"
     needs: frozenset[Need] = frozenset({"boxes", "depth", "prediction", "previous"})
-    provenance: Provenance = "inspired"
     stats_names = ("dropped", "in_boxes", "tested", "median_zncc")
 
     def reset(self, camera: Camera | None = None) -> None:
@@ -45,8 +44,7 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
             pixels = np.full((len(rows), 2), -1e3)
             pixels[ahead] = state.camera.distort_points(state.camera.project(local[ahead]))
             scores[number] = zncc(current, patches(gray, pixels, self.settings.patch_px))
-        tested = np.isfinite(scores).any(axis=0)
-        median = np.full(len(rows), -1.0)
+        tested, median = np.isfinite(scores).any(axis=0), np.full(len(rows), -1.0)
         median[tested] = np.nanmedian(scores[:, tested], axis=0)
         keep[rows] = median >= self.settings.zncc
         if tested.any():
@@ -56,8 +54,7 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
 
 def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Square patches ``[N, size * size]`` around rounded pixels ``[N, 2]``; NaN where they leave the image."""
-    half = size // 2
-    height, width = gray.shape
+    half, (height, width) = size // 2, gray.shape
     centre = np.rint(xy.clip(-1e6, 1e6)).astype(np.intp)
     fits = ((centre >= half) & (centre < (width - half, height - half))).all(axis=1)
     span = np.arange(-half, half + 1)

@@ -3,9 +3,20 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.compiled import inlined, kernel
 
 Array = NDArray[np.float64]
+
+
+@inlined
+def moved_point(pose: Array, point: Array) -> tuple[float, float, float]:
+    """Coordinates of a point ``[3]`` that is moved by a pose ``[4, 4]``."""
+    x, y, z = point[0], point[1], point[2]
+    return (
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
+    )
 
 
 @kernel

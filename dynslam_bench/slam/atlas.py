@@ -7,7 +7,7 @@ the root map). The atlas knows where an unmerged submap may lie. Poses count in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -69,10 +69,8 @@ class Atlas:
     """
 
     def __init__(self, world: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0) -> None:
-        self.world = world
-        self.active = 0
+        self.world, self.active, self._unit_ratio = world, 0, unit_ratio
         self.submaps = dict(enumerate(submaps, 1))
-        self._unit_ratio = unit_ratio
 
     def begin_submap(self, start: Array, bound_m: float, slack: float = np.pi) -> None:
         """A submap begins where the camera was lost, as far as is known, and becomes the active one.
@@ -171,14 +169,21 @@ def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool)
     return unpacked(saved, camera, features.scales)
 
 
-def save_atlas(path: Path, atlas: Atlas, features: MapFeatures, *, depth: bool, made_by: str = "") -> None:
+def save_atlas(path: Path, atlas: Atlas, world: Map, features: MapFeatures, *, depth: bool, made_by: str = "") -> None:
     """Write the atlas to a file; `open_atlas` restores every bit.
+
+    Args:
+        path: The file.
+        atlas: The atlas.
+        world: Its keyframes and points, or a refined copy of them.
+        features: The features that it is made of.
+        depth: Whether they have depth.
+        made_by: Which run made it, in words.
 
     Raises:
         TrackerError: There is no map yet, or it is too large for a file.
         DynslamError: The file cannot be written.
     """
-    world = atlas.world
     if not world.next_keyframe:
         raise TrackerError("there is no map to save: no frame has begun one")
     header = MapHeader(
@@ -189,12 +194,11 @@ def save_atlas(path: Path, atlas: Atlas, features: MapFeatures, *, depth: bool, 
         next_point=world.next_point,
         made_by=made_by[:1000],
     )
-    write_map(path, SavedMap(header, packed(atlas)))
+    write_map(path, SavedMap(header, packed(world, atlas.submaps.values())))
 
 
-def packed(atlas: Atlas) -> dict[str, NDArray[Any]]:
-    """The arrays of an atlas, as `map_files` describes them."""
-    world = atlas.world
+def packed(world: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
+    """The arrays of a map and its submaps, as `map_files` describes them."""
     slots, points = world.keyframes, world.points
     points = points[np.argsort(world.id[points], kind="stable")]
     features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
@@ -205,9 +209,8 @@ def packed(atlas: Atlas) -> dict[str, NDArray[Any]]:
     row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
     arrays["obs_kf"], arrays["obs_ft"] = row_of_keyframe[keyframe], feature
-    submaps = atlas.submaps.values()
-    arrays["submap_start"] = np.array([submap.start for submap in submaps]).reshape(-1, 3)
-    arrays["submap_anchor"] = np.array([submap.anchor for submap in submaps]).reshape(-1, 3)
+    places = np.array([(submap.start, submap.anchor) for submap in submaps]).reshape(-1, 2, 3)
+    arrays["submap_start"], arrays["submap_anchor"] = places[:, 0], places[:, 1]
     arrays["submap_bound"] = np.array([submap.bound_m for submap in submaps], np.float64)
     return arrays
 

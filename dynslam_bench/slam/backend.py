@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -107,9 +106,7 @@ class RgbdBackend:
         self._keyframes = KeyframePolicy(s.keyframes, self.mapper.close_m)
         self._local_map = LocalMap(self.world, connected_only=s.loop_closing.enabled)
         self._views = MapViews(self.world, DEPTH_IMAGES if self.uses_depth else 0)
-        self._tracked = False
-        self._unrecognised = 0
-        self._reference = -1
+        self._tracked, self._unrecognised, self._reference = False, 0, -1
         self._last: TrackedFrame | None = None
         self._first: tuple[FrameBundle, Observations] | None = None
         self._refined: Map | None = None
@@ -135,7 +132,7 @@ class RgbdBackend:
         """
         begin = perf_counter()
         self._refined = None
-        observations = observe(frame, keep, weight, self.camera, self._features.scales)
+        observations = observe(frame, keep, weight, self.camera, self.world.scales)
         result = self._track(frame, observations) if self.world.next_keyframe else self._initialise(frame, observations)
         stages = {"tracking": perf_counter() - begin - sum(result.timings.values())}
         return replace(result, timings={**stages, "mapping": 0.0, "bundle_adjustment": 0.0, **result.timings})
@@ -168,7 +165,7 @@ class RgbdBackend:
             if first is not None and velocity is not None:
                 return self._restart(frame, raw, first, velocity, fit.count)
             result = self._update_map(frame, tracked, fit, root)
-        counts = {"matches": len(fit.matches), "inliers": fit.count, "relocalised": initial.relocalised}
+        counts = {"matches": len(fit.matches.feature), "inliers": fit.count, "relocalised": initial.relocalised}
         return replace(result, stats={**result.stats, **counts})
 
     def _initial_pose(
@@ -179,11 +176,9 @@ class RgbdBackend:
         candidate, trusted = pose_from_last_frame(
             world, last, observations, prediction, reference, self.settings.tracking
         )
-        initial = None
-        if candidate is not None and trusted and self._tracked:
-            initial = candidate
-            if not self.atlas.active:
-                return initial, None
+        initial = candidate if trusted and self._tracked else None
+        if initial is not None and not self.atlas.active:
+            return initial, None
         if self._tracked:
             keyframes, _ = self._local_map.around(reference)
             bound = self._gate.while_tracked(last, raw, frame.timestamp, prediction)
@@ -213,8 +208,8 @@ class RgbdBackend:
                 f"the map's descriptors have {stored} bytes, frame {frame.index}'s {own}",
                 "make the map with the same features",
             )
-        nothing = np.zeros(len(frame.xy))
-        none = observe(frame, nothing.astype(bool), nothing.astype(np.float32), self.camera, self._features.scales)
+        keep = np.zeros(len(frame.xy), bool)
+        none = observe(frame, keep, keep.astype(np.float32), self.camera, self.world.scales)
         return TrackedFrame(none, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
     def _accept(self, frame: FrameBundle, observations: Observations, fit: MapFit, last: TrackedFrame) -> TrackedFrame:
@@ -275,17 +270,15 @@ class RgbdBackend:
         """The first frame with enough depth is the first keyframe, and the world's frame of reference."""
         if np.count_nonzero(observations.z > 0) < MIN_INITIAL:
             return self._result(None)
-        result = self._begin_map(frame, observations, np.eye(4))
-        rolling = self.settings.tracking.rolling_shutter and self.camera.readout_s and self._tracked
-        self._first = (frame, observations) if rolling else None
-        return result
+        if self.settings.tracking.rolling_shutter and self.camera.readout_s:
+            self._first = frame, observations
+        return self._begin_map(frame, observations, np.eye(4))
 
     def _begin_map(self, frame: FrameBundle, observations: Observations, T_cam_world: Array) -> TrackResult:
         """The frame becomes the first keyframe of the active map."""
         self._tracked = True
-        self._last = tracked = TrackedFrame(
-            observations, np.full(len(observations), -1, np.int64), T_cam_world, frame.timestamp
-        )
+        point = np.full(len(observations), -1, np.int64)
+        self._last = tracked = TrackedFrame(observations, point, T_cam_world, frame.timestamp)
         timings = self._insert_keyframe(frame, tracked)
         self._update_state()
         self._remember(frame, np.eye(4), KNOWN_POSE)
@@ -418,9 +411,8 @@ class RgbdBackend:
             TrackerError: There is no map yet, or it is too large for a file.
             DynslamError: The file cannot be written.
         """
-        atlas = copy(self.atlas)
-        atlas.world = self._refined or self.world
-        save_atlas(path, atlas, self._features, depth=self.uses_depth, made_by=made_by)
+        world = self._refined or self.world
+        save_atlas(path, self.atlas, world, self._features, depth=self.uses_depth, made_by=made_by)
 
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.

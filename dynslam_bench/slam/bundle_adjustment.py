@@ -15,14 +15,9 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point
 from dynslam_bench.slam.map import Array, Map, Slots
-from dynslam_bench.slam.pose_optimisation import (
-    CHI2_DEPTH,
-    CHI2_MONO,
-    cauchy_width,
-    observation_chi2,
-)
+from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, cauchy_width, observation_chi2
 
 FIXED_KEYFRAMES = 6
 """Further keyframes that observe the same points and stay where they are."""
@@ -100,33 +95,23 @@ def _step(
     damping: float, chi2: Array, new_poses: Array, new_points: Array,
 ) -> bool:  # fmt: skip
     """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
-    n, q = obs_pose.shape[0], points.shape[0]
-    size = 6 * variable
-    s = np.zeros((size, size))
-    g = np.zeros(size)
+    n, q, size = obs_pose.shape[0], points.shape[0], 6 * variable
+    s, g = np.zeros((size, size)), np.zeros(size)
     w = np.zeros((n, 6, 3))  # J_pose^T Lambda J_point
-    inverse = np.zeros((q, 3, 3))
-    b = np.zeros((q, 3))
+    inverse, b = np.zeros((q, 3, 3)), np.zeros((q, 3))
     jc, jl, e = np.zeros((3, 6)), np.zeros((3, 3)), np.zeros(3)
-    hll = np.zeros((3, 3))
-    y = np.zeros((6, 3))
+    hll, y = np.zeros((3, 3)), np.zeros((6, 3))
     for i in range(q):
         hll[:] = 0.0
         for k in range(start[i], start[i + 1]):
-            depth = info_right[k] > 0.0
             if chi2[k] == np.inf:
                 continue
-            weight = 1.0 / (1.0 + chi2[k] / width)
-            c = obs_pose[k]
-            r = poses[c]
-            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-            xc = r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + r[0, 3]
-            yc = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + r[1, 3]
-            zc = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + r[2, 3]
+            depth, weight = info_right[k] > 0.0, 1.0 / (1.0 + chi2[k] / width)
+            c, r = obs_pose[k], poses[obs_pose[k]]
+            xc, yc, zc = moved_point(r, points[i])
             iz = 1.0 / zc
             a, d = fx * iz, fy * iz
             au, dv = -a * xc * iz, -d * yc * iz
-            rows = 3 if depth else 2
             u = fx * xc * iz + cx
             e[0] = uv[k, 0] - u
             e[1] = uv[k, 1] - (fy * yc * iz + cy)
@@ -136,10 +121,9 @@ def _step(
                 jl[0, m] = a * r[0, m] + au * r[2, m]
                 jl[1, m] = d * r[1, m] + dv * r[2, m]
                 jl[2, m] = a * r[0, m] + ar * r[2, m]
-            lu = weight * info[k]
-            lr = weight * info_right[k]
+            lu, lr = weight * info[k], weight * info_right[k]
             for m in range(3):
-                f0, f1, f2 = lu * jl[0, m], lu * jl[1, m], (lr * jl[2, m] if rows == 3 else 0.0)
+                f0, f1, f2 = lu * jl[0, m], lu * jl[1, m], (lr * jl[2, m] if depth else 0.0)
                 b[i, m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
                 for o in range(m + 1):
                     hll[m, o] += f0 * jl[0, o] + f1 * jl[1, o] + f2 * jl[2, o]
@@ -152,7 +136,7 @@ def _step(
                 jc[2, 3], jc[2, 4], jc[2, 5] = ar * yc, a * zc - ar * xc, -a * yc
                 base = 6 * c
                 for m in range(6):
-                    f0, f1, f2 = lu * jc[0, m], lu * jc[1, m], (lr * jc[2, m] if rows == 3 else 0.0)
+                    f0, f1, f2 = lu * jc[0, m], lu * jc[1, m], (lr * jc[2, m] if depth else 0.0)
                     g[base + m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
                     for o in range(m + 1):
                         s[base + m, base + o] += f0 * jc[0, o] + f1 * jc[1, o] + f2 * jc[2, o]
@@ -166,8 +150,7 @@ def _step(
         det = h00 * c00 + h10 * c10 + h20 * c20
         if not det > 1e-18:
             continue
-        t = 1.0 / det
-        v = inverse[i]
+        t, v = 1.0 / det, inverse[i]
         v[0, 0], v[0, 1], v[0, 2] = c00 * t, c10 * t, c20 * t
         v[1, 0], v[1, 1], v[1, 2] = c10 * t, (h00 * h22 - h20 * h20) * t, (h10 * h20 - h00 * h21) * t
         v[2, 0], v[2, 1], v[2, 2] = c20 * t, (h10 * h20 - h00 * h21) * t, (h00 * h11 - h10 * h10) * t
@@ -210,9 +193,7 @@ def _step(
             if c < variable:
                 for m in range(6):
                     x = g[6 * c + m]
-                    b0 -= w[k, m, 0] * x
-                    b1 -= w[k, m, 1] * x
-                    b2 -= w[k, m, 2] * x
+                    b0, b1, b2 = b0 - w[k, m, 0] * x, b1 - w[k, m, 1] * x, b2 - w[k, m, 2] * x
         v = inverse[i]
         for m in range(3):
             new_points[i, m] = points[i, m] + v[m, 0] * b0 + v[m, 1] * b1 + v[m, 2] * b2
@@ -242,12 +223,9 @@ def _adjust(
                 trial,
             )  # fmt: skip
             if new < cost:
-                poses, points = new_poses, new_points
-                for k in range(chi2.shape[0]):
-                    chi2[k] = trial[k]
-                gain = cost - new
-                cost = new
-                damping = max(damping * 0.2, 1e-8)
+                gain, damping = cost - new, max(damping * 0.2, 1e-8)
+                poses, points, cost = new_poses, new_points, new
+                chi2[:] = trial
                 if gain < 1e-5 * cost:
                     break
                 continue
@@ -262,10 +240,8 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
         problem: Start values and observations; every point should have two observations or depth.
         iterations: Levenberg-Marquardt iterations at most.
     """
-    c = problem.camera
-    count = len(problem.points)
-    start = np.searchsorted(problem.obs_point, np.arange(count + 1)).astype(np.int64)
-    chi2 = np.zeros(len(problem.obs_pose))
+    c, chi2 = problem.camera, np.zeros(len(problem.obs_pose))
+    start = np.searchsorted(problem.obs_point, np.arange(len(problem.points) + 1)).astype(np.int64)
     guess = np.ascontiguousarray(problem.poses), problem.variable, np.ascontiguousarray(problem.points)
     measured = problem.uv, problem.right, problem.info, problem.info_right
     lens = c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m
@@ -334,16 +310,14 @@ def _bundle(world: Map, variable: Slots, fixed: Slots, points: Slots, max_observ
     support = np.bincount(of_point[pose >= 0], minlength=len(points))
     supported = np.flatnonzero(support >= 2)
     order = supported[np.lexsort((world.id[points[supported]], -support[supported]))]  # long tracks first
-    order = order[np.cumsum(support[order]) <= max_observations]
-    order.sort()
+    order = np.sort(order[np.cumsum(support[order]) <= max_observations])
     if not len(order):
         return None
     point_number = np.full(len(points), -1, np.int64)
     point_number[order] = np.arange(len(order))
     used = (pose >= 0) & (point_number[of_point] >= 0)
     obs_point, obs_pose, points = point_number[of_point[used]], pose[used], points[order]
-    features = all_features[used].astype(np.int64)
-    at = poses[obs_pose]
+    features, at = all_features[used].astype(np.int64), poses[obs_pose]
     problem = BundleProblem(
         world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point,
         world.kf_xy[at, features], world.kf_right[at, features], world.kf_info[at, features],

@@ -249,10 +249,7 @@ def _essential(xy_first: Array, xy_second: Array, info: Array, camera: Camera) -
 
 
 def _pose(rotation: Any, translation: Any) -> Array:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = np.ravel(translation) / np.linalg.norm(translation)
-    return pose
+    return se3.from_matrix(np.ravel(translation) / np.linalg.norm(translation), rotation)
 
 
 def _triangulated(
@@ -320,7 +317,7 @@ class InitialMap:
     second: View
     motion: TwoViewMotion
 
-    def insert_into(self, world: Map, T_first_world: Array, submap: int) -> tuple[int, int]:
+    def insert_into(self, world: Map, T_first_world: Array, submap: int) -> list[int]:
         """Add the two views as keyframes of an empty submap, with their points; returns the keyframes' slots.
 
         Args:
@@ -337,7 +334,7 @@ class InitialMap:
         points = world.add_points(position, self.first.observations.rgb[first], slots[0], first)
         world.observe(slots[1], second, points)
         world.refresh(points)
-        return slots[0], slots[1]
+        return slots
 
 
 class TwoViewInitialiser:
@@ -380,11 +377,9 @@ class TwoViewInitialiser:
         if len(self.later) < MIN_VIEWS:
             return None
         motions = possible_motions(first.observations, self.later, camera, settings, self._motions)
-        self._motions = distinct_motions(motions)[:CARRIED]
-        motion = accepted_motion(motions, settings)
+        motion, self._motions = accepted_motion(motions, settings), distinct_motions(motions)[:CARRIED]
         if motion is None:
             return None
-        depth = float(np.median(motion.points[:, 2]))
-        pose = motion.T_second_first.copy()
-        pose[:3, 3] /= depth
+        depth, pose = float(np.median(motion.points[:, 2])), motion.T_second_first
+        pose = se3.from_matrix(pose[:3, 3] / depth, pose[:3, :3])
         return InitialMap(first, view, replace(motion, T_second_first=pose, points=motion.points / depth))

@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import FAR, CellGrid, Features, Words, distance, search_in_radius
 from dynslam_bench.geometry import se3
-from dynslam_bench.slam.bundle_adjustment import (
-    Bundle,
-    adjust_bundle,
-    full_bundle,
-    local_bundle,
-)
+from dynslam_bench.slam.bundle_adjustment import Bundle, adjust_bundle, full_bundle, local_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.settings import BackendSettings, KeyframeSettings
 from dynslam_bench.slam.tracking import CLOSE_BASELINES, Observations, TrackedFrame
@@ -67,8 +62,7 @@ class LocalMapper:
     """
 
     def __init__(self, world: Map, settings: BackendSettings) -> None:
-        self.world = world
-        self.settings = settings
+        self.world, self.settings = world, settings
         self.close_m = CLOSE_BASELINES * world.camera.baseline_m
         self.culled: list[tuple[int, int, Array]] = []
         points = world.points
@@ -100,18 +94,19 @@ class LocalMapper:
         world.refresh(world.points_of(slot))
         self._cull_points()
         self._points_from_depth(slot, observations, everything=first)
-        adjusted = 0.0
-        if not first:
-            neighbours, _ = world.covisible(slot)
-            neighbours = neighbours[: s.neighbours]
-            close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m)) / max(len(observations), 1)
-            if close < s.triangulate_below:
-                self._points_from_views(slot, observations, neighbours)
-            self._fuse(slot, neighbours)
-            start = perf_counter()
-            self.adjust(slot)
-            adjusted = perf_counter() - start
-            self._cull_keyframes(slot)
+        if first:
+            return slot, {"mapping": perf_counter() - begin, "bundle_adjustment": 0.0}
+        neighbours = world.covisible(slot)[0][: s.neighbours]
+        close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m)) / max(len(observations), 1)
+        if close < s.triangulate_below:
+            for other in neighbours.tolist():
+                features, others, position = triangulate(world, slot, other, s.min_parallax_sigmas)
+                self._add_points(slot, features, position, observations, (other, others))
+        self._fuse(slot, neighbours)
+        start = perf_counter()
+        self.adjust(slot)
+        adjusted = perf_counter() - start
+        self._cull_keyframes(slot)
         return slot, {"mapping": perf_counter() - begin - adjusted, "bundle_adjustment": adjusted}
 
     # ------------------------------------------------------------------ points
@@ -127,12 +122,6 @@ class LocalMapper:
             se3.inverse(world.kf_pose[slot]), world.camera.unproject(observations.xy[free], observations.z[free])
         )
         self._add_points(slot, free, position, observations)
-
-    def _points_from_views(self, slot: int, observations: Observations, neighbours: Slots) -> None:
-        """Points for features that have no point yet, by triangulation with the neighbours."""
-        for other in neighbours.tolist():
-            features, others, position = triangulate(self.world, slot, other, self.settings.mapping.min_parallax_sigmas)
-            self._add_points(slot, features, position, observations, (other, others))
 
     def _add_points(
         self,
@@ -163,16 +152,14 @@ class LocalMapper:
 
     def _fuse(self, slot: int, neighbours: Slots) -> None:
         """Match the new keyframe's points in its neighbours and theirs in it; merge duplicates."""
-        world = self.world
         for other in neighbours.tolist():
-            self.fuse_into(other, world.points_of(slot))
-        self.fuse_into(slot, world.points_of(neighbours))
-        world.refresh(world.points_of(slot))
+            self.fuse_into(other, self.world.points_of(slot))
+        self.fuse_into(slot, self.world.points_of(neighbours))
+        self.world.refresh(self.world.points_of(slot))
 
     def fuse_into(self, keyframe: int, candidates: Slots) -> None:
         """Match points in a keyframe: new observations of them, and duplicates among its own points."""
-        world = self.world
-        n = int(world.kf_count[keyframe])
+        world, n = self.world, int(self.world.kf_count[keyframe])
         own = world.kf_point[keyframe, :n]
         observed = np.zeros(world.alive.size, bool)
         observed[own[own >= 0]] = True
@@ -184,17 +171,15 @@ class LocalMapper:
         features = Features(xy, world.kf_right[keyframe, :n], levels, world.kf_words[keyframe, :n], grid)
         windows, words = (uv, right, 3.0 * world.scales[octave]), world.words[points]
         feature = search_in_radius(features, np.ones(n, bool), windows, octave, words, max_distance=MAX_DISTANCE)
-        hit = feature >= 0
-        points, feature = points[hit], feature[hit]
-        good = ((xy[feature] - uv[hit]) ** 2).sum(axis=1) / world.scales[levels[feature]] ** 2 < 5.991
+        good = feature >= 0
+        good &= ((xy[feature] - uv) ** 2).sum(axis=1) / world.scales[levels[feature]] ** 2 < 5.991
         points, feature = points[good], feature[good]
         empty = own[feature] < 0
         world.observe(keyframe, feature[empty], points[empty])
         for row, point in zip(feature[~empty].tolist(), points[~empty].tolist(), strict=True):
-            duplicate = int(world.kf_point[keyframe, row])
-            if duplicate < 0 or duplicate == point or not world.alive[point]:
-                continue
-            world.replace_point(*sorted((duplicate, point), key=world.n_obs.__getitem__))  # the less observed one
+            duplicate = int(own[row])
+            if duplicate >= 0 and duplicate != point and world.alive[point]:
+                world.replace_point(*sorted((duplicate, point), key=world.n_obs.__getitem__))  # the less observed one
 
     # ------------------------------------------------------------------ bundle adjustment
 
@@ -221,13 +206,12 @@ class LocalMapper:
             if total and redundant > s.redundant_share * total:
                 self.cull_keyframe(other)
         while world.keyframe_count > s.maximum:
-            shares = []
-            for other in self._dispensable(slot).tolist():
-                total, redundant = world.redundancy(other, self.close_m)
-                shares.append((-redundant / max(total, 1), int(world.kf_id[other]), other))
-            if not shares:
+            others = self._dispensable(slot)
+            if not len(others):
                 break
-            self.cull_keyframe(min(shares)[2])
+            counts = [world.redundancy(other, self.close_m) for other in others.tolist()]
+            shares = [redundant / max(total, 1) for total, redundant in counts]
+            self.cull_keyframe(int(others[np.lexsort((world.kf_id[others], np.negative(shares)))[0]]))
 
     def _dispensable(self, slot: int) -> Slots:
         """Keyframes that may be culled where there are too many; at least one of each submap stays for its frames.
@@ -235,8 +219,7 @@ class LocalMapper:
         Tracking depends on the newest and on those around the camera, which overlap most: they stay if others can be
         culled.
         """
-        world = self.world
-        kept = world.keyframes[1:-2]
+        world, kept = self.world, self.world.keyframes[1:-2]
         kept = kept[np.bincount(world.kf_map[world.keyframes])[world.kf_map[kept]] > 1]
         near, _ = world.covisible(slot)
         older = kept[world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT_SHARE]
@@ -246,14 +229,9 @@ class LocalMapper:
 
     def cull_keyframe(self, slot: int) -> None:
         """Remove a keyframe; `culled` names its replacement, the most covisible keyframe or the newest of its map."""
-        world = self.world
-        others, _ = world.covisible(slot)
-        if not len(others):
-            others = world.submap(int(world.kf_map[slot]))
-            others = others[others != slot][::-1]
-        replacement = int(others[0])
-        relative = world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement])
-        self.culled.append((slot, replacement, relative))
+        world, same_map = self.world, self.world.submap(int(self.world.kf_map[slot]))
+        replacement = int(np.r_[world.covisible(slot)[0], same_map[same_map != slot][::-1]][0])
+        self.culled.append((slot, replacement, world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement])))
         world.remove_keyframe(slot)
 
 
@@ -309,15 +287,12 @@ class KeyframePolicy:
             frame: Its index.
             reference: Slot of the keyframe that shares most points with it.
         """
-        s, gap = self.settings, frame - self._last
+        s, gap, matched = self.settings, frame - self._last, tracked.point >= 0
         close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
-        matched = tracked.point >= 0
         inliers = int(np.count_nonzero(matched))
         self._most_inliers = max(self._most_inliers, inliers)
-        if s.schedule == "none" or inliers <= MIN_KEYFRAME_INLIERS:
-            return False
-        if s.schedule == "every":
-            return True
+        if s.schedule != "rule" or inliers <= MIN_KEYFRAME_INLIERS:
+            return s.schedule == "every" and inliers > MIN_KEYFRAME_INLIERS
         few_close = np.count_nonzero(close & matched) < MIN_CLOSE
         if np.count_nonzero(close & ~matched) > NEW_CLOSE and (few_close or gap >= s.max_gap):
             return True
@@ -353,8 +328,7 @@ def _triangulate(
 ) -> tuple[Slots, Slots, Array]:  # fmt: skip
     """Pairs of rows that fit one point, and its depth along the ray of camera `a`."""
     # x_b = r x_a + t
-    r = np.zeros((3, 3))
-    t = np.zeros(3)
+    r, t = np.zeros((3, 3)), np.zeros(3)
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -364,16 +338,10 @@ def _triangulate(
         for k in range(3):
             t[i] -= r[i, k] * pose_a[k, 3]
     n, m = rows_a.shape[0], rows_b.shape[0]
-    match = np.full(n, -1, np.int64)
-    depth = np.zeros(n)
-    matched_by = np.full(m, -1, np.int64)
-    best_distance = np.full(n, FAR, np.int64)
-    bx, by = np.empty(m), np.empty(m)
-    for j in range(m):
-        bx[j] = (xy_b[rows_b[j], 0] - cx) / fx
-        by[j] = (xy_b[rows_b[j], 1] - cy) / fy
-    cosine_limit = np.cos(MIN_PARALLAX)
-    focal = 0.5 * (fx + fy)
+    match, matched_by = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
+    depth, best_distance = np.zeros(n), np.full(n, FAR, np.int64)
+    bx, by = (xy_b[rows_b, 0] - cx) / fx, (xy_b[rows_b, 1] - cy) / fy
+    cosine_limit, focal = np.cos(MIN_PARALLAX), 0.5 * (fx + fy)
     for i in range(n):
         a = rows_a[i]
         x, y = (xy_a[a, 0] - cx) / fx, (xy_a[a, 1] - cy) / fy
@@ -406,12 +374,9 @@ def _triangulate(
             else:
                 continue
             w = d2 * s + t[2]
-            if s < 0.1 or w < 0.1 or s > 40.0:
+            if s < 0.1 or w < 0.1 or s > 40.0 or (z_b[b] > 0.0 and abs(w - z_b[b]) > 0.05 * z_b[b]):
                 continue
-            if z_b[b] > 0.0 and abs(w - z_b[b]) > 0.05 * z_b[b]:
-                continue
-            e0 = (d0 * s + t[0]) / w - bx[j]
-            e1 = (d1 * s + t[1]) / w - by[j]
+            e0, e1 = (d0 * s + t[0]) / w - bx[j], (d1 * s + t[1]) / w - by[j]
             if e0 * e0 + e1 * e1 > 5.991 * sigma * sigma:
                 continue
             ratio = (s * np.sqrt(x * x + y * y + 1.0)) / (w * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0))
@@ -419,20 +384,13 @@ def _triangulate(
             # the nearer view shows the patch larger, hence at a coarser octave
             if ratio > 1.8 * expected or ratio * 1.8 < expected:
                 continue
-            best_distance[i] = d
-            match[i] = j
-            depth[i] = s
+            best_distance[i], match[i], depth[i] = d, j, s
     for i in range(n):  # one feature of b for one of a: the smaller distance wins, then the lower index
         j = match[i]
         if j >= 0 and (matched_by[j] < 0 or best_distance[i] < best_distance[matched_by[j]]):
             matched_by[j] = i
-    count = 0
-    out_a, out_b, out_z = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
-    for i in range(n):
-        if match[i] >= 0 and matched_by[match[i]] == i:
-            out_a[count], out_b[count], out_z[count] = rows_a[i], rows_b[match[i]], depth[i]
-            count += 1
-    return out_a[:count].copy(), out_b[:count].copy(), out_z[:count].copy()
+    chosen = np.sort(matched_by[matched_by >= 0])
+    return rows_a[chosen], rows_b[match[chosen]], depth[chosen]
 
 
 def triangulate(world: Map, slot: int, other: int, min_parallax_sigmas: float) -> tuple[Slots, Slots, Array]:
@@ -450,8 +408,7 @@ def triangulate(world: Map, slot: int, other: int, min_parallax_sigmas: float) -
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
-    n, m = int(world.kf_count[slot]), int(world.kf_count[other])
-    camera = world.camera
+    n, m, camera = int(world.kf_count[slot]), int(world.kf_count[other]), world.camera
     features, others, depth = _triangulate(
         world.kf_pose[slot], world.kf_pose[other],
         np.flatnonzero(world.kf_point[slot, :n] < 0), np.flatnonzero(world.kf_point[other, :m] < 0),
@@ -460,6 +417,5 @@ def triangulate(world: Map, slot: int, other: int, min_parallax_sigmas: float) -
         world.kf_words[slot], world.kf_words[other], world.scales,
         camera.fx, camera.fy, camera.cx, camera.cy, float(min_parallax_sigmas),
     )  # fmt: skip
-    pose = se3.inverse(world.kf_pose[slot])
     local = camera.unproject(world.kf_xy[slot, features], depth)
-    return features, others, local @ pose[:3, :3].T + pose[:3, 3]
+    return features, others, se3.transform(se3.inverse(world.kf_pose[slot]), local)

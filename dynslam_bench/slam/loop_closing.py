@@ -73,9 +73,8 @@ AGREE_M, AGREE_DEG, AGREE_SCALE = 0.1, 2.0, 0.1
 """Largest difference of the corrections of consecutive keyframes; of a scale, its logarithm."""
 SIGMAS = (0.02, 0.02, 0.02, 0.01, 0.01, 0.01)
 """Of an edge of weight 1: metres, or units of length without depth, then radians; only their ratio matters."""
-GRAPH_ITERATIONS = 20
-MIN_GAIN = 1e-9
-"""The search ends when a step lowers the cost by a smaller share."""
+GRAPH_ITERATIONS, MIN_GAIN = 20, 1e-9
+"""The search ends after so many steps, or when one lowers the cost by a smaller share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,15 +164,11 @@ class LoopCloser:
     def __init__(
         self, atlas: Atlas, mapper: LocalMapper, settings: BackendSettings, seed: int, *, scale_is_known: bool = True
     ) -> None:
-        self.atlas = atlas
-        self.world = atlas.world
-        self.mapper = mapper
-        self.settings = settings
+        self.atlas, self.world, self.mapper, self.settings = atlas, atlas.world, mapper, settings
         self.closed: list[Loop] = []
         self.rescaled: dict[int, float] = {}
         self.in_root_map = self.leaves_submap = False
-        self._seed = seed
-        self._scale_is_known = scale_is_known
+        self._seed, self._scale_is_known = seed, scale_is_known
         self._path: dict[int, float] = {}
         self._path_length = 0.0
         self._shortcuts: list[tuple[float, float]] = []
@@ -197,11 +192,10 @@ class LoopCloser:
             self._loop_edges = transferred_edges(self._loop_edges, *ids, relative)
         loop = self._verified(slot, observations) if root is None else self._loop_to_root(slot, observations, root)
         self._met_at = self._met_at if self.in_root_map else None
+        if loop is None or (self._row and not loop.correction.agrees(self._row[-1], self.world.kf_centre[slot])):
+            self._row.clear()
         if loop is None:
-            self._row.clear()
             return
-        if self._row and not loop.correction.agrees(self._row[-1], self.world.kf_centre[slot]):
-            self._row.clear()
         self._row.append(loop.correction)
         if len(self._row) < self.settings.loop_closing.confirmations:
             return
@@ -211,15 +205,14 @@ class LoopCloser:
         if not loop.fits:
             self.leaves_submap = self.in_root_map = root is not None
             return
-        if loop.merges and root is None and self._aliased(slot, observations, loop):
-            return
-        if loop.merges:
-            self._merge(slot, loop)
-        else:
+        if not loop.merges:
             self._correct(slot, loop)
-        recognised = loop.place.keyframe
-        self._fuse(slot, recognised)
-        self._shortcuts.append((self._path_at(recognised), self._path_length))
+        elif root is None and self._aliased(slot, observations, loop):
+            return
+        else:
+            self._merge(slot, loop)
+        self._fuse(slot, loop.place.keyframe)
+        self._shortcuts.append((self._path_at(loop.place.keyframe), self._path_length))
         self.closed.append(loop)
         self._last_pose = self.world.kf_pose[slot].copy()  # a correction adds no path
 
@@ -352,7 +345,7 @@ class LoopCloser:
     def _correct(self, slot: int, loop: Loop) -> None:
         """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
         world, correction = self.world, loop.correction
-        loop_edge = replace(self._edge(loop.place.keyframe, slot, correction.T_cam_now), weight=LOOP_WEIGHT)
+        loop_edge = self._edge(loop.place.keyframe, slot, correction.T_cam_now, LOOP_WEIGHT)
         older = edges_within(world.kf_id[world.keyframes], self._loop_edges)
         self._loop_edges = [*older, loop_edge]
         if (np.array([correction.moved_m, correction.rotated_deg, abs(np.log(correction.scale))]) < NEGLIGIBLE).all():
@@ -386,19 +379,18 @@ class LoopCloser:
         """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger one moves onto the older one."""
         world = self.world
         younger, older, correction = self._merge_of(slot, loop)
-        slots = world.submap(younger)
-        world.move_submap(younger, correction.T_now_before, older, correction.scale)
+        slots = world.move_submap(younger, correction.T_now_before, older, correction.scale)
         self._note_scales(slots, np.full(len(slots), correction.scale))
-        self._loop_edges.append(replace(self._edge(loop.place.keyframe, slot, world.kf_pose[slot]), weight=LOOP_WEIGHT))
+        self._loop_edges.append(self._edge(loop.place.keyframe, slot, world.kf_pose[slot], LOOP_WEIGHT))
 
     def _note_scales(self, slots: Slots, scales: Array) -> None:
         """Lengths around keyframes were multiplied."""
         self._loop_edges = rescaled_edges(self._loop_edges, self.world.kf_id[slots], scales)
         self.rescaled = dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
-    def _edge(self, one: int, other: int, pose_of_other: Array) -> Edge:
-        id_one, id_other = self.world.kf_id[[one, other]].tolist()
-        return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.world.kf_pose[one]))
+    def _edge(self, one: int, other: int, pose_of_other: Array, weight: float = 1.0) -> Edge:
+        ids = self.world.kf_id[[one, other]].tolist()
+        return Edge(*ids, pose_of_other @ se3.inverse(self.world.kf_pose[one]), weight)
 
     def _covisibility_edges(self, slots: Slots) -> list[Edge]:
         """Edges of each keyframe to the older ones that share many points, and to the one that shares most.
@@ -409,14 +401,14 @@ class LoopCloser:
         for slot in slots.tolist():
             near, shared = self.world.covisible(slot)
             older = self.world.kf_id[near] < self.world.kf_id[slot]
-            near, shared = near[older], shared[older]
-            pairs |= {(int(other), slot) for other in [*near[:1], *near[shared >= STRONG_COVISIBILITY]]}
+            linked = [*near[older][:1], *near[older & (shared >= STRONG_COVISIBILITY)]]
+            pairs |= {(int(other), slot) for other in linked}
         return [self._edge(a, b, self.world.kf_pose[b]) for a, b in sorted(pairs)]
 
     def _fuse(self, slot: int, candidate: int) -> None:
         points = self.world.points_of(around(self.world, candidate))
         for keyframe in around(self.world, slot).tolist():
-            self.mapper.fuse_into(keyframe, points[self.world.alive[points]])
+            self.mapper.fuse_into(keyframe, points)
         self.world.refresh(points[self.world.alive[points]])
         self.mapper.adjust(slot)
 
@@ -460,14 +452,12 @@ def transferred_edges(edges: Sequence[Edge], culled: int, replacement: int, T_cu
     """
     transferred = []
     for edge in edges:
-        one, other, pose = edge.one, edge.other, edge.T_other_one
-        if one == culled:
-            one, pose = replacement, pose @ T_culled_replacement
-        if other == culled:
-            other, pose = replacement, se3.inverse(T_culled_replacement) @ pose
-        if one != other:
-            transferred.append(Edge(one, other, pose, edge.weight))
-    return transferred
+        if edge.one == culled:
+            edge = replace(edge, one=replacement, T_other_one=edge.T_other_one @ T_culled_replacement)
+        if edge.other == culled:
+            edge = replace(edge, other=replacement, T_other_one=se3.inverse(T_culled_replacement) @ edge.T_other_one)
+        transferred.append(edge)
+    return [edge for edge in transferred if edge.one != edge.other]
 
 
 def edges_within(ids: Slots, edges: Sequence[Edge]) -> list[Edge]:
@@ -492,11 +482,9 @@ def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: floa
         Factors ``[N]``.
     """
     all_edges = [*edges, loop_edge]
-    one = np.searchsorted(ids, [edge.one for edge in all_edges])
-    other = np.searchsorted(ids, [edge.other for edge in all_edges])
-    wanted = np.zeros(len(all_edges))
+    one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in all_edges]).T
+    row, wanted = np.arange(len(all_edges)), np.zeros(len(all_edges))
     wanted[-1] = np.log(scale)
-    row = np.arange(len(all_edges))
     ends = np.r_[row, row], np.r_[one, other]
     values = np.r_[-np.ones(len(row)), np.ones(len(row))]
     _, part = connected_components(coo_array((np.ones(len(row)), (one, other)), shape=(len(ids), len(ids))), False)
@@ -520,8 +508,7 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     Returns:
         World to camera ``[N, 4, 4]``.
     """
-    one = np.searchsorted(ids, [edge.one for edge in edges])
-    other = np.searchsorted(ids, [edge.other for edge in edges])
+    one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in edges]).T
     back = se3.inverse(np.array([edge.T_other_one for edge in edges]))
     sigmas = SIGMAS / np.sqrt([[edge.weight] for edge in edges])
     error = _edge_errors(poses, one, other, back, sigmas)
@@ -556,23 +543,18 @@ def _graph_step(poses: Array, one: Slots, other: Slots, error: Array, sigmas: Ar
     jacobian = bsr_array(block_rows, shape=(error.size, 6 * len(poses))).tocsc()[:, 6:]
     normal = (jacobian.T @ jacobian).tocsc()
     normal = normal + diags_array(damping * normal.diagonal() + 1e-12)
-    twists = np.zeros((len(poses), 6))
-    twists[1:] = -spsolve(normal.tocsc(), jacobian.T @ error.ravel()).reshape(-1, 6)
-    return twists
+    twists = -spsolve(normal.tocsc(), jacobian.T @ error.ravel()).reshape(-1, 6)
+    return np.concatenate([np.zeros((1, 6)), twists])
 
 
 def _adjoint(pose: Array) -> Array:
     """Matrices ``[..., 6, 6]`` that turn twists (translation, rotation) into the frame a pose leads to."""
-    matrix = np.zeros((*pose.shape[:-2], 6, 6))
     rotation = pose[..., :3, :3]
-    matrix[..., :3, :3] = matrix[..., 3:, 3:] = rotation
-    matrix[..., :3, 3:] = se3.hat(pose[..., :3, 3]) @ rotation
-    return matrix
+    return np.block([[rotation, se3.hat(pose[..., :3, 3]) @ rotation], [np.zeros_like(rotation), rotation]])
 
 
 def _inverse_left_jacobian(twist: Array) -> Array:
     """``[..., 6, 6]``, to second order: how the logarithm of a pose follows a twist on its left."""
-    ad = np.zeros((*twist.shape[:-1], 6, 6))
-    ad[..., :3, :3] = ad[..., 3:, 3:] = se3.hat(twist[..., 3:])
-    ad[..., :3, 3:] = se3.hat(twist[..., :3])
+    by_translation, by_rotation = se3.hat(twist[..., :3]), se3.hat(twist[..., 3:])
+    ad = np.block([[by_rotation, by_translation], [np.zeros_like(by_rotation), by_rotation]])
     return np.eye(6) - ad / 2 + ad @ ad / 12

@@ -6,7 +6,7 @@ Keyframes and points live in numbered slots; a freed slot is used again, after t
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from dynslam_bench.contracts import KeyframeRecord, KeyframeView, Keypoints, Map
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import Camera, se3
+from dynslam_bench.geometry.gauss_newton import moved_point
 
 if TYPE_CHECKING:
     from dynslam_bench.slam.tracking import Observations
@@ -74,13 +75,10 @@ class Map:
     """
 
     def __init__(self, camera: Camera, scales: Array) -> None:
-        self.camera = camera
-        self.scales = np.ascontiguousarray(scales, np.float64)
-        self.next_keyframe = 0
-        self.next_point = 0
+        self.camera, self.scales = camera, np.ascontiguousarray(scales, np.float64)
+        self.next_keyframe = self.next_point = self._top = 0
         self._free_points: list[int] = []
         self._freed_points: list[int] = []
-        self._top = 0
         self.substrings: dict[int, tuple[int, NDArray[np.uint16]]] = {}
         for name, (kind, *shape) in (KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES).items():
             setattr(self, name, np.zeros((0, *shape), kind))
@@ -131,18 +129,12 @@ class Map:
         if n > features:
             self._grow(FEATURE_TABLES, n, axis=1)
             self.kf_point[:, features:] = -1
-        free = np.flatnonzero(~self.kf_alive)
-        if not len(free):
-            free = np.array([self.kf_alive.size])
+        if self.kf_alive.all():
             self._grow(KEYFRAME_TABLES | FEATURE_TABLES, max(16, self.kf_alive.size + self.kf_alive.size // 2))
-        slot = int(free[0])
-        self.kf_alive[slot] = True
-        self.kf_id[slot] = self.next_keyframe
+        slot = int(self.kf_alive.argmin())
+        self.kf_alive[slot], self.kf_id[slot], self.kf_map[slot] = True, self.next_keyframe, submap
+        self.kf_frame[slot], self.kf_stamp[slot], self.kf_count[slot] = frame, stamp, n
         self.next_keyframe += 1
-        self.kf_map[slot] = submap
-        self.kf_frame[slot] = frame
-        self.kf_stamp[slot] = stamp
-        self.kf_count[slot] = n
         self.set_pose(slot, T_cam_world)
         raw = observations.keypoints
         described = (
@@ -175,15 +167,13 @@ class Map:
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
         observers, _ = self.observations(points[points >= 0])
-        counts = np.bincount(observers, minlength=self.kf_alive.size)
-        if exclude >= 0:
-            counts[exclude] = 0
+        counts = np.bincount(observers[observers != exclude], minlength=self.kf_alive.size)
         slots = np.flatnonzero(counts)
         order = np.lexsort((-self.kf_id[slots], -counts[slots]))
         return slots[order], counts[slots[order]]
 
-    def move_submap(self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0) -> None:
-        """Merge a submap into another: all its keyframes and points move, and become part of that.
+    def move_submap(self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0) -> Slots:
+        """Merge a submap into another: all its keyframes and points move, and become part of that; returns their slots.
 
         Args:
             number: The submap.
@@ -191,7 +181,7 @@ class Map:
             merged_into: The other's number.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """
-        slots = np.flatnonzero(self.kf_alive & (self.kf_map == number))
+        slots = self.submap(number)
         points = self.points_of(slots)
         self.kf_pose[slots, :3, 3] *= scale
         for slot in slots.tolist():
@@ -199,6 +189,7 @@ class Map:
         self.position[points] = se3.transform(T_new_old, scale * self.position[points])
         self.kf_map[slots] = merged_into
         self.refresh(points)
+        return slots
 
     def remove_keyframe(self, slot: int) -> None:
         """Remove a keyframe, its observations, and the points that no keyframe observes any more."""
@@ -221,16 +212,10 @@ class Map:
         if self._top + fresh > self.alive.size:
             self._grow(POINT_TABLES, max(2048, self._top + fresh, self.alive.size + self.alive.size // 2))
         slots = np.concatenate([np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)])
-        self._top += fresh
-        self.alive[slots] = True
-        self.id[slots] = np.arange(self.next_point, self.next_point + n)
-        self.next_point += n
-        self.position[slots] = position
-        self.rgb[slots] = rgb
-        self.visible[slots] = 1
-        self.found[slots] = 1
-        self.born[slots] = self.kf_id[keyframe]
-        self.n_obs[slots] = 0
+        self.alive[slots], self.id[slots] = True, np.arange(self.next_point, self.next_point + n)
+        self._top, self.next_point = self._top + fresh, self.next_point + n
+        self.position[slots], self.rgb[slots], self.born[slots] = position, rgb, self.kf_id[keyframe]
+        self.visible[slots], self.found[slots], self.n_obs[slots] = 1, 1, 0
         self.observe(keyframe, features, slots)
         return slots
 
@@ -248,8 +233,7 @@ class Map:
 
     def remove_points(self, points: Slots) -> None:
         """Remove points and their observations."""
-        points = np.unique(points)
-        points = points[self.alive[points]]
+        points = np.unique(points[self.alive[points]])
         self.kf_point[self.observations(points)] = -1
         self.n_obs[points], self.alive[points] = 0, False
         self._freed_points.extend(points.tolist())
@@ -258,8 +242,8 @@ class Map:
         """Replace a point by another that is the same point of the scene."""
         self._reserve(int(self.n_obs[new] + self.n_obs[old]))
         _replace(*self._observed, self.kf_point, old, new)
-        self.visible[new] += self.visible[old]
-        self.found[new] += self.found[old]
+        for count in (self.visible, self.found):
+            count[new] += count[old]
         self.alive[old] = False
         self._freed_points.append(old)
 
@@ -307,25 +291,15 @@ class Map:
         """
         depth = self.kf_z[slot, : self.kf_count[slot]]
         close = (depth > 0) & (depth <= close_m) if depth.any() else np.ones(len(depth), bool)
-        total, redundant = _redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed)
-        return int(total), int(redundant)
+        return _redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed)
 
 
 # ---------------------------------------------------------------------- what filters and files read
 
 
-class MapView(NamedTuple):
-    """What filters may read of the map.
-
-    Attributes:
-        keyframes: The newest keyframes, newest first, at most `VIEWS`.
-        ids: int64 ``[M]``, ids of all points.
-        positions: World positions ``[M, 3]`` of the points, metres.
-    """
-
-    keyframes: tuple[KeyframeView, ...]
-    ids: Slots
-    positions: Array
+MapView: TypeAlias = tuple[tuple[KeyframeView, ...], tuple[Slots, Array]]
+"""What filters may read of the map: the newest keyframes, newest first, at most `VIEWS`; ids ``[M]`` and world
+positions ``[M, 3]`` in metres of all points."""
 
 
 def points_in(world: Map, submap: int) -> Slots:
@@ -379,7 +353,7 @@ class MapViews:
         if self._made_for != (world.next_keyframe, submap):
             self._made_for = world.next_keyframe, submap
             newest, points = world.submap(submap)[::-1][:VIEWS].tolist(), points_in(world, submap)
-            self._view = MapView(tuple(map(self._keyframe, newest)), world.id[points], world.position[points])
+            self._view: MapView = tuple(map(self._keyframe, newest)), (world.id[points], world.position[points])
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
@@ -407,9 +381,8 @@ class MapViews:
 @kernel
 def _link_one(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframe: int, feature: int, point: int) -> None:
     end = n_obs[point]
-    for o in range(end):
-        if obs_kf[point, o] == keyframe:
-            return
+    if (obs_kf[point, :end] == keyframe).any():
+        return
     obs_kf[point, end], obs_ft[point, end] = keyframe, feature
     n_obs[point] += 1
     kf_point[keyframe, feature] = point
@@ -457,36 +430,29 @@ def _refresh(
 ) -> None:  # fmt: skip
     """Renew descriptor (the medoid of the observed ones), viewing direction and scale range of the points."""
     for i in range(points.shape[0]):
-        p = points[i]
-        n = n_obs[p]
+        p, n = points[i], n_obs[points[i]]
         if n == 0:
             continue
-        m = min(n, 12)  # only the newest observations count
-        best = n - 1
-        if m > 2:
-            best_score = 1 << 40
-            for a in range(n - m, n):
+        first, best, best_score = max(n - 12, 0), n - 1, 1 << 40  # only the newest observations count
+        if n > 2:
+            for a in range(first, n):
                 score = 0
-                for b in range(n - m, n):
+                for b in range(first, n):
                     score += distance(kf_words[obs_kf[p, a], obs_ft[p, a]], kf_words[obs_kf[p, b], obs_ft[p, b]])
                 if score < best_score:
                     best, best_score = a, score
         for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
             words[p, w] = kf_words[obs_kf[p, best], obs_ft[p, best], w]
         sx, sy, sz = 0.0, 0.0, 0.0
-        reference_distance = 0.0
         for o in range(n):
             c = kf_centre[obs_kf[p, o]]
             x, y, z = position[p, 0] - c[0], position[p, 1] - c[1], position[p, 2] - c[2]
             d = np.sqrt(x * x + y * y + z * z) + 1e-12
-            sx += x / d
-            sy += y / d
-            sz += z / d
+            sx, sy, sz = sx + x / d, sy + y / d, sz + z / d
             if o == 0:
-                reference_distance = d * scales[kf_octave[obs_kf[p, o], obs_ft[p, o]]]
+                far[p] = d * scales[kf_octave[obs_kf[p, o], obs_ft[p, o]]]
         length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
         normal[p, 0], normal[p, 1], normal[p, 2] = sx / length, sy / length, sz / length
-        far[p] = reference_distance
 
 
 @kernel
@@ -501,11 +467,8 @@ def _project(
         Points, pixels, right coordinates, predicted octaves and cosines of the viewing angle.
     """
     n = candidates.shape[0]
-    index = np.empty(n, np.int64)
-    uv = np.empty((n, 2))
-    right = np.empty(n)
-    octave = np.empty(n, np.int64)
-    cosine = np.empty(n)
+    index, octave = np.empty(n, np.int64), np.empty(n, np.int64)
+    uv, right, cosine = np.empty((n, 2)), np.empty(n), np.empty(n)
     r, t = pose[:3, :3], pose[:3, 3]
     ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
     oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
@@ -515,15 +478,13 @@ def _project(
     count = 0
     for i in range(n):
         p = candidates[i]
-        x, y, z = position[p, 0], position[p, 1], position[p, 2]
-        zc = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        xc, yc, zc = moved_point(pose, position[p])
         if zc < 0.05:
             continue
-        u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / zc + cx
-        v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / zc + cy
+        u, v = fx * xc / zc + cx, fy * yc / zc + cy
         if u < 0.0 or u >= width or v < 0.0 or v >= height:
             continue
-        dx, dy, dz = x - ox, y - oy, z - oz
+        dx, dy, dz = position[p, 0] - ox, position[p, 1] - oy, position[p, 2] - oz
         d = np.sqrt(dx * dx + dy * dy + dz * dz)
         if d > WIDEN_RANGE * far[p] or d * WIDEN_RANGE < far[p] / nearest:
             continue
@@ -531,11 +492,8 @@ def _project(
         if c < MIN_COSINE:
             continue
         level = int(np.ceil(np.log(far[p] / d) * inverse_log - 1e-9))
-        index[count] = p
-        uv[count, 0], uv[count, 1] = u, v
-        right[count] = u - bf / zc
-        octave[count] = min(max(level, 0), levels - 1)
-        cosine[count] = c
+        index[count], octave[count] = p, min(max(level, 0), levels - 1)
+        uv[count, 0], uv[count, 1], right[count], cosine[count] = u, v, u - bf / zc, c
         count += 1
     return index[:count].copy(), uv[:count].copy(), right[:count].copy(), octave[:count].copy(), cosine[:count].copy()
 
@@ -550,10 +508,7 @@ def _redundancy(
         p = kf_point[keyframe, f]
         if p < 0 or not close[f]:
             continue
-        total += 1
-        if n_obs[p] <= REDUNDANT_VIEWS:
-            continue
-        fine = 0
+        total, fine = total + 1, 0
         for o in range(n_obs[p]):
             if obs_kf[p, o] != keyframe and kf_octave[obs_kf[p, o], obs_ft[p, o]] <= kf_octave[keyframe, f] + 1:
                 fine += 1

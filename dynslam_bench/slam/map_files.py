@@ -7,12 +7,11 @@ out: in another one it means nothing. `docs/reference/files.md` says how maps ar
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -253,23 +252,18 @@ def write_keyframes_csv(path: Path, outputs: MapOutputs, exact: Mapping[float, i
     Raises:
         DynslamError: The folder cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["id", "frame", "timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw", "features", "observations", "map"]
-    )
+    lines = ["id,frame,timestamp,tx,ty,tz,qx,qy,qz,qw,features,observations,map"]
     for record in outputs.keyframes:
-        translation, quaternion = se3.to_quaternion(record.T_world_cam)
-        numbers = [f"{value:.9f}" for value in (*translation, *quaternion)]
-        when: list[object] = ["", ""]
+        pose = (f"{value:.9f}" for value in np.concatenate(se3.to_quaternion(record.T_world_cam)))
+        when: tuple[object, object] = "", ""
         if record.frame >= 0:
-            when = [record.frame, format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp))]
-        writer.writerow([record.id, *when, *numbers, record.features, record.observations, record.map])
-    write_atomic(path, text.getvalue())
+            when = record.frame, format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp))
+        cells = (record.id, *when, *pose, record.features, record.observations, record.map)
+        lines.append(",".join(map(str, cells)))
+    write_atomic(path, "\n".join([*lines, ""]))
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(NamedTuple):
     """Map points of a stored run.
 
     Attributes:
@@ -299,7 +293,7 @@ def read_ply(path: Path) -> Cloud:
     points = np.frombuffer(body, _PLY_LAYOUT)
     if not np.isfinite(points["position"]).all():
         raise RunError(f"{path} holds points that are not finite")
-    return Cloud(points["position"].copy(), points["colour"].copy(), points["observations"].copy())
+    return Cloud(*(points[name].copy() for name in ("position", "colour", "observations")))
 
 
 def _ply_header(rows: int) -> bytes:

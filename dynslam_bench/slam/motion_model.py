@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.gauss_newton import apply_twist
@@ -68,8 +69,12 @@ def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
     return np.block([[q * dt**4 / 4, q * dt**3 / 2], [q * dt**3 / 2, q * dt**2]])
 
 
-def _transition(dt: float) -> Array:
-    return np.eye(12) + dt * np.eye(12, k=6)
+@kernel
+def _rotated(rotation: Array, vector: Array) -> Array:
+    """A rotation matrix ``[3, 3]`` rotated further by a rotation vector ``[3]``, and kept orthonormal."""
+    pose, twist = np.eye(4), np.zeros(6)
+    pose[:3, :3], twist[3:] = rotation, vector
+    return apply_twist(pose, twist)[:3, :3]
 
 
 @dataclass(eq=False)
@@ -91,31 +96,25 @@ class MotionState:
     @classmethod
     def at(cls, T_cam_world: Array, covariance: Array) -> MotionState:
         """A state with known pose and unknown velocity."""
-        full = np.zeros((12, 12))
-        full[:6, :6] = covariance
-        full[6:, 6:] = np.diag(_START_SPEED**2)
-        r = T_cam_world[:3, :3]
+        r, unknown = T_cam_world[:3, :3], np.zeros((6, 6))
+        full = np.block([[covariance, unknown], [unknown, np.diag(_START_SPEED**2)]])
         return cls(-r.T @ T_cam_world[:3, 3], r.copy(), np.zeros(6), full)
 
     @property
     def T_cam_world(self) -> Array:
         """World-to-camera pose ``[4, 4]``."""
         pose = np.eye(4)
-        pose[:3, :3] = self.rotation
-        pose[:3, 3] = -self.rotation @ self.position
+        pose[:3, :3], pose[:3, 3] = self.rotation, -self.rotation @ self.position
         return pose
 
     def difference(self, T_cam_world: Array) -> Array:
         """(position, rotation) ``[6]`` that leads from this state's pose to another."""
-        r = T_cam_world[:3, :3]
-        rotation = se3.rotation_vectors(r @ self.rotation.T)
-        return np.concatenate([-r.T @ T_cam_world[:3, 3] - self.position, rotation])
+        r, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
+        return np.concatenate([-r.T @ t - self.position, se3.rotation_vectors(r @ self.rotation.T)])
 
     def moved(self, correction: Array, covariance: Array) -> MotionState:
         """The state after a correction ``[12]``."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.rotation
-        rotation = apply_twist(pose, np.append(np.zeros(3), correction[3:6]))[:3, :3]  # keeps it orthonormal
+        rotation = _rotated(self.rotation, correction[3:6])
         return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
 
     def transformed(self, rotation: Array, scale: float) -> MotionState:
@@ -128,7 +127,7 @@ class MotionState:
 
     def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
         """The state `dt` seconds later."""
-        f = _transition(dt)
+        f = np.eye(12) + dt * np.eye(12, k=6)
         covariance = f @ self.covariance @ f.T + _process_noise(dt, settings)
         return self.moved(np.append(self.speed * dt, np.zeros(6)), covariance)
 
@@ -141,14 +140,11 @@ class MotionState:
 
     def updated(self, T_cam_world: Array, covariance: Array) -> MotionState:
         """The state after a measured pose; one beyond the chi-square limit inflates the predicted covariance."""
-        p = self.covariance
-        innovation = self.difference(T_cam_world)
-        s = p[:6, :6] + covariance
-        surprise = float(innovation @ np.linalg.solve(s, innovation)) / CHI2_POSE
+        p, innovation = self.covariance, self.difference(T_cam_world)
+        surprise = float(innovation @ np.linalg.solve(p[:6, :6] + covariance, innovation)) / CHI2_POSE
         if surprise > 1.0:
             p = p * surprise
-            s = p[:6, :6] + covariance
-        gain = np.linalg.solve(s, p[:6]).T
+        gain = np.linalg.solve(p[:6, :6] + covariance, p[:6]).T
         reduced = p - gain @ p[:6]
         return self.moved(gain @ innovation, 0.5 * (reduced + reduced.T))
 
@@ -174,19 +170,18 @@ def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: Moti
 
 
 def _smooth_part(stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings) -> Array:
-    state = MotionState.at(poses[0], covariances[0])
-    filtered, predicted, steps = [state], [state], np.diff(stamps)
+    later = MotionState.at(poses[0], covariances[0])
+    filtered, predicted, steps = [later], [later], np.diff(stamps)
     for k in range(1, len(stamps)):
-        ahead = state.predicted(float(steps[k - 1]), settings)
-        state = ahead.updated(poses[k], covariances[k])
-        predicted.append(ahead)
-        filtered.append(state)
+        predicted.append(later.predicted(float(steps[k - 1]), settings))
+        later = predicted[k].updated(poses[k], covariances[k])
+        filtered.append(later)
     out = np.empty_like(poses)
-    out[-1] = state.T_cam_world
-    later = state
+    out[-1] = later.T_cam_world
     for k in range(len(stamps) - 2, -1, -1):
         ahead = predicted[k + 1]
-        gain = np.linalg.solve(ahead.covariance, _transition(float(steps[k])) @ filtered[k].covariance).T
+        transition = np.eye(12) + float(steps[k]) * np.eye(12, k=6)
+        gain = np.linalg.solve(ahead.covariance, transition @ filtered[k].covariance).T
         error = np.concatenate([ahead.difference(later.T_cam_world), later.speed - ahead.speed])
         covariance = filtered[k].covariance + gain @ (later.covariance - ahead.covariance) @ gain.T
         later = filtered[k].moved(gain @ error, covariance)
@@ -206,8 +201,7 @@ class CameraMotion:
     """
 
     def __init__(self, settings: MotionModelSettings) -> None:
-        self._settings = settings
-        self._interval = FIRST_INTERVAL_S
+        self._settings, self._interval = settings, FIRST_INTERVAL_S
         self.state: MotionState | None = None
         self.intervals: deque[float] = deque(maxlen=INTERVALS)
 
@@ -304,8 +298,6 @@ def compensate_rolling_shutter(observations: Observations, camera: Camera, veloc
     Returns:
         New observations; a feature that such a motion would put behind the camera stays where it is.
     """
-    if not len(observations):
-        return observations
     row = observations.keypoints.xy[:, 1:].astype(np.float64)
     late = ((row + 0.5) / camera.height - 0.5) * camera.readout_s
     has_depth = observations.z > 0
@@ -334,8 +326,7 @@ class RollingShutter:
     """
 
     def __init__(self, camera: Camera, intervals: deque[float]) -> None:
-        self._camera = camera
-        self._intervals = intervals
+        self._camera, self._intervals = camera, intervals
         self.velocity: CameraVelocity | None = None
 
     def predicted(self, raw: Observations, last: TrackedFrame, timestamp: float) -> Observations:
@@ -416,8 +407,7 @@ def trajectory(history: Sequence[FramePose], world: Map, settings: MotionModelSe
     Frames of unmerged submaps are left out: where they were taken in the root map's world is unknown.
     """
     frames = {frame.timestamp: frame for frame in reversed(history) if world.kf_map[frame.reference] == 0}
-    stamps = np.array(sorted(frames), np.float64)
-    ordered = [frames[stamp] for stamp in stamps.tolist()]
+    stamps, ordered = np.array(sorted(frames), np.float64), [frames[stamp] for stamp in sorted(frames)]
     poses = np.array([frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]).reshape(-1, 4, 4)
     if settings.smooth and len(poses) > 2:
         covariances = [

@@ -26,7 +26,6 @@ from dynslam_bench.contracts import (
     FlowResult,
     Frame,
     FrameBundle,
-    Keypoints,
     MapOutputs,
     MaskedExtractor,
     TrackResult,
@@ -175,7 +174,10 @@ class SlamPipeline:
                 if self._segmentation is not None and instances.class_names:
                     mask = dynamic_mask(instances, self._segmentation, depth)
         with clock("features"):
-            keypoints = self._extract(gray, mask)
+            if mask is None or self._segmentation is None or not isinstance(self._extractor, MaskedExtractor):
+                keypoints = self._extractor.extract(gray)
+            else:
+                keypoints = self._extractor.extract_masked(gray, mask, self._segmentation.outside_share)
             xy = camera.undistort_points(keypoints.xy)
         column, row = np.rint(keypoints.xy).astype(np.intp).T
         z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
@@ -193,17 +195,11 @@ class SlamPipeline:
         stats = self._stats(bundle, state, static, result)
         return TrackResult(result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep)
 
-    def _extract(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> Keypoints:
-        """Keypoints, enough of them outside the dynamic mask."""
-        if mask is None or self._segmentation is None or not isinstance(self._extractor, MaskedExtractor):
-            return self._extractor.extract(gray)
-        return self._extractor.extract_masked(gray, mask, self._segmentation.outside_share)
-
     def _filter_state(self, frame: FrameBundle, camera: Camera) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
         previous = self._previous
         T_world_pred, covariance = self._backend.predict(frame.timestamp)
-        view = self._backend.view()
+        keyframes, map_points = self._backend.view()
         return FilterState(
             camera=camera,
             keep=np.ones(len(frame.xy), dtype=bool),
@@ -212,8 +208,8 @@ class SlamPipeline:
             T_world_prev=None if previous is None else previous.T_world_cam,
             T_world_pred=T_world_pred,
             motion_covariance=covariance,
-            keyframes=view.keyframes,
-            map_points=(view.ids, view.positions),
+            keyframes=keyframes,
+            map_points=map_points,
             seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
         )
 
@@ -381,9 +377,8 @@ def flow_to_previous(
     kept, count = np.flatnonzero(state.keep), len(frame.xy)
     guess = predicted_flow(frame, state)[kept]
     result = flow.track(image, previous, frame.keypoints.xy[kept], guess=guess, seed=state.seed)
-    xy = np.full((count, 2), np.nan, np.float32)
+    xy, cost = np.full((count, 2), np.nan, np.float32), np.full(count, np.inf, np.float32)
     valid = np.zeros(count, bool)
-    cost = np.full(count, np.inf, np.float32)
     xy[kept], valid[kept], cost[kept] = result.xy, result.valid, result.cost
     return FlowResult(xy, valid, cost, result.stats)
 
@@ -398,8 +393,7 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     Returns:
         Raw pixels float32 ``[N, 2]``; NaN where depth or a prediction is missing.
     """
-    guess = np.full((len(frame.xy), 2), np.nan, np.float32)
-    has_depth = frame.z > 0
+    guess, has_depth = np.full((len(frame.xy), 2), np.nan, np.float32), frame.z > 0
     if state.T_world_prev is None or state.T_world_pred is None or not has_depth.any():
         return guess
     camera, T_prev_cur = state.camera, se3.inverse(state.T_world_prev) @ state.T_world_pred

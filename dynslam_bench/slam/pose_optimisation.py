@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point
 
 Array = NDArray[np.float64]
 
@@ -42,19 +42,16 @@ class PoseEstimate:
     Attributes:
         T_cam_world: World-to-camera pose ``[4, 4]``.
         inliers: bool ``[N]``.
+        count: Number of inliers.
         residual_px: Median reprojection error of the inliers in pixels of octave 0; NaN without any.
         information: Gauss-Newton matrix ``[6, 6]`` of (translation, rotation) in the camera frame.
     """
 
     T_cam_world: Array
     inliers: NDArray[np.bool_]
+    count: int
     residual_px: float
     information: Array
-
-    @property
-    def count(self) -> int:
-        """Number of inliers."""
-        return int(np.count_nonzero(self.inliers))
 
 
 @kernel
@@ -69,19 +66,16 @@ def _linearise(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array, active: NDArray[np.bool_],
     width: float, fx: float, fy: float, cx: float, cy: float, bf: float, h: Array, g: Array,
 ) -> float:  # fmt: skip
-    """The Gauss-Newton system, and the cost: of Cauchy's kernel of a squared width, or Huber's where that is 0."""
-    h[:] = 0.0
-    g[:] = 0.0
-    cost = 0.0
-    j = np.zeros((3, 6))
-    r = np.zeros(3)
+    """Fill the Gauss-Newton system, of the matrix its lower triangle; returns the cost.
+
+    The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
+    """
+    h[:], g[:], cost = 0.0, 0.0, 0.0
+    j, r = np.zeros((3, 6)), np.zeros(3)
     for i in range(points.shape[0]):
         if not active[i]:
             continue
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
-        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
-        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        x, y, z = moved_point(pose, points[i])
         depth = info_right[i] > 0.0
         limit = CHI2_DEPTH if depth else CHI2_MONO
         if z < NEAR_M:
@@ -117,9 +111,6 @@ def _linearise(
                 g[m] += f * r[row]
                 for n in range(m + 1):
                     h[m, n] += f * j[row, n]
-    for m in range(6):
-        for n in range(m):
-            h[n, m] = h[m, n]
     return cost
 
 
@@ -129,9 +120,7 @@ def observation_chi2(
     fx: float, fy: float, cx: float, cy: float, bf: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
-    x = pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2] * point[2] + pose[0, 3]
-    y = pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2] * point[2] + pose[1, 3]
-    z = pose[2, 0] * point[0] + pose[2, 1] * point[1] + pose[2, 2] * point[2] + pose[2, 3]
+    x, y, z = moved_point(pose, point)
     if z < NEAR_M:
         return np.inf, np.inf
     u = fx * x / z + cx
@@ -159,9 +148,7 @@ def _optimise(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
     fx: float, fy: float, cx: float, cy: float, bf: float, rounds: int, iterations: int,
 ) -> tuple[Array, NDArray[np.bool_], Array, Array]:  # fmt: skip
-    n = points.shape[0]
-    inlier = np.ones(n, np.bool_)
-    error = np.zeros(n)
+    inlier, error = np.ones(len(points), np.bool_), np.zeros(len(points))
     h, g = np.zeros((6, 6)), np.zeros(6)
     for turn in range(rounds):
         width = cauchy_width(error[inlier] ** 2) if turn == rounds - 1 else 0.0
@@ -178,10 +165,8 @@ def _optimise(
             h2, g2 = np.zeros((6, 6)), np.zeros(6)
             new = _linearise(candidate, points, uv, right, info, info_right, inlier, width, fx, fy, cx, cy, bf, h2, g2)
             if new <= cost:
-                gain = cost - new
-                pose, cost = candidate, new
-                h, g = h2, g2
-                damping = max(damping * 0.1, 1e-9)
+                gain, damping = cost - new, max(damping * 0.1, 1e-9)
+                pose, cost, h, g = candidate, new, h2, g2
                 if gain < 1e-4 * (cost + 1e-12):
                     break
             else:
@@ -223,10 +208,10 @@ def optimise_pose(
         The pose; with fewer than six points the start pose and no inliers.
     """
     if len(points) < 6:
-        return PoseEstimate(T_cam_world, np.zeros(len(points), bool), float("nan"), np.zeros((6, 6)))
+        return PoseEstimate(T_cam_world, np.zeros(len(points), bool), 0, np.nan, np.zeros((6, 6)))
     start = np.ascontiguousarray(T_cam_world, np.float64)
     points, uv, right, info, info_right = map(np.ascontiguousarray, (points, uv, right, info, info_right))
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m
     pose, inliers, error, h = _optimise(start, points, uv, right, info, info_right, *lens, rounds, iterations)
-    residual = float(np.median(error[inliers])) if inliers.any() else float("nan")
-    return PoseEstimate(pose, inliers, residual, h)
+    residual_px = float(np.median(error[inliers])) if inliers.any() else np.nan
+    return PoseEstimate(pose, inliers, int(np.count_nonzero(inliers)), residual_px, h + np.tril(h, -1).T)

@@ -50,13 +50,10 @@ STRIDE = 4
 CHANGED = 0.25
 """A keyframe is indexed again when it has gained or lost this share of its points."""
 
-MAX_DISTANCE = 60
-RATIO = 0.85
+MAX_DISTANCE, RATIO = 60, 0.85
 """Largest Hamming distance of a match by descriptor alone, and over that of the second nearest."""
-RANSAC_ITERATIONS = 150
-"""RANSAC samples at most."""
-RANSAC_BATCH = 25
-"""Samples that are evaluated together."""
+RANSAC_ITERATIONS, RANSAC_BATCH = 150, 25
+"""RANSAC samples at most, and how many of them are evaluated together."""
 PNP_CANDIDATES = 5
 """Keyframes with the most descriptor matches that RANSAC is tried on."""
 MIN_PNP_INLIERS = 8
@@ -89,8 +86,7 @@ MIN_ALIASING_MATCHES = 30
 
 CANDIDATES = 10
 """Best-ranked keyframes that are matched feature by feature; bounds the time of a frame."""
-MANY_POINTS = 60
-MANY_POINTS_SHARE = 0.75
+MANY_POINTS, MANY_POINTS_SHARE = 60, 0.75
 """With so many matches at a place this factor of the required share suffices."""
 
 SLACK_M = 0.5
@@ -98,13 +94,11 @@ SLACK_M = 0.5
 KIDNAP_POINTS = 60
 """A frame that shows so many map points, as many as a map begins with, followed by one that shows none of them and is
 not connected with it: the camera was kidnapped."""
-CONNECTED = 20
-CONNECTED_SHARE = 0.4
+CONNECTED, CONNECTED_SHARE = 20, 0.4
 """Matches that fit one homography, and their share of all, that connect two images."""
 HOMOGRAPHY_PX = 4.0
 """Largest error of these matches, pixels."""
-ROTATION_SLACK = np.radians(20.0)
-ROTATION_SLACK_SHARE = 0.75
+ROTATION_SLACK, ROTATION_SLACK_SHARE = np.radians(20.0), 0.75
 """Largest error of the rotation: an angle, and a share of all rotations between images. A camera that moves sideways
 seems to rotate. On four rendered laps none of 4,000 sections of 3 to 30 steps exceeded the share and half the angle."""
 
@@ -125,9 +119,9 @@ def top_candidates(world: Map, keyframes: Slots, observations: Observations, cou
         Slots, best first; of equal scores the newer keyframe. All, in the order given, if there are at most `count`.
     """
     if len(keyframes) <= count or not len(observations):
-        return [int(slot) for slot in keyframes[:count]]
+        return list(map(int, keyframes[:count]))
     order = np.lexsort((-world.kf_id[keyframes], -recognition_scores(world, keyframes, observations)))
-    return [int(slot) for slot in keyframes[order[:count]]]
+    return list(map(int, keyframes[order[:count]]))
 
 
 def recognition_scores(world: Map, keyframes: Slots, observations: Observations) -> Array:
@@ -140,14 +134,13 @@ def recognition_scores(world: Map, keyframes: Slots, observations: Observations)
     _index_substrings(world)
     query = np.ascontiguousarray(observations.words).view(np.uint16)[:, ::STRIDE].T
     counts = np.full((len(query), VALUES), -1, np.int64)
-    for position, values in enumerate(query):
-        counts[position, values] = 0
+    np.put_along_axis(counts, query.astype(np.int64), 0, axis=1)
     indexed = [world.substrings[slot][1] for slot in keyframes.tolist()]
     for substrings in indexed:
         _count_shared(substrings, counts)
     total = np.maximum(counts, 0).sum()
     weight = np.where(counts > 0, np.log(max(total, 1) / np.maximum(counts, 1)), 0.0)
-    scores = np.array([_sum_weights(substrings, counts, weight) for substrings in indexed])
+    scores = np.array([_sum_weights(substrings, weight) for substrings in indexed])
     return np.asarray(scores / np.sqrt([max(substrings.shape[1], 1) for substrings in indexed]))
 
 
@@ -172,12 +165,11 @@ def _count_shared(substrings: NDArray[np.uint16], counts: NDArray[np.int64]) -> 
 
 
 @kernel
-def _sum_weights(substrings: NDArray[np.uint16], counts: NDArray[np.int64], weight: NDArray[np.float64]) -> float:
+def _sum_weights(substrings: NDArray[np.uint16], weight: NDArray[np.float64]) -> float:
     score = 0.0
     for position in range(substrings.shape[0]):
         for value in substrings[position]:
-            if counts[position, value] > 0:
-                score += weight[position, value]
+            score += weight[position, value]
     return score
 
 
@@ -429,9 +421,12 @@ def is_aliased(
             rng = stream(seed, "lookalikes", int(world.kf_id[slot]))
             least = MIN_ALIASING_MATCHES // 2, MIN_ALIASING_MATCHES // 3
             other = recognise_place(world, slot, observations, settings, rng, *least)
-            if other is None or len(other.matches) < MIN_ALIASING_MATCHES or other.share < min_share:
-                continue
-            if not possible(submap, other.T_cam_world):
+            if (
+                other is None
+                or len(other.matches) < MIN_ALIASING_MATCHES
+                or other.share < min_share
+                or not possible(submap, other.T_cam_world)
+            ):
                 continue
             if any(contradict(place, other) for place in places):
                 return True
@@ -674,13 +669,12 @@ class PoseSearch:
         factor = MANY_POINTS_SHARE if len(place.matches) >= MANY_POINTS else 1.0
         if place.share < factor * s.relocalisation.min_share:
             return None
-        uncertainty = 0.0
-        if self.lost:
-            uncertainty = pose_uncertainty(world, observations, place, stream(self.seed, "halves", self.frame))
-            candidates = {submap: place}, self.keyframes
-            if uncertainty > 1 or is_aliased(world, observations, *candidates, s.tracking, self.seed, admits):
-                return None
-        return replace(place, uncertainty=uncertainty)
+        if not self.lost:
+            return replace(place, uncertainty=0.0)
+        uncertainty = pose_uncertainty(world, observations, place, stream(self.seed, "halves", self.frame))
+        candidates = {submap: place}, self.keyframes
+        aliased = uncertainty > 1 or is_aliased(world, observations, *candidates, s.tracking, self.seed, admits)
+        return None if aliased else replace(place, uncertainty=uncertainty)
 
     def _within_bound(self, candidate: InitialPose) -> bool:
         """Whether the camera can be at a pose in the map where it was tracked last."""

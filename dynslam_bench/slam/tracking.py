@@ -27,8 +27,7 @@ CLOSE_BASELINES = 40.0
 """Points nearer than this many stereo baselines are close: their depth is trusted at once (ORB-SLAM2's number)."""
 MARGIN_PX = 8.0
 """Points of the last frame are matched up to this distance outside the image."""
-LAST_FRAME_RATIO = 0.9
-MAP_RATIO = 0.85
+LAST_FRAME_RATIO, MAP_RATIO = 0.9, 0.85
 """Nearest over second nearest descriptor distance allowed in the two searches."""
 MIN_KEYFRAME_GAP = 20
 """Keyframes at least between one and another that a loop is closed to."""
@@ -42,8 +41,7 @@ MIN_MATCHES = 10
 """Inliers that a pose needs at least to be a candidate."""
 WIDEN = 2.5
 """Factor on the search window where the narrow one gave no trusted pose."""
-TRUSTED_INLIERS = 50
-TRUSTED_SHARE = 0.5
+TRUSTED_INLIERS, TRUSTED_SHARE = 50, 0.5
 """Inliers, and their share of the matches, that make a pose from the last frame trusted by itself."""
 
 
@@ -106,7 +104,6 @@ def observe(
     index = np.flatnonzero(np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0))
     xy, z = np.ascontiguousarray(frame.xy[index], dtype=np.float64), frame.z[index].astype(np.float64)
     z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
-    right = right_coordinates(xy, z, camera)
     keypoints = frame.keypoints.select(index)
     octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
     variance = scales[octave] ** 2
@@ -117,7 +114,7 @@ def observe(
         keypoints,
         xy,
         z,
-        right,
+        right_coordinates(xy, z, camera),
         octave,
         keypoints.angle.astype(np.float64),
         as_words(keypoints.descriptors),
@@ -260,14 +257,11 @@ def match_last_frame(
         close_m: Depth below which the last frame's own depth is used, metres; 0 to use map points alone.
         max_distance: Largest Hamming distance.
     """
-    camera = world.camera
-    from_map = last.point >= 0
+    camera, from_map = world.camera, last.point >= 0
     rows = np.flatnonzero(from_map | (last.observations.z > 0) & (last.observations.z < close_m))
-    mapped = from_map[rows]
-    position = world.position[last.point[rows]]
-    unmapped = rows[~mapped]
-    local = camera.unproject(last.observations.xy[unmapped], last.observations.z[unmapped])
-    position[~mapped] = se3.transform(se3.inverse(last.T_cam_world), local)
+    position, unmapped = world.position[last.point[rows]], ~from_map[rows]
+    local = camera.unproject(last.observations.xy[rows[unmapped]], last.observations.z[rows[unmapped]])
+    position[unmapped] = se3.transform(se3.inverse(last.T_cam_world), local)
     local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     uv, inside = camera.view(local, MARGIN_PX)
     rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
@@ -283,9 +277,8 @@ def match_last_frame(
         ratio=LAST_FRAME_RATIO,
     )
     hit = feature >= 0
-    rows, position, feature = rows[hit], position[hit], feature[hit]
-    consistent = rotation_consistent(last.observations.angle[rows], observations.angle[feature])
-    return Matches(feature[consistent], last.point[rows[consistent]], position[consistent])
+    matches = Matches(feature[hit], last.point[rows[hit]], position[hit])
+    return matches.select(rotation_consistent(last.observations.angle[rows[hit]], observations.angle[matches.feature]))
 
 
 def match_map(
@@ -312,11 +305,9 @@ def match_map(
         New matches, and the slots of all candidates in view (matched or not).
     """
     points, uv, right, octave, cosine = world.project(T_cam_world, candidates)
-    matched = np.zeros(world.alive.size, bool)
-    matched[matches.point[matches.point >= 0]] = True
     free = np.ones(len(observations.xy), bool)
     free[matches.feature] = False
-    rest = ~matched[points]
+    rest = ~np.isin(points, matches.point)
     radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
     wanted = points[rest]
     feature = search_in_radius(
@@ -391,9 +382,10 @@ def track_local_map(
     """
     more, in_view = match_map(world, observations, T_cam_world, matches, candidates, settings)
     matches = matches.joined(more)
-    mapped = matches.select(matches.point >= 0)
-    enough = len(mapped.point) >= 2 * settings.min_inliers
-    return fit_pose(world.camera, observations, mapped if enough else matches, T_cam_world, in_view)
+    mapped = matches.point >= 0
+    if np.count_nonzero(mapped) >= 2 * settings.min_inliers:
+        matches = matches.select(mapped)
+    return fit_pose(world.camera, observations, matches, T_cam_world, in_view)
 
 
 # ---------------------------------------------------------------------- the local map
@@ -412,8 +404,7 @@ class LocalMap:
     """
 
     def __init__(self, world: Map, *, connected_only: bool) -> None:
-        self._world = world
-        self._connected_only = connected_only
+        self._world, self._connected_only = world, connected_only
         self._computed_for: tuple[int, int] | None = None
 
     def around(self, reference: int) -> tuple[Slots, Slots]:

@@ -18,7 +18,6 @@ from dynslam_bench.contracts import (
     KeyframeView,
     Keypoints,
     Need,
-    Provenance,
 )
 from dynslam_bench.geometry import se3
 from dynslam_bench.testing.report import (
@@ -143,12 +142,11 @@ def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
 
 
 def _declaration(candidate: DynamicFilter) -> None:
-    needs, tags = get_args(Need), get_args(Provenance)
+    needs = get_args(Need)
     unknown = sorted(candidate.needs - set(needs))
     require_all(
         (isinstance(candidate.name, str) and candidate.name, f"the name is {candidate.name!r}"),
         (not unknown, f"unknown needs {unknown}", f"known are {', '.join(sorted(needs))}"),
-        (candidate.provenance in tags, f"provenance is {candidate.provenance!r}", f"one of {', '.join(tags)}"),
     )
 
 

@@ -25,13 +25,13 @@ from dynslam_bench.culling.ego_motion import (
     CORRELATION,
     RigidMotionFilter,
     depth_sigma,
+    failing_regions,
     prior_information,
     refine_prediction,
 )
 from dynslam_bench.culling.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.free_space import MAX_AGE_S, FreeSpaceFilter
 from dynslam_bench.culling.multiview_depth import BIN_M, MultiViewFilter, grow, hidden, refine_by_matches
-from dynslam_bench.culling.regions import failing_regions
 from dynslam_bench.culling.settings import (
     CorrelationSettings,
     EpipolarSettings,

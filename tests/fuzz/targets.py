@@ -942,7 +942,7 @@ def _read_map(data: bytes | None, folder: Path) -> None:
     for slot in world.keyframes.tolist():
         world.covisible(slot)
         world.project(world.kf_pose[slot], world.points)
-    packed(atlas)
+    packed(atlas.world, atlas.submaps.values())
     world.remove_keyframe(int(world.keyframes[0]))
 
 

@@ -55,7 +55,7 @@ def test_full_bundle_adjustment_is_undone_when_the_run_goes_on(room):
     """`finalize` gives the same when asked twice, and a run that goes on is what it would have been."""
     asked, quiet = (make_backend(room, bundle_adjustment__full=True) for _ in range(2))
     for index, pose in enumerate(room.path(60)):
-        (views, _, points), (others, _, same) = asked.view(), quiet.view()
+        (views, (_, points)), (others, (_, same)) = asked.view(), quiet.view()
         assert np.array_equal(points, same)
         for one, other in zip(views, others, strict=True):
             assert np.array_equal(one.T_world_cam, other.T_world_cam)
@@ -82,7 +82,7 @@ def test_dynamic_features_enter_neither_tracking_nor_map(room):
         keeps.append(~moving)
     backend = make_backend(room)
     assert errors(track_all(backend, frames, keeps), truth).max() < 0.025
-    for record, view in zip(backend.outputs().keyframes[::-1], backend.view().keyframes, strict=True):
+    for record, view in zip(backend.outputs().keyframes[::-1], backend.view()[0], strict=True):
         assert len(view.keypoints) == np.count_nonzero(keeps[record.frame])
 
 
@@ -137,8 +137,8 @@ def test_features_without_depth_become_points_by_triangulation(room):
     results = track_all(with_it, frames)
     track_all(without, frames)
     assert errors(results, truth).max() < 0.02
-    local = with_it.view().positions
-    assert len(local) > len(without.view().ids)
+    (_, (_, local)), (_, (ids, _)) = with_it.view(), without.view()
+    assert len(local) > len(ids)
     # every point lies on a wall of the room: z = 2.5, |x| = 3 or |y| = 2 in the world of the first camera
     wall = np.minimum.reduce([abs(local[:, 2] - 2.5), abs(abs(local[:, 0]) - 3), abs(abs(local[:, 1]) - 2)])
     assert np.median(wall) < 0.02 and np.quantile(wall, 0.9) < 0.08
@@ -265,7 +265,7 @@ def test_filters_see_the_newest_keyframes_and_all_points(room, monkeypatch):
     backend = make_backend(room, keyframes__tracked_share=1.0, keyframes__redundant_share=1.0)
     track_all(backend, [replace(room.see(p, i), depth=np.ones((480, 640), np.float32))
                         for i, p in enumerate(room.path(40))])  # fmt: skip
-    (views, ids, positions), outputs = backend.view(), backend.outputs()
+    (views, (ids, positions)), outputs = backend.view(), backend.outputs()
     assert len(set(ids.tolist())) == len(positions) > 0 and np.array_equal(outputs.ids, ids)
     assert len(outputs.keyframes) > 10, "more than are shown"
     assert [view.depth is not None for view in views] == [True] * 8 + [False] * 2

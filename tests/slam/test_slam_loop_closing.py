@@ -273,7 +273,7 @@ def test_maps_that_never_meet_stay_apart_and_filters_see_the_active_one():
     outputs, world = backend.outputs(), backend.world
     assert {record.map for record in outputs.keyframes} == {0, 1}
     assert 0 < len(outputs.positions) < len(world.points), "where those of the submap lie is unknown"
-    views, ids, _ = backend.view()
+    views, (ids, _) = backend.view()
     assert views and all(view.timestamp > 2.4 for view in views), "keyframes of the root map are older"
     assert set(ids.tolist()) == set(world.id[world.points_of(world.submap(1))].tolist())
     assert 0 < len(ids) < len(world.points) and backend.predict(8.0)[0] is not None

@@ -40,7 +40,7 @@ def made(tmp_path_factory):
 
 def test_a_loaded_map_is_the_saved_one_to_the_last_bit(made, tmp_path):
     room, _, file, backend = made
-    saved, loaded = packed(backend.atlas), read_map(file)
+    saved, loaded = packed(backend.world, []), read_map(file)
     assert loaded.header.made_by == "a run" and saved.keys() == loaded.arrays.keys() and len(saved["id"]) > 300
     for name, array in saved.items():
         assert array.dtype == loaded.arrays[name].dtype and array.tobytes() == loaded.arrays[name].tobytes(), name

@@ -306,7 +306,7 @@ def test_faulty_sequences(changes, words):
 class Keep:
     """Keeps everything."""
 
-    name, needs, provenance = "keep", frozenset({"depth"}), "own"
+    name, needs = "keep", frozenset({"depth"})
 
     def reset(self, camera):
         pass
@@ -319,7 +319,6 @@ class Keep:
     ("change", "words"),
     [
         ({"needs": frozenset({"magic"})}, "unknown needs"),
-        ({"provenance": "copied"}, "provenance is 'copied'"),
         ({"apply": lambda s, f, st: FilterResult.of(np.ones(3, bool))}, "not only on those that earlier filters kept"),
         ({"apply": lambda s, f, st: FilterResult(np.ones(len(f), bool), np.full(len(f), 2, np.float32))}, "outside"),
         ({"apply": lambda s, f, st: FilterResult.of(st.flow.valid)}, "raised AttributeError"),

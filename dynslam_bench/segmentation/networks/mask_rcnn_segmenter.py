@@ -53,7 +53,7 @@ class MaskRCNNSegmenter:
         with pinned_threads(torch.get_num_threads, torch.set_num_threads, self.threads):
             image = torch.from_numpy(np.array(frame.rgb, order="C")).to(self.device).permute(2, 0, 1).float() / 255
             detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
-            boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
+        boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
         config, wanted = self.network.config, expand_classes(self.settings.classes)
         names = [config.classes[label - 1] for label in labels]
         masks = np.zeros((len(names), height, width), bool)
