@@ -13,7 +13,7 @@ import pytest
 from envs_toys import TARGET, write_folder
 
 from dynslam_bench.core import fingerprint
-from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.errors import PluginError, RunError
 from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, run_one
 
 PLUGIN = """
@@ -112,7 +112,10 @@ def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
 )
 def test_a_changed_plug_in_is_another_run(file: str, old: str, new: str, tmp_path: Path) -> None:
     spec, folder = plugin(tmp_path)
+    asked = resolve(spec)
     assert makes_another_run(spec, edit(folder / file, old, new))
+    with pytest.raises(RunError, match="source of tracker 'mine' changed since the run was asked for"):
+        identity.check_unchanged(asked)
 
 
 def test_code_of_this_package_that_changes_meanwhile_is_noticed(tmp_path: Path, monkeypatch) -> None:

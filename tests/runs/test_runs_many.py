@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import tarfile
-import threading
 import time
 import zipfile
 from collections.abc import Iterator
@@ -113,25 +112,6 @@ def test_what_cannot_be_looked_up_is_set_aside_where_somebody_is_told(store: Run
     faults: list[str] = []
     records = run_many(asked, results=store, on_fault=lambda spec, error: faults.append(str(error)))
     assert [record.status for record in records] == ["ok"] and len(faults) == len(wrong)
-
-
-def test_the_first_runs_are_made_while_others_are_looked_up(
-    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dynslam_bench.runs.running._LOOKED_UP_FIRST", 1)
-    finished = threading.Event()
-
-    def endless() -> Iterator[RunSpec]:
-        yield from specs(toy_folder, range(2))
-        assert finished.wait(300), "no run was made before the last one was known"
-        yield from specs(toy_folder, range(1, 3))
-
-    def told(event: RunEvent) -> None:
-        if event.kind == "finished":
-            finished.set()
-
-    records = run_many(endless(), results=store, on_event=told)
-    assert [record.seed for record in records] == [0, 1, 1, 2] and len(store.ids()) == 3
 
 
 def test_pruning_by_partial_metrics(store: RunStore, toy_folder: str) -> None:

@@ -45,8 +45,6 @@ PRELOADED = (
     *("dynslam_bench.flow.moth_flame", "dynslam_bench.segmentation.schedule", _CHILD),
     *("dynslam_bench.runs.loop", "dynslam_bench.trackers.registry", "dynslam_bench.sequences.synthetic.sequence"),
 )
-CACHED_PACKAGES = ("core", "geometry", "contracts", "sequences", "features", "segmentation")
-"""The packages of this package whose code is part of the keys of the stage caches."""
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
@@ -314,7 +312,8 @@ def serve(fd: int, start: str) -> None:
     if start == "fork":
         with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
             importlib.import_module("dynslam_bench.core.compiled").load_kernels()
-        package_digest(CACHED_PACKAGES)  # remembered: the children's cache keys are of the code that is loaded here
+            # remembered: the keys of the children's stage caches are of the code that is loaded here
+            package_digest(importlib.import_module("dynslam_bench.runs.identity").CODE_PACKAGES)
     adopt_orphans()
     _Server(control, start).run()
 
