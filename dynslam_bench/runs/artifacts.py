@@ -92,8 +92,7 @@ class SnapshotWriter:
         bad = error is not None and (len(self._worst) < WORST or error > self._worst[-1][0])
         if not kept and not bad:
             return
-        shows = result.keypoints_xy is not None or result.dynamic_mask is not None
-        shot = snapshot_of(outcome.index, result) if shows else None
+        shot = snapshot_of(outcome.index, result)
         self._size = (rgb.shape[0], rgb.shape[1])
         picture = annotated(rgb, result, _PICTURE_WIDTH)
         if kept:
@@ -129,8 +128,10 @@ class SnapshotWriter:
         )
 
 
-def snapshot_of(index: int, result: TrackResult) -> Snapshot:
-    """The snapshot of a frame that was tracked."""
+def snapshot_of(index: int, result: TrackResult) -> Snapshot | None:
+    """The snapshot of a frame that was tracked; None if its tracker shows neither features nor a mask."""
+    if result.keypoints_xy is None and result.dynamic_mask is None:
+        return None
     points = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy).reshape(-1, 2)
     kept = result.keypoints_keep
     mask = result.dynamic_mask

@@ -225,18 +225,20 @@ def weights_of(settings: Settings, source: str) -> dict[str, str]:
 
 
 def check_unchanged(run: ResolvedRun) -> None:
-    """A run was made with the code and the files (weights, its map) that were looked up for it.
+    """A run was made with the code, and began in the map, that were looked up for it.
 
     Raises:
         RunError: They have changed since.
-        PluginError: One cannot be read any more.
+        PluginError: The code cannot be read any more.
     """
     if has_package_changed(CODE_PACKAGES):
         raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
-    now = _code_of(run.tracker, run.settings, run.segmentation)
-    if changed := [what for what in ("source", "weights") if now[what] != run.identity[what]]:
+    begun_in = run.start_map
+    if begun_in is not None and named_digests(run.settings).get(MAP_SETTING) != begun_in.digest:
+        raise RunError(f"the map {begun_in.file} has changed since the run was asked for", "the run is not stored")
+    if source_fingerprint(run.tracker, run.settings, run.segmentation) != run.identity["source"]:
         raise RunError(
-            f"{' and '.join(changed)} of tracker '{run.tracker.id}' changed since the run was asked for",
+            f"the code of tracker '{run.tracker.id}' has changed since the run was asked for",
             "the run is not stored; ask again, and let no tracker write files beside its code",
         )
 

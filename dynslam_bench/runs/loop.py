@@ -158,8 +158,7 @@ class _Recorder:
         if self._sheet is not None:
             self._sheet.add()
         if self._spec.rrd:
-            shows = result.keypoints_xy is not None or result.dynamic_mask is not None
-            shot = snapshot_of(outcome.index, result) if shows else None
+            shot = snapshot_of(outcome.index, result)
             error_m = None if outcome.error is None else outcome.error.trans_m
             image, pose = encode(env.frame.rgb), outcome.T_world_cam
             self._recorded.append(

@@ -32,7 +32,6 @@ from dynslam_bench.core.settings import (
     field_names,
     flatten,
     names,
-    online_choice,
     parameters,
     parse_assignments,
     settings_table,
@@ -50,7 +49,7 @@ class Root(Settings):
     epipolar: Epipolar = Epipolar()
     features: int = tunable(1000, low=200, high=4000, meaning="keypoints")
     method: Literal["orb", "fast"] = tunable("orb", meaning="detector")
-    when: Literal["rule", "now"] = online_choice("rule", meaning="keyframes")
+    when: Literal["rule", "now"] = tunable("rule", online=True, tuned=False, meaning="keyframes")
     name: str = "plain"
     maybe: float | None = None
 
@@ -462,7 +461,10 @@ def test_file_and_module_targets(tmp_path, monkeypatch):
     ("target", "expected"),
     [
         ("nowhere.at.all:SPEC", "cannot import nowhere.at.all: ModuleNotFoundError"),
-        ("/nowhere/file.py:SPEC", "cannot import /nowhere/file.py: FileNotFoundError: no file /nowhere/file.py"),
+        (
+            "/nowhere/file.py:SPEC",
+            "cannot import /nowhere/file.py: FileNotFoundError: .*No such file.*",
+        ),
         ("nocolon", "is not module:Attr"),
         (":SPEC", "is not module:Attr"),
         ("module:", "is not module:Attr"),

@@ -117,7 +117,7 @@ def test_the_default_memory_limit_is_a_share_of_the_machine(attack, monkeypatch)
     monkeypatch.setattr(memory_module, "machine_memory_mb", lambda: 1000.0)
     assert memory_module.memory_limit(None, 2) == (
         400.0,
-        "by default 80 % of this machine's 1000 MB, shared by 2 runs at a time",
+        " (by default 80 % of this machine's 1000 MB, shared by 2 runs at a time)",
     )
     assert memory_module.memory_limit(0) == (None, "") and memory_module.memory_limit(70.0, 4) == (70.0, "")
     record, _ = attack("hog-child", frame_s=60)
@@ -217,7 +217,7 @@ def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store:
         for turn in (1, 2):
             seen = started(pids, 4 * turn)
             until(lambda: any(tree >= {*seen[-4:]} for tree in trees[:-1]))  # noqa: B023 (the supervisor knows them)
-            os.kill(SERVERS["fork"]._process.pid, signal.SIGKILL)  # nothing else knows its number
+            os.kill(SERVERS["fork"]._running[1].pid, signal.SIGKILL)  # nothing else knows its number
             until(lambda: alive(seen) == [], 20)  # noqa: B023
         with pytest.raises(InfrastructureError, match=r"the fork server was ended from outside.*is not stored"):
             run.result()

@@ -114,7 +114,7 @@ def test_a_changed_plug_in_is_another_run(file: str, old: str, new: str, tmp_pat
     spec, folder = plugin(tmp_path)
     asked = resolve(spec)
     assert makes_another_run(spec, edit(folder / file, old, new))
-    with pytest.raises(RunError, match="source of tracker 'mine' changed since the run was asked for"):
+    with pytest.raises(RunError, match="code of tracker 'mine' has changed since"):
         identity.check_unchanged(asked)
 
 
