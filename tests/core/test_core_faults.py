@@ -1,4 +1,4 @@
-"""Files, the stage cache and downloads: whole or absent, under a fault at every file operation and odd addresses."""
+"""Files, the stage cache, downloads, runs: whole or absent, under a fault at every file operation and odd addresses."""
 
 import contextlib
 import http.server
@@ -18,23 +18,35 @@ import pytest
 from faults import in_a_small_process, survey, tree
 from pydantic import Field
 
-from dynslam_bench.core.download import check_address, download
-from dynslam_bench.core.errors import DownloadError, DynslamError, RunError
-from dynslam_bench.core.files import (
+from dynslam_bench.core import (
+    DownloadError,
+    DynslamError,
+    RunError,
     TemporaryFolder,
     atomic_folder,
     claimed,
+    inside,
     is_abandoned,
+    parse_json,
+    printable,
+    read_bytes,
+    read_json,
+    read_lines,
+    read_text,
     replace_folder,
+    storable,
     sweep,
     sweep_temporary,
+    without_passwords,
+    words_without_passwords,
     write_atomic,
 )
-from dynslam_bench.core.reading import parse_json, read_bytes, read_json, read_lines, read_text
+from dynslam_bench.core.download import check_address, download
 from dynslam_bench.core.records import Record, digest
-from dynslam_bench.core.sanitise import inside, printable, storable, without_passwords, words_without_passwords
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.stage_cache import StageCache
+from dynslam_bench.geometry import Trajectory
+from dynslam_bench.runs import RunRecord, RunStore
 
 BODY = bytes(range(256)) * 40
 
@@ -105,6 +117,70 @@ def test_the_cache_never_gives_half_an_entry(tmp_path: Path) -> None:
         result=lambda: (swept(root).keys(), cache.get("orb", "ab" * 20).arrays["a"].tolist()),
     )
     assert found.operations >= 4 and found.ends["kill", -9] == found.operations
+
+
+RECORD = RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json")
+TRUTH = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)))
+
+
+def make(root: Path, record: RunRecord = RECORD) -> None:
+    """What a run writes into the store."""
+    store = RunStore(root)
+    store.prepare()
+    with store.claim(record.run_id), store.work_folder(record.run_id) as work:
+        store.add_sequence(record.sequence.part, TRUTH.timestamps_ns, TRUTH)
+        store.publish(work, record)
+
+
+def held(root: Path) -> dict[str, bytes | str]:
+    """What is in the store once the next command has swept it, a minute later."""
+    for new in root.rglob(".*.new"):
+        os.utime(new, (0, 0))
+    RunStore(root).prepare()
+    return tree(root)
+
+
+@in_a_small_process
+def test_a_new_run_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    root = tmp_path / "results"
+
+    def whole_or_missing() -> None:
+        records, unreadable = RunStore(root).all()
+        assert list(records) in ([], [RECORD]) and unreadable == []
+
+    faults = ("kill", "full", "read-only")
+    found = survey(lambda: make(root), root, halfway=whole_or_missing, result=lambda: held(root), faults=faults)
+    assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
+    assert found.operations > 20 and found.ends["kill", -9] == found.operations
+    assert found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5
+
+
+@in_a_small_process
+def test_a_run_that_is_made_again_is_never_lost(tmp_path: Path) -> None:
+    root, failed = tmp_path / "results", RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})
+
+    def old_or_new() -> None:
+        (record,) = RunStore(root).all()[0]
+        assert record in (failed, RECORD)
+
+    found = survey(
+        lambda: make(root), root, begin=lambda: make(root, failed), halfway=old_or_new, result=lambda: held(root),
+        faults=("kill",),
+    )  # fmt: skip
+    assert found.operations > 15 and found.ends["kill", -9] == found.operations
+
+
+@in_a_small_process
+def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
+    root = tmp_path / "results"
+
+    def remove() -> None:
+        store = RunStore(root)
+        if store.ids():
+            store.remove(RECORD.run_id)
+
+    found = survey(remove, root, begin=lambda: make(root), result=lambda: held(root).keys(), faults=("kill", "full"))
+    assert not RunStore(root).ids() and found.operations > 5 and found.ends["kill", -9] == found.operations
 
 
 @in_a_small_process

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 import dynslam_bench
-from dynslam_bench.core import compiled, fingerprint, folders
+from dynslam_bench.core import DynslamError, PluginError, SettingsError, compiled, did_you_mean, fingerprint, folders
 from dynslam_bench.core import plugins as plugin_probe
 from dynslam_bench.core import version as versions
-from dynslam_bench.core.errors import DynslamError, PluginError, SettingsError, did_you_mean
 from dynslam_bench.core.fingerprint import (
     code_digest,
     content_digest,

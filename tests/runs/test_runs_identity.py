@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from envs_toys import TARGET, write_folder
 
-from dynslam_bench.core import fingerprint
-from dynslam_bench.core.errors import PluginError, RunError
+from dynslam_bench.core import PluginError, RunError, fingerprint
 from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, run_one
 
 PLUGIN = """
