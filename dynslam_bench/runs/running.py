@@ -538,9 +538,14 @@ def _asked(ask: Callable[..., T], *arguments: object) -> T:
 
 def pictures_asked(spec: RunSpec) -> list[str]:
     """The files beside a run that it was asked for."""
-    asked = [(PICTURE.format(0), spec.snapshots), (VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet)]
-    asked += [(RECORDING_FILE, spec.rrd), (MAP_FILE, spec.save_map)]
-    return [name for name, wanted in asked if wanted]
+    asked = {
+        PICTURE.format(0): spec.snapshots,
+        VIDEO_FILE: spec.video,
+        SHEET_FILE: spec.sheet,
+        RECORDING_FILE: spec.rrd,
+        MAP_FILE: spec.save_map,
+    }
+    return [name for name, wanted in asked.items() if wanted]
 
 
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:

@@ -85,7 +85,7 @@ class Suite(Record):
     offsets: tuple[Offset, ...] = Field(default=(0,), min_length=1)
     frames: tuple[int, int | None] | None = None
     stride: int = Field(default=1, ge=1)
-    threads: int = Field(default=1, ge=1)
+    threads: int = Field(default=1, ge=1, le=1024)
     cache: bool = False
     settings: dict[str, Any] = Field(default_factory=dict)
     tracker_settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
