@@ -293,12 +293,8 @@ def test_odd_addresses_are_one_clear_line(url: str, words: str, tmp_path: Path) 
     with pytest.raises(DownloadError, match=words) as caught:
         download(url, tmp_path / "x", attempts=1)
     assert "s3cret" not in str(caught.value) and not list(tmp_path.iterdir())
-
-
-def test_http_is_taken_where_the_content_is_checked_or_on_this_machine() -> None:
     check_address("http://host/x.tgz", checked=True)
     check_address("http://127.0.0.1:80/x", checked=False)
-    check_address("https://host/x.tgz", checked=False)
 
 
 class Handler(http.server.BaseHTTPRequestHandler):
@@ -416,6 +412,8 @@ def test_half_characters_do_not_keep_a_record_from_being_stored(tmp_path: Path) 
     record = Sample(text="caf\udce9", more={"\ud800": ["\udfff"]})
     write_atomic(tmp_path / "record.json", record.to_json())
     assert Sample.read(tmp_path / "record.json") == Sample(text="caf\\udce9", more={"\\ud800": ["\\udfff"]})
+    for value in (0.1 + 0.2, 1e-300, np.inf, -np.inf, np.nan):
+        assert np.array_equal(Sample.parse(Sample(text="p", x=value).to_json(), "p").x, value, equal_nan=True)
     write_atomic(tmp_path / "text", "comment \ud800")
     assert (tmp_path / "text").read_bytes() == b"comment \\ud800"
     assert storable(("a\udc80", 1, None)) == ("a\\udc80", 1, None)
@@ -509,14 +507,6 @@ EXPECTED_FLOW = [7831125740418745553, 14977623595910913313]
 EXPECTED_WIDE = [12832584331059455313]
 
 
-def test_round_trip_even_of_infinity(tmp_path):
-    for value in (0.1 + 0.2, 1e-300, float("inf"), -float("inf")):
-        write_atomic(tmp_path / "p.json", Sample(text="p", x=value).to_json())
-        assert Sample.read(tmp_path / "p.json") == Sample(text="p", x=value)
-    write_atomic(tmp_path / "p.json", Sample(text="p", x=float("nan")).to_json())
-    assert np.isnan(Sample.read(tmp_path / "p.json").x)
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -552,14 +542,8 @@ def test_streams_do_not_disturb_each_other():
     first = stream(1, "a").random(5)
     stream(1, "b").random(1000)
     assert np.array_equal(first, stream(1, "a").random(5))
+    assert 0 <= derive_seed(stream(3)) == derive_seed(stream(3)) < 2**63
     names = [("a",), ("b",), ("a", "b"), ("ab",), ("a", 1), ("a", 11), ("a", 1, 1)]
     assert len({tuple(stream(1, *name).random(2)) for name in names}) == len(names)
     assert stream(1, "a").random() != stream(2, "a").random()
     assert stream(1, "a", 1).random() == stream(1, "a", "1").random()
-
-
-def test_derived_seeds():
-    seeds = {derive_seed(stream(i)) for i in range(50)}
-    assert len(seeds) == 50
-    assert all(0 <= seed < 2**63 for seed in seeds)
-    assert derive_seed(stream(3)) == derive_seed(stream(3))

@@ -268,22 +268,18 @@ def test_no_plug_in_takes_the_id_of_a_built_in_tracker(tmp_path: Path) -> None:
         resolve(RunSpec(tracker=f"{file}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))))
 
 
-def test_one_run_id_with_two_results_is_said(
+def test_one_run_id_with_two_results_is_said_and_another_scheme_is_unverified(
     store: RunStore, toy_folder: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 6))
     record = run_one(spec, store)
     assert run_one(spec, store).notes == record.notes
+    assert record.verified and "identity" not in record.program
+    old = record.model_copy(update={"identity": record.identity | {"scheme": 0}})
+    assert not old.verified and old.program["identity"] == "unverified"
     trajectory = store.folder(record.run_id) / "trajectory_online.txt"
     trajectory.write_text(trajectory.read_text().replace("0.0", "0.1"))
     (again,) = run_many([spec], results=store, retry=["ok"])
     assert again.run_id == record.run_id
     assert any("another trajectory" in note for note in again.notes)
     assert any(record.run_id in message for message in caplog.messages)
-
-
-def test_runs_of_another_scheme_are_unverified(store: RunStore, toy_folder: str) -> None:
-    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 6)), store)
-    assert record.verified and "identity" not in record.program
-    old = record.model_copy(update={"identity": {k: v for k, v in record.identity.items() if k != "scheme"}})
-    assert not old.verified and old.program["identity"] == "unverified"
