@@ -176,6 +176,9 @@ def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> dict[str,
     """What of a run's identity says by which code, libraries, weights and files it is made."""
     with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
         files = contents_digest(load_object(tracker.files)(settings)) if tracker.files else ""
+    weights, group = named_digests(settings), getattr(settings, "segmentation", None)
+    if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
+        weights[source] = weights_digest(group.model_copy(update={"source": source}))
     installed = versions()  # another version of what computes with the run's data may give other bits
     top = tracker.entry_point.rpartition(":")[0].partition(".")[0]
     own = f"dynslam-bench {release()}"
@@ -183,7 +186,7 @@ def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> dict[str,
         "distribution": own if top == "dynslam_bench" else " ".join(distribution_of_module(top)).strip(),
         "source": source_fingerprint(tracker, settings, source),
         "requires": {module: distribution_of_module(module)[1] for module in sorted(tracker.requires)},
-        "weights": weights_of(settings, source),
+        "weights": weights,  # of every file that the settings name, or of the network in use where none is named
         **({"files": files} if files else {}),
         "libraries": {name: installed.get(name, "") for name in LIBRARIES},
     }
@@ -209,19 +212,6 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
     if prefix == "plugin":
         plugins["segmentation.source"] = plugin_digest(SEGMENTERS.get(segmenter).entry_point)
     return digest([code_digest(tracker.entry_point, CODE_PACKAGES), plugins])
-
-
-def weights_of(settings: Settings, source: str) -> dict[str, str]:
-    """Digest of every file that the settings name, by the setting's name; of the network in use where none is named.
-
-    Raises:
-        PluginError: A file cannot be read.
-    """
-    digests = named_digests(settings)
-    group = getattr(settings, "segmentation", None)
-    if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
-        digests[source] = weights_digest(group.model_copy(update={"source": source}))
-    return digests
 
 
 def check_unchanged(run: ResolvedRun) -> None:

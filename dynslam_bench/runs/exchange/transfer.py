@@ -1,5 +1,6 @@
 """Stored runs as files of other tools with ``provenance.json`` beside them, and their trajectories as stored runs."""
 
+import contextlib
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -201,16 +202,12 @@ def stated_provenance(file: Path) -> str:
     Args:
         file: The trajectory, or the folder that holds it.
     """
-    beside = (file if file.is_dir() else file.parent) / PROVENANCE_FILE
-    if not beside.is_file():
-        return ""
-    try:
-        provenance = Provenance.read(beside)
+    with contextlib.suppress(DynslamError, OSError, ValueError):  # ValueError: a name with a null byte
+        provenance = Provenance.read((file if file.is_dir() else file.parent) / PROVENANCE_FILE)
         files = [file] if file.is_file() else [file / name for name in provenance.files if Path(name).name == name]
-        intact = bool(files) and all(provenance.files.get(path.name) == digest_of(path) for path in files)
-    except (DynslamError, OSError, ValueError):  # ValueError: a name with a null byte
-        return ""
-    return provenance.describe() if intact else ""
+        if files and all(provenance.files.get(path.name) == digest_of(path) for path in files):
+            return provenance.describe()
+    return ""
 
 
 def digest_of(path: Path) -> str:

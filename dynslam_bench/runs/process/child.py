@@ -188,8 +188,7 @@ def describe_failure(error: BaseException) -> dict[str, Any]:
         return message("crashed", broken, infrastructure=broken)
     if isinstance(cause, TrackerContractError):
         return message("invalid", text)
-    exited = f"sys.exit({cause.code!r}) was called" if isinstance(cause, SystemExit) else ""
-    named = exited or f"{kind}: {text}".rstrip(": ")
+    named = f"sys.exit({cause.code!r}) was called" if isinstance(cause, SystemExit) else f"{kind}: {text}".rstrip(": ")
     if isinstance(cause, MemoryError) or "out of memory" in text.lower() or kind == "OutOfMemoryError":
         return message("out-of-memory", named, line=True)
     data = {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
@@ -224,4 +223,7 @@ def source_line(error: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    os._exit(main(Connection(int(sys.argv[1]))))  # threads that a tracker left running must not hold it up
+    # from the module, not from here: the loop raises the module's `FailedAt`
+    from dynslam_bench.runs.process.child import main as make_run
+
+    os._exit(make_run(Connection(int(sys.argv[1]))))  # threads that a tracker left running must not hold it up
