@@ -226,8 +226,15 @@ def bench(
     limits = chosen.limits.model_dump() | {name: value for name, value in asked.items() if value is not None}
     every = chosen.model_copy(update={"limits": checked(Limits, **limits)}).specs(**choice)
     specs = islice(every, shard[0] - 1, None, shard[1])
-    how: dict[str, Any] = {"on_plan": on_plan, "on_event": on_event, "on_fault": on_fault, "retry": retry}
-    how |= {"results": results, "protocol": protocol, "jobs": jobs}
+    how: dict[str, Any] = {
+        "results": results,
+        "protocol": protocol,
+        "jobs": jobs,
+        "retry": retry,
+        "on_plan": on_plan,
+        "on_event": on_event,
+        "on_fault": on_fault,
+    }
     if scheduler is None:
         return run_specs(specs, **how)
     with DaskWorkers(scheduler) as workers:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -93,8 +94,7 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 modules.add(node.module or "")
             elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-                first = node.args[0] if node.args else None
-                modules.add(first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else "")
+                modules |= {str(first.value) for first in node.args[:1] if isinstance(first, ast.Constant)}
     return {name.partition(".")[0].partition(" ")[0] for name in modules} - {""}
 
 
@@ -165,12 +165,10 @@ def _module_files(module: str, base: Path) -> list[Path]:
             return program_files(place / top)
         if (place / f"{top}.py").is_file():
             return program_files(place)
-    try:
-        spec = find_spec(top)
-    except (ImportError, ValueError):
-        spec = None
-    folders = [] if spec is None else [Path(place) for place in spec.submodule_search_locations or ()]
-    return [file for place in folders if not is_installed(place) for file in files_below(place)]
+    with suppress(ImportError, ValueError):
+        folders = getattr(find_spec(top), "submodule_search_locations", None) or ()
+        return [file for place in map(Path, folders) if not is_installed(place) for file in files_below(place)]
+    return []
 
 
 def is_installed(path: Path) -> bool:
@@ -196,11 +194,10 @@ def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
         if file in reached:
             continue
         reached[file] = None
-        for word in sorted(_words(file)):
-            if "." in word or "/" in word:
-                path = Path(word).expanduser() if word.startswith("~/") else Path(word)
-                places = {file.parent / path, base / path}  # an absolute path stays as it is
-                waiting += [place for place in places if not _is_of_system(place) and _is_file(place)]
+        for word in sorted(word for word in _words(file) if "." in word or "/" in word):
+            path = Path(word).expanduser() if word.startswith("~/") else Path(word)
+            places = {file.parent / path, base / path}  # an absolute path stays as it is
+            waiting += [place for place in places if not _is_of_system(place) and _is_file(place)]
     return list(reached)
 
 
@@ -246,6 +243,5 @@ def leads_back(entry: Path) -> bool:
 
 def _is_left_out(folder: Path) -> bool:
     """Whether a folder is a virtual environment, a results folder or a recording."""
-    if (folder / "pyvenv.cfg").is_file() or any((folder / name).exists() for name in _RECORDING):
-        return True
-    return (folder / "runs").is_dir() and any((folder / name).exists() for name in _STORE)
+    is_store = (folder / "runs").is_dir() and any((folder / name).exists() for name in _STORE)
+    return is_store or any((folder / name).exists() for name in ("pyvenv.cfg", *_RECORDING))

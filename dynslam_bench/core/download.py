@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import ipaddress
 import json
 import shutil
 import time
@@ -12,7 +11,7 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Literal
 from urllib.error import HTTPError
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from dynslam_bench.core.errors import DownloadError, DynslamError, raising
@@ -24,6 +23,7 @@ CHUNK = 1 << 18
 MOST_BYTES = 32 * 2**30
 _LONGEST_PAUSE_S = 30.0
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EIO)
+_LOOPBACK = ("localhost", "127.0.0.1", "::1")
 _GO_ON = "run the same command again, it goes on from there"
 
 
@@ -174,7 +174,7 @@ class _Partial:
             request.add_header("Range", f"bytes={self._size()}-")
             if notes.get("version"):
                 request.add_header("If-Range", notes["version"])
-        return connect(request, self.timeout_s)
+        return build_opener(_Redirect).open(request, timeout=self.timeout_s)
 
     def _total(self, response: Any) -> int | None:
         """The length of the whole file, if the server says it; an answer that does not go on begins the file again."""
@@ -233,8 +233,8 @@ class _Partial:
         return self.part.with_name(self.part.name + ".json")
 
 
-def check_address(url: str, *, checked: bool) -> SplitResult:
-    """The parts of an address that may be fetched: https, or http where the content is checked.
+def check_address(url: str, *, checked: bool) -> None:
+    """Check that an address may be fetched: https, or http where the content is checked.
 
     Args:
         url: The address.
@@ -253,32 +253,14 @@ def check_address(url: str, *, checked: bool) -> SplitResult:
         raise DownloadError(f"{shown}: it is no web address", "for example https://host/name.tgz")
     if parts.username is not None or parts.password is not None:
         raise DownloadError(f"cannot download from {host}: the address holds a name or password", "leave them out")
-    if parts.scheme == "http" and not checked and not _is_loopback(host):
+    if parts.scheme == "http" and not checked and host not in _LOOPBACK:
         raise DownloadError(f"{shown}: http without a known checksum could bring anything", "use https")
-    return parts
-
-
-def connect(request: Request, timeout_s: float) -> Any:
-    """Open an address as the standard library does, for http and https alone, whatever a server redirects to.
-
-    Raises:
-        DownloadError: The server redirects to another scheme.
-        OSError: It cannot be reached, or answers with an error.
-    """
-    return build_opener(_Redirect).open(request, timeout=timeout_s)
 
 
 class _Redirect(HTTPRedirectHandler):
-    """Follows redirects to https, and from http to http."""
+    """Follows redirects to https, and from http to http, and to no other scheme."""
 
     def redirect_request(self, req: Request, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
         if newurl.partition(":")[0].lower() not in ("https", req.type):
             raise DownloadError(f"the server redirects {req.full_url} to {newurl[:200]!r}, refused", "name a mirror")
         return super().redirect_request(req, fp, code, msg, headers, newurl)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -160,12 +160,10 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         For example ``"did you mean 'epipolar.threshold_px'?"``; empty if nothing is known.
     """
     names = sorted(set(known))
-    lowered: dict[str, list[str]] = {}
-    for candidate in names:
-        lowered.setdefault(candidate.lower(), []).append(candidate)
-    close = difflib.get_close_matches(name.lower(), list(lowered), n=3, cutoff=0.5)
+    close = difflib.get_close_matches(name.lower(), {candidate.lower() for candidate in names}, n=3, cutoff=0.5)
     if close:
-        return "did you mean " + " or ".join(repr(candidate) for match in close for candidate in lowered[match]) + "?"
+        meant = [repr(candidate) for match in close for candidate in names if candidate.lower() == match]
+        return f"did you mean {' or '.join(meant)}?"
     if 0 < len(names) <= 16:
         return "known: " + ", ".join(names)
     return f"{len(names)} are known, none is close" if names else ""

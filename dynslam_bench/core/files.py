@@ -10,20 +10,20 @@ import os
 import re
 import secrets
 import shutil
-import sys
 import tempfile
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dynslam_bench.core.errors import DynslamError, raising
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.(tmp|new)")
 _NEW_S = 60.0
-_TURN_S = 0.1
 """A temporary name ends in ``.new`` until it is locked, which takes no time, and in ``.tmp`` from then on."""
+_TURN_S = 0.1
+_CURE = "check the permissions and the free space"
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
@@ -54,7 +54,7 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     Raises:
         DynslamError: The folder cannot be written (full disk, permissions); nothing is left behind.
     """
-    with _clear_errors(path), replacing(path) as temporary:
+    with raising(DynslamError, f"cannot write {path}", _CURE), replacing(path) as temporary:
         temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
@@ -64,13 +64,12 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
     Raises:
         DynslamError: As `write_atomic`.
     """
-    with _clear_errors(path), replacing(path) as temporary, temporary.open("wb") as file:
+    with (
+        raising(DynslamError, f"cannot write {path}", _CURE),
+        replacing(path) as temporary,
+        temporary.open("wb") as file,
+    ):
         file.writelines(f"{line}\n".encode(errors="backslashreplace") for line in lines)
-
-
-def _clear_errors(path: Path) -> AbstractContextManager[None]:
-    """Turn what goes wrong in writing a file into one line."""
-    return raising(DynslamError, f"cannot write {path}", "check the permissions and the free space")
 
 
 def replace_folder(work: Path, target: Path) -> None:
@@ -80,47 +79,30 @@ def replace_folder(work: Path, target: Path) -> None:
     system can exchange two names at once: Linux, on its own file systems; elsewhere it is missing for a moment).
 
     Raises:
-        OSError: It cannot be renamed; then `target` is as it was.
+        OSError: It cannot be renamed; then `target` is as it was, where two names can be exchanged.
     """
+    old = work.with_name(f"{work.name}.old")
     while True:
         try:
             work.rename(target)
-            return
+            break
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-        try:
-            _exchange(work, target)
-        except OSError as error:
-            if error.errno not in (errno.ENOENT, errno.ENOTEMPTY, errno.EEXIST) or not work.exists():
-                raise
-            continue  # another process has just removed or replaced the target
-        shutil.rmtree(work, ignore_errors=True)
-        return
+        if _exchange(work, target):
+            old = work
+            break
+        shutil.rmtree(old, ignore_errors=True)
+        with suppress(FileNotFoundError):  # another process has just moved it away
+            target.rename(old)
+    shutil.rmtree(old, ignore_errors=True)
 
 
-def _exchange(one: Path, other: Path) -> None:
-    """Give each of two folders the other's name."""
-    if sys.platform == "linux":
-        libc = ctypes.CDLL(None, use_errno=True)
-        names = (_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other))
-        if hasattr(libc, "renameat2") and libc.renameat2(*names, _RENAME_EXCHANGE) == 0:
-            return
-        number = ctypes.get_errno()
-        if number not in (0, errno.EINVAL, errno.ENOSYS):
-            raise OSError(number, os.strerror(number), str(other))
-    aside = one.with_name(f"{one.name}.old")
-    other.rename(aside)
-    try:
-        one.rename(other)
-    except OSError:
-        try:
-            aside.rename(other)
-        except OSError as error:
-            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another process has put its own there, which counts
-                shutil.rmtree(aside, ignore_errors=True)
-        raise
-    aside.rename(one)
+def _exchange(one: Path, other: Path) -> bool:
+    """Give each of two folders the other's name; False if the system cannot do so at once, or one is gone."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    names = (_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other))
+    return hasattr(libc, "renameat2") and libc.renameat2(*names, _RENAME_EXCHANGE) == 0
 
 
 def _reserve(path: Path, make: Callable[[Path], None]) -> tuple[Path, int]:
@@ -131,22 +113,19 @@ def _reserve(path: Path, make: Callable[[Path], None]) -> tuple[Path, int]:
     return fresh.rename(fresh.with_suffix(".tmp")), lock
 
 
-def sweep_temporary(folder: Path, pattern: str = ".*") -> int:
-    """Remove the temporary files and folders that killed processes left in a folder; returns how many.
+def sweep_temporary(folder: Path, pattern: str = ".*") -> None:
+    """Remove the temporary files and folders that killed processes left in a folder.
 
     Args:
         folder: Where; nothing happens if it is missing.
         pattern: Of the paths below it to look at, e.g. ``runs/.*``.
     """
-    removed = 0
     for path in folder.glob(pattern):
         if not _TEMPORARY.fullmatch(path.name) or not is_abandoned(path):
             continue
         with suppress(OSError):  # another process was faster, or it is another user's
             if path.suffix == ".tmp" or time.time() - path.stat().st_mtime > _NEW_S:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-                removed += 1
-    return removed
 
 
 @contextmanager
@@ -294,9 +273,10 @@ class TemporaryFolder:
         self._remove()
 
 
-def sweep() -> int:
-    """Remove this user's `TemporaryFolder`s whose process is no more; returns how many there were."""
-    return sum(sweep_temporary(base, f".{_PRIVATE}.*") for base in {Path(tempfile.gettempdir()), SHARED_MEMORY})
+def sweep() -> None:
+    """Remove this user's `TemporaryFolder`s whose process is no more."""
+    for base in {Path(tempfile.gettempdir()), SHARED_MEMORY}:
+        sweep_temporary(base, f".{_PRIVATE}.*")
 
 
 def _remove(path: Path, lock: int, owner: int) -> None:

@@ -269,8 +269,7 @@ def contents_digest(files: Iterable[str | Path], root: Path | None = None, *, sy
         whole = hashlib.sha256()
         for file in map(Path, ordered):
             name = "" if root is None else f"{file.relative_to(root).as_posix()}\0"
-            is_source = syntax and file.suffix == ".py"
-            content = syntax_digest(file.read_bytes()) if is_source else file_sha256(file)
+            content = syntax_digest(file.read_bytes()) if syntax and file.suffix == ".py" else file_sha256(file)
             whole.update(f"{name}{content}\n".encode(errors="surrogateescape"))
         return whole.hexdigest()
 
@@ -341,20 +340,18 @@ def _remembered(kind: str, files: Sequence[str | Path], compute: Callable[[], st
     return value
 
 
-def _files_state(files: Iterable[str | Path]) -> tuple[str, int]:
+def _files_state(files: Sequence[str | Path]) -> tuple[str, int]:
     """Digest of path, size, times and inode of each file, and the newest of the times in nanoseconds.
 
     Raises:
         OSError: One is not there.
     """
-    texts, newest = [], 0
-    for path in [os.fspath(file) for file in files]:
-        if not path.startswith(os.sep):
-            path = os.path.abspath(path)  # noqa: PTH100 - thousands of files: pathlib takes several times as long
-        stat = os.stat(path)  # noqa: PTH116
-        modified, changed = stat.st_mtime_ns, stat.st_ctime_ns
-        newest = max(newest, modified, changed)
-        texts.append(f"{path}\0{stat.st_size},{modified},{changed},{stat.st_ino}\n")
+    stats = [os.stat(file) for file in files]  # noqa: PTH116 - thousands: pathlib takes several times as long
+    texts = [
+        f"{os.path.abspath(file)}\0{stat.st_size},{stat.st_mtime_ns},{stat.st_ctime_ns},{stat.st_ino}\n"  # noqa: PTH100
+        for file, stat in zip(files, stats, strict=True)
+    ]
+    newest = max((max(stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats), default=0)
     return hashlib.sha256("".join(texts).encode(errors="surrogateescape")).hexdigest(), newest
 
 
@@ -419,29 +416,22 @@ def git_revision() -> GitRevision | None:
     checkout = Path(dynslam_bench.__file__).resolve().parent.parent
     if not (checkout / "pyproject.toml").is_file() or not (checkout / ".git").exists():
         return None
-    try:
-        revision = _git(checkout, "rev-parse", "HEAD")
-        changes = _git(checkout, "status", "--porcelain", "--untracked-files=no")
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return GitRevision(revision=revision, dirty=bool(changes))
+    git = ("git", "-C", str(checkout))
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        changes = _output_of(*git, "status", "--porcelain", "--untracked-files=no")
+        return GitRevision(revision=_output_of(*git, "rev-parse", "HEAD"), dirty=bool(changes))
+    return None
 
 
-def _git(folder: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(folder), *arguments]
+def _output_of(*command: str) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=10).stdout.strip()
 
 
 def _cpu_model() -> str:
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(errors="replace").splitlines():
-            if line.lower().startswith(("model name", "hardware")):
-                return line.partition(":")[2].strip()
-    if platform.system() == "Darwin":
-        try:
-            command = ["sysctl", "-n", "machdep.cpu.brand_string"]
-            return subprocess.run(command, check=True, capture_output=True, text=True, timeout=5).stdout.strip()
-        except (OSError, subprocess.SubprocessError):
-            return platform.processor()
+    for line in info.read_text(errors="replace").splitlines() if info.is_file() else ():
+        if line.lower().startswith(("model name", "hardware")):
+            return line.partition(":")[2].strip()
+    with contextlib.suppress(OSError, subprocess.SubprocessError):  # macOS
+        return _output_of("sysctl", "-n", "machdep.cpu.brand_string")
     return platform.processor() or platform.machine()

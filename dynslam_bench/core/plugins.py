@@ -100,9 +100,10 @@ class Registry(Generic[P]):
             if registered is not None and registered.source == "built in" and registered.spec != spec:
                 raise PluginError(f"{name} has the id '{spec.id}', which is built in", "give the plug-in another id")
             return spec
-        broken = [failure for failure in self._failures if name in failure.source]
-        hint = f"a plug-in of that name failed to load: {broken[0].reason}" if broken else did_you_mean(name, plugins)
-        raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
+        broken = [f"{failure.source} failed to load: {failure.reason}" for failure in self._failures]
+        named = [line for line in broken if name in line]
+        hints = named[:1] or [did_you_mean(name, plugins), *broken[:1]]
+        raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", "; ".join(filter(None, hints)))
 
     def refresh(self) -> None:
         """Forget what was discovered, e.g. after the environment variable changed."""
@@ -218,18 +219,15 @@ def _module_name(path: Path) -> str:
 
 
 def _load_file(path: Path) -> ModuleType:
-    resolved = path.expanduser().resolve()
-    if not resolved.is_file():
-        raise FileNotFoundError(f"no file {resolved}")
-    name = _module_name(path)
+    resolved, name = path.expanduser().resolve(), _module_name(path)
     if name in sys.modules:
         return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, resolved)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    try:  # from its text: byte code of an edit of equal length in the same second would pass for that of this one
-        exec(compile(resolved.read_bytes(), resolved, "exec"), module.__dict__)
+    # from its text: byte code of an edit of equal length in the same second would pass for that of this one
+    code = compile(resolved.read_bytes(), resolved, "exec")
+    module = sys.modules[name] = ModuleType(name)
+    module.__file__ = str(resolved)
+    try:
+        exec(code, module.__dict__)
     except BaseException:
         del sys.modules[name]
         raise
@@ -238,19 +236,14 @@ def _load_file(path: Path) -> ModuleType:
 
 def _environment_targets(kind: Kind) -> list[str]:
     """Targets of ``DYNSLAM_BENCH_PLUGINS="trackers=my.py:SPEC,flow=pkg.mod:SPEC"``; no ``kind=`` means a tracker."""
-    targets = []
-    for item in filter(None, (part.strip() for part in os.environ.get(ENVIRONMENT_VARIABLE, "").split(","))):
-        prefix, separator, rest = item.partition("=")
-        if (prefix if separator else "trackers") == kind:
-            targets.append(rest if separator else item)
-    return targets
+    items = [item.strip() for item in os.environ.get(ENVIRONMENT_VARIABLE, "").split(",")]
+    pairs = [item.partition("=") if "=" in item else ("trackers", "=", item) for item in items if item]
+    return [target for prefix, _, target in pairs if prefix == kind]
 
 
 def _reason(error: BaseException) -> str:
-    text = str(error).strip().splitlines()
-    if isinstance(error, DynslamError):
-        return text[-1]
-    return f"{type(error).__name__}: {text[-1]}" if text else type(error).__name__
+    name = "" if isinstance(error, DynslamError) else type(error).__name__
+    return ": ".join(filter(None, [name, *str(error).strip().splitlines()[-1:]]))
 
 
 # -- whether a module can be imported at all: tried in a process of its own, which that may end ------------------------
@@ -301,11 +294,16 @@ def check_import(location: str) -> None:
     if os.environ.get(ISOLATED_VARIABLE):
         return
     command = [*python_command(_PROBE), location, str(_IMPORTED)]
-    environment = {**os.environ, ISOLATED_VARIABLE: "1"}
     quiet = subprocess.DEVNULL
     try:
         code = subprocess.run(
-            command, env=environment, timeout=LIMIT_S, check=False, stdin=quiet, stdout=quiet, stderr=quiet
+            command,
+            env=os.environ | {ISOLATED_VARIABLE: "1"},
+            timeout=LIMIT_S,
+            check=False,
+            stdin=quiet,
+            stdout=quiet,
+            stderr=quiet,
         ).returncode
     except subprocess.TimeoutExpired:
         raise PluginError(f"cannot import {location}: it is not done after {LIMIT_S} s") from None

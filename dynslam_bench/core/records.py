@@ -32,13 +32,10 @@ class Record(BaseModel):
 
     def to_json(self) -> str:
         """The record as indented JSON with a final newline; no password, and nothing that UTF-8 cannot hold."""
-        return self._json(2) + "\n"
+        return self.to_line(2) + "\n"
 
-    def to_line(self) -> str:
-        """The same as one line without its newline."""
-        return self._json(None)
-
-    def _json(self, indent: int | None) -> str:
+    def to_line(self, indent: int | None = None) -> str:
+        """The same without its newline, as one line or indented."""
         try:
             text = self.model_dump_json(indent=indent)
         except ValueError:  # half characters, e.g. of a foreign command line

@@ -102,6 +102,7 @@ def tunable(
     limits: tuple[float | None, float | None] | None = None,
     unit: str = "",
     online: bool = False,
+    tuned: bool = True,
 ) -> Any:
     """A field that studies may tune.
 
@@ -114,19 +115,20 @@ def tunable(
         limits: What validation accepts, where that is wider than the search range; None leaves an end open.
         unit: Physical unit, e.g. ``px``.
         online: True if the field may change in mid-episode.
+        tuned: False if no study tunes the field: it is online, and a decision for single frames.
     """
     if scale == "log" and (low is None or low <= 0):
         raise ValueError(f"a log scale needs low > 0, got {low=}")
-    annotation: dict[str, Any] = {"low": low, "high": high, "scale": scale, "unit": unit, "online": online}
+    annotation: dict[str, Any] = {
+        "low": low,
+        "high": high,
+        "scale": scale,
+        "unit": unit,
+        "online": online,
+        "tunable": tuned,
+    }
     least, most = (low, high) if limits is None else limits
     return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most)
-
-
-def online_choice(default: Any, *, meaning: str) -> Any:
-    """A field with choices that may change in mid-episode but that no study tunes: a decision for single frames."""
-    field = tunable(default, meaning=meaning, online=True)
-    field.json_schema_extra[_KEY]["tunable"] = False
-    return field
 
 
 def names(default: str, kind: Literal["file", "features", "flow"], *, meaning: str, otherwise: str = "") -> Any:
@@ -201,13 +203,11 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
     Raises:
         SettingsError: An assignment has no ``=`` or no name.
     """
-    result = {}
-    for text in assignments:
-        name, separator, value = text.partition("=")
-        if not separator or not name.strip():
+    split = [[text, *map(str.strip, text.partition("="))] for text in assignments]
+    for text, name, separator, _ in split:
+        if not separator or not name:
             raise SettingsError(f"'{text}' is not an assignment", "write it as --set name=value")
-        result[name.strip()] = value.strip()
-    return result
+    return {name: value for _, name, _, value in split}
 
 
 def flatten(settings: Settings) -> dict[str, Any]:
@@ -236,12 +236,8 @@ def settings_table(cls: type[Settings]) -> str:
     rows = ["| setting | default | range | unit | online | meaning |", "| --- | --- | --- | --- | --- | --- |"]
     for name, field, default in _leaves(cls):
         p = described.get(name)
-        span = "" if p is None else _span(p)
-        given = json.dumps(default, default=str)
-        rows.append(
-            f"| `{name}` | `{given}` | {span} | {p.unit if p else ''} | {'yes' if p and p.online else ''} "
-            f"| {field.description or ''} |"
-        )
+        more = f"{_span(p)} | {p.unit} | {'yes' if p.online else ''}" if p else " |  | "
+        rows.append(f"| `{name}` | `{json.dumps(default, default=str)}` | {more} | {field.description or ''} |")
     return "\n".join(rows) + "\n"
 
 
@@ -382,10 +378,9 @@ class OnlineSettings:
     def __init__(self, settings: Settings, parts: Iterable[tuple[str, Callable[[Any], None]]]) -> None:
         self._built = self._in_force = settings
         self._parts = tuple(parts)
-        taken = {group for group, _ in self._parts}
         for parameter in online_parameters(settings):
             group = parameter.name.split(".")[0]
-            if group not in taken:
+            if group not in dict(self._parts):
                 raise SettingsError(
                     f"online setting '{parameter.name}' of {type(settings).__name__} is taken by no part of the system",
                     f"give the part a method configure(settings) and the group '{group}', "

@@ -61,14 +61,12 @@ class StageCache:
         path = self.path(stage, key)
         try:
             arrays = read_npz(path)
-            cost = float(arrays.pop("cost_s"))
+            entry = Entry(arrays, float(arrays.pop("cost_s")))
         except (DynslamError, KeyError):
-            with contextlib.suppress(OSError):  # a cache that can only be read keeps its damaged entries
-                path.unlink()
-            return None
-        with contextlib.suppress(OSError):  # evicted by another process meanwhile: the content is in hand
-            os.utime(path)
-        return Entry(arrays, cost)
+            entry = None
+        with contextlib.suppress(OSError):  # a cache that can only be read, or one that another process has evicted of
+            os.utime(path) if entry else path.unlink()
+        return entry
 
     def put(self, stage: str, key: str, arrays: Mapping[str, NDArray[Any]], cost_s: float) -> None:
         """Store a result; another process may have stored the same meanwhile, which does not matter.
@@ -110,13 +108,11 @@ class StageCache:
 
     def _shrink(self, most_bytes: float) -> int:
         entries = sorted(self._entries(), key=itemgetter(0))
-        total = left = sum(size for _, _, size in entries)
-        for _, path, size in entries:
-            if left <= most_bytes:
-                break
+        left = np.cumsum([size for _, _, size in entries[::-1]])[::-1]  # of an entry and all that were used later
+        going = [(path, size) for (_, path, size), rest in zip(entries, left, strict=True) if rest > most_bytes]
+        for path, _ in going:
             path.unlink(missing_ok=True)
-            left -= size
-        return total - left
+        return sum(size for _, size in going)
 
     def path(self, stage: str, key: str, suffix: str = ".npz") -> Path:
         """Where an entry lies; `get` and `put` take ``.npz``, other modules write ``.npy`` that count and go as all."""

@@ -92,8 +92,7 @@ class SnapshotWriter:
         bad = error is not None and (len(self._worst) < WORST or error > self._worst[-1][0])
         if not kept and not bad:
             return
-        shows = result.keypoints_xy is not None or result.dynamic_mask is not None
-        shot = snapshot_of(outcome.index, result) if shows else None
+        shot = snapshot_of(outcome.index, result)
         self._size = (rgb.shape[0], rgb.shape[1])
         picture = annotated(rgb, result, _PICTURE_WIDTH)
         if kept:
@@ -129,11 +128,12 @@ class SnapshotWriter:
         )
 
 
-def snapshot_of(index: int, result: TrackResult) -> Snapshot:
-    """The snapshot of a frame that was tracked."""
+def snapshot_of(index: int, result: TrackResult) -> Snapshot | None:
+    """The snapshot of a frame that was tracked; None if its tracker shows neither features nor a mask."""
+    if result.keypoints_xy is None and result.dynamic_mask is None:
+        return None
     points = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy).reshape(-1, 2)
-    kept = result.keypoints_keep
-    mask = result.dynamic_mask
+    kept, mask = result.keypoints_keep, result.dynamic_mask
     return Snapshot(
         index,
         np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
@@ -164,19 +164,18 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
         height, width = map(int, arrays["size"])
         index, count, points, kept = arrays["index"], arrays["count"], arrays["points"], arrays["kept"]
         masks, masked = arrays["masks"], arrays["masked"]
-        if masks.dtype != np.uint8 or masks.shape[1:] != (height, -(-width // 8)):
-            raise ValueError(f"masks of {masks.dtype} {masks.shape} do not fit {width} x {height} pixels")
         if not (
-            len(index) == len(count) == len(masks) == len(masked) <= MOST_FRAMES
+            masks.dtype == np.uint8
+            and masks.shape[1:] == (height, -(-width // 8))
+            and len(index) == len(count) == len(masks) == len(masked) <= MOST_FRAMES
             and (count >= 0).all()
             and points.shape == (count.sum(), 2)
             and kept.shape == points.shape[:1]
             and points.dtype == np.int16
             and kept.dtype == masked.dtype == np.bool_
         ):
-            raise ValueError("its arrays do not fit each other")
-        ends = np.cumsum(count)[:-1]
-        parts = zip(np.split(points, ends), np.split(kept, ends), strict=True)
+            raise ValueError(f"its arrays do not fit each other and {width} x {height} pixels")
+        parts = zip(*(np.split(array, np.cumsum(count)[:-1]) for array in (points, kept)), strict=True)
         shots = [
             Snapshot(int(index[at]), place, keep, masks[at] if masked[at] else None, width)
             for at, (place, keep) in enumerate(parts)

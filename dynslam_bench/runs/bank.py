@@ -51,13 +51,12 @@ class Bank(RunStore):
         """
         self.copy_part(other, record)
         full = raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space")
-        with self.work_folder(record.run_id) as work:
-            with full:
-                for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
-                    if file.is_file():
-                        shutil.copyfile(file, work / file.name)
-                (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
-                replace_folder(work, self.folder(record.run_id))
+        with self.work_folder(record.run_id) as work, full:
+            for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
+                if file.is_file():
+                    shutil.copyfile(file, work / file.name)
+            (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
+            replace_folder(work, self.folder(record.run_id))
         return record
 
     def files(self) -> list[str]:
@@ -271,8 +270,7 @@ def _check(bank: str | Path) -> None:
 
 def _is_repository(place: str) -> bool:
     """Whether a place is a git repository that has to be cloned: an address, or a bare one."""
-    bare = Path(place, "HEAD").is_file() and Path(place, "objects").is_dir()
-    return bare or _ADDRESS.fullmatch(place) is not None
+    return _ADDRESS.fullmatch(place) is not None or (Path(place, "HEAD").is_file() and Path(place, "objects").is_dir())
 
 
 @contextmanager

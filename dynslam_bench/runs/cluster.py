@@ -135,13 +135,11 @@ def _answer(at_a_time: int, make: Callable[..., bytes], *arguments: str) -> byte
 def _facts(sequences: Sequence[str], data_root: str | None) -> dict[str, Any]:
     """What this machine has."""
     lacking = {name for name in sequences if not _is_here(name, data_root)}
-    lacking |= set() if cached_checkpoint(COCO) else {f"network {COCO.id}"}
-    packages = set(versions().items())
     return {
         "code": package_digest(CODE_PACKAGES),
-        "packages": packages,
+        "packages": set(versions().items()),
         "device": resolve_device(),
-        "lacking": lacking,
+        "lacking": lacking | (set() if cached_checkpoint(COCO) else {f"network {COCO.id}"}),
     }
 
 

@@ -90,9 +90,7 @@ class FrameRow:
     @classmethod
     def of(cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None) -> FrameRow:
         """The row of a frame that an environment has tracked."""
-        error, pose = outcome.error, None
-        if outcome.T_world_cam is not None:
-            pose = np.concatenate(se3.to_quaternion(outcome.T_world_cam)).tolist()
+        error, pose = outcome.error, outcome.T_world_cam
         return cls(
             index=outcome.index,
             timestamp=outcome.timestamp,
@@ -105,7 +103,7 @@ class FrameRow:
             mask_iou=mask_iou,
             timings=dict(outcome.timings),
             stats=storable(dict(outcome.stats)),
-            pose=pose,
+            pose=None if pose is None else np.concatenate(se3.to_quaternion(pose)).tolist(),
             dynamic_share=dynamic_share,
         )
 
@@ -186,13 +184,12 @@ class FrameLog:
         A line that a dying process left unfinished is not taken, and no damage.
         """
         rows: list[FrameRow] = []
+        lines = read_lines(path, kind=RunError) if path.is_file() else iter(())
         try:
-            for line in read_lines(path, kind=RunError) if path.is_file() else ():
-                if line.endswith("\n"):
-                    row = _LINE.validate_json(line)
-                    if rows and row.timestamp <= rows[-1].timestamp:
-                        raise ValueError(f"stamp {row.timestamp!r} after {rows[-1].timestamp!r}")
-                    rows.append(row)
+            for row in (_LINE.validate_json(line) for line in lines if line.endswith("\n")):
+                if rows and row.timestamp <= rows[-1].timestamp:
+                    raise ValueError(f"stamp {row.timestamp!r} after {rows[-1].timestamp!r}")
+                rows.append(row)
         except (DynslamError, ValueError) as error:
             return cls(rows, f"row {len(rows) + 1} of {path.name} is damaged ({reason_of(error)})")
         return cls(rows)
@@ -279,10 +276,8 @@ def load_frames(run: RunRecord | Path | str, results: RunStore | Path | str = "r
 
 
 def _file(run: RunRecord | Path | str, results: RunStore | Path | str) -> Path:
-    store = results if isinstance(results, RunStore) else RunStore(results)
-    if isinstance(run, RunRecord):
-        return store.folder(run.run_id) / CSV_FILE
-    path = Path(run).expanduser()
-    if isinstance(run, str) and not path.exists():
-        path = store.folder(store.find(run))
+    path = Path(run.run_id if isinstance(run, RunRecord) else run).expanduser()
+    if isinstance(run, RunRecord) or (isinstance(run, str) and not path.exists()):
+        store = results if isinstance(results, RunStore) else RunStore(results)
+        path = store.folder(store.find(str(path)))
     return path / CSV_FILE if path.is_dir() else path

@@ -121,13 +121,12 @@ class Resolver:
             self._code[configuration, source] = _code_of(tracker, settings, source)
         code = self._code[configuration, source]
         start_map = start_map_of(settings, sequence.camera, tracker.sensors, code["weights"])
-        by_content = {} if start_map is None else {MAP_SETTING: ""}  # its digest is among the weights
         identity = {
             "scheme": IDENTITY_SCHEME,
             "tracker": tracker.id,
             "tracker_version": tracker.version,
             **code,
-            "settings": flat | by_content if by_content else flat,
+            "settings": flat if start_map is None else flat | {MAP_SETTING: ""},  # its digest is among the weights
             "segmentation": source,
             "sequence": part.id,
             "content": part.content,
@@ -177,23 +176,20 @@ def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> dict[str,
     """What of a run's identity says by which code, libraries, weights and files it is made."""
     with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
         files = contents_digest(load_object(tracker.files)(settings)) if tracker.files else ""
+    weights, group = named_digests(settings), getattr(settings, "segmentation", None)
+    if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
+        weights[source] = weights_digest(group.model_copy(update={"source": source}))
     installed = versions()  # another version of what computes with the run's data may give other bits
+    top = tracker.entry_point.rpartition(":")[0].partition(".")[0]
+    own = f"dynslam-bench {release()}"
     return {
-        "distribution": distribution_of(tracker),
+        "distribution": own if top == "dynslam_bench" else " ".join(distribution_of_module(top)).strip(),
         "source": source_fingerprint(tracker, settings, source),
         "requires": {module: distribution_of_module(module)[1] for module in sorted(tracker.requires)},
-        "weights": weights_of(settings, source),
+        "weights": weights,  # of every file that the settings name, or of the network in use where none is named
         **({"files": files} if files else {}),
         "libraries": {name: installed.get(name, "") for name in LIBRARIES},
     }
-
-
-def distribution_of(tracker: TrackerSpec) -> str:
-    """Name and version of the distribution that the tracker's code comes from, e.g. ``dynslam-bench 0.1.0``."""
-    top = tracker.entry_point.rpartition(":")[0].partition(".")[0]
-    if top == "dynslam_bench":
-        return f"dynslam-bench {release()}"
-    return " ".join(distribution_of_module(top)).strip()
 
 
 def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, source: str = "") -> str:
@@ -218,31 +214,23 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
     return digest([code_digest(tracker.entry_point, CODE_PACKAGES), plugins])
 
 
-def weights_of(settings: Settings, source: str) -> dict[str, str]:
-    """Digest of every file that the settings name, by the setting's name; of the network in use where none is named.
-
-    Raises:
-        PluginError: A file cannot be read.
-    """
-    digests = named_digests(settings)
-    group = getattr(settings, "segmentation", None)
-    if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
-        digests[source] = weights_digest(group.model_copy(update={"source": source}))
-    return digests
-
-
 def check_unchanged(run: ResolvedRun) -> None:
-    """A run was made with the code of this package, and began in the map, that were looked up for it.
+    """A run was made with the code, and began in the map, that were looked up for it.
 
     Raises:
         RunError: They have changed since.
-        PluginError: The map is gone.
+        PluginError: The code cannot be read any more.
     """
     if has_package_changed(CODE_PACKAGES):
         raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
     begun_in = run.start_map
-    if begun_in is not None and named_digests(run.settings)[MAP_SETTING] != begun_in.digest:
+    if begun_in is not None and named_digests(run.settings).get(MAP_SETTING) != begun_in.digest:
         raise RunError(f"the map {begun_in.file} has changed since the run was asked for", "the run is not stored")
+    if source_fingerprint(run.tracker, run.settings, run.segmentation) != run.identity["source"]:
+        raise RunError(
+            f"the code of tracker '{run.tracker.id}' has changed since the run was asked for",
+            "the run is not stored; ask again, and let no tracker write files beside its code",
+        )
 
 
 def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:

@@ -83,8 +83,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     with contextlib.closing(recorder):
         with at(position):
             env.reset(seed=spec.seed)
-        over = False
-        reported = 0
+        over, reported = False, 0
         while True:
             done = base.episode.next_index
             with at(lambda: f"frame {base.episode.next_index - 1} of {total}"):
@@ -145,12 +144,11 @@ class _Recorder:
         """Keep the frames since the last call: the one just tracked, and those that were dropped before it."""
         env, result = self._env, self._env.result
         outcomes = env.episode.outcomes
-        for outcome in outcomes[self._logged :]:
-            masked = self._compare_masks(outcome.index) if outcome is outcomes[-1] else (None, None)
-            self._log.write(FrameRow.of(outcome, *masked).to_json())
+        *dropped, outcome = outcomes[self._logged :]
+        self._log.writelines(FrameRow.of(frame).to_json() for frame in dropped)
+        self._log.write(FrameRow.of(outcome, *self._compare_masks(outcome.index)).to_json())
         self._log.flush()
         self._logged = len(outcomes)
-        outcome = outcomes[-1]
         if self._snapshots is not None:
             self._snapshots.add(outcome, env.frame.rgb, result)
         if self._video is not None:
@@ -158,8 +156,7 @@ class _Recorder:
         if self._sheet is not None:
             self._sheet.add()
         if self._spec.rrd:
-            shows = result.keypoints_xy is not None or result.dynamic_mask is not None
-            shot = snapshot_of(outcome.index, result) if shows else None
+            shot = snapshot_of(outcome.index, result)
             error_m = None if outcome.error is None else outcome.error.trans_m
             image, pose = encode(env.frame.rgb), outcome.T_world_cam
             self._recorded.append(
@@ -171,7 +168,7 @@ class _Recorder:
         env, folder = self._env, self._folder
         began = time.perf_counter()
         final = env.final_trajectory()
-        outcome: dict[str, Any] = {"finalize_s": None, "gpu_memory_mb": None}
+        outcome: dict[str, Any] = {}
         if final is not None:
             outcome["finalize_s"] = time.perf_counter() - began
             write_tum(folder / FINAL, final)

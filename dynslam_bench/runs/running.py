@@ -10,13 +10,11 @@ import threading
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, as_completed, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -262,8 +260,6 @@ def judge_coverage(tracked: int, due: int, lost_at_end: int, total: int) -> tupl
 OnFault = Callable[[RunSpec, DynslamError], None]
 """Called as ``on_fault(spec, error)`` for a run that cannot be made; nothing of it is stored."""
 _LOOK_AGAIN_S = 0.2
-_LOOKED_UP_FIRST = 1000
-"""Runs that are looked up before the first one begins."""
 _SENT = 1000
 """Runs that an executor is given at a time."""
 EventKind = Literal["reused", "started", "progress", "finished"]
@@ -277,7 +273,7 @@ class RunEvent:
         kind: ``reused`` (it was stored already), ``started``, ``progress`` or ``finished``.
         run_id: The run.
         spec: What was asked for.
-        total: How many runs there are, of those looked up so far.
+        total: How many runs there are, of those looked up so far while some are ``reused``.
         record: The outcome, with ``reused`` and ``finished``.
         partial: The partial metrics, with ``progress``.
     """
@@ -319,11 +315,11 @@ def run_many(
 ) -> Records:
     """Make the runs that are not stored yet, and score them.
 
-    The first runs begin once a thousand are looked up, while the others are. A stored run is made again if snapshots, a
-    video, a sheet or its map are asked for that it lacks. One that is given another label gets that. One that a study
-    made is an ordinary run once it is asked for without the study. A failure is a record and stops nothing; after an
-    interrupt the call goes on. A run that cannot be made stops no other, and nothing of it is stored. Several processes
-    may share a results folder (without `executor`): each run is made by one of them.
+    A stored run is made again if snapshots, a video, a sheet or its map are asked for that it lacks. One that is given
+    another label gets that. One that a study made is an ordinary run once it is asked for without the study. A failure
+    is a record and stops nothing; after an interrupt the call goes on. A run that cannot be made stops no other, and
+    nothing of it is stored. Several processes may share a results folder (without `executor`): each run is made by one
+    of them.
 
     Args:
         specs: What to run; runs that are the same are made once.
@@ -349,14 +345,19 @@ def run_many(
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
     again = set(FAILED).union(retry) - {"failed"} if "failed" in retry else set(retry)
-    outcomes = {"ok", "lost", *FAILED}
-    if not again <= outcomes:
-        statuses = ", ".join(sorted(outcomes))
-        raise RunError(f"unknown status '{min(again - outcomes)}' to retry", f"known: failed, {statuses}")
+    for unknown in sorted(again - {"ok", "lost", *FAILED}):
+        raise RunError(f"unknown status '{unknown}' to retry", f"known: failed, {', '.join(('lost', 'ok', *FAILED))}")
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
-    bench = _Bench(store, get_protocol(protocol), jobs, executor, on_plan, on_event, on_progress, cancelled, on_fault)
-    return bench.make(specs, again)
+    bench = _Bench(store, get_protocol(protocol), jobs, on_plan, on_event, on_progress, cancelled, on_fault)
+    bench.look_up(specs, again)
+    if executor is None:
+        bench.make_here()
+    else:
+        bench.make_remotely(executor)
+    if bench.first_fault is not None and on_fault is None:
+        raise bench.first_fault
+    return Records(store, [run_id for run_id in bench.run_ids if run_id in bench.done], bench.not_stored)
 
 
 @dataclass
@@ -366,7 +367,6 @@ class _Bench:
     store: RunStore
     protocol: Protocol
     jobs: int
-    executor: Executor | None
     on_plan: Callable[[Plan], None] | None
     on_event: Callable[[RunEvent], None] | None
     on_progress: OnProgress | None
@@ -380,37 +380,12 @@ class _Bench:
     not_stored: dict[str, RunRecord] = field(default_factory=dict)
     first_fault: DynslamError | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
-    looked_up: threading.Event = field(default_factory=threading.Event)
     aborted: threading.Event = field(default_factory=threading.Event)
 
-    def make(self, specs: Iterable[RunSpec], again: Collection[str]) -> Records:
-        makers: list[Future[None]] = []
-        with ThreadPoolExecutor(self.jobs, thread_name_prefix="dynslam-run") as pool:
-            try:
-                looking_up = self._look_up(specs, again)
-                for _ in islice(looking_up, _LOOKED_UP_FIRST):
-                    pass
-                if self.executor is None:
-                    makers += [pool.submit(self._make_here) for _ in range(self.jobs)]
-                else:
-                    makers.append(pool.submit(self._make_remotely, self.executor))
-                for _ in looking_up:
-                    if any(maker.done() for maker in makers):  # it failed
-                        break
-                for maker in as_completed(makers):
-                    maker.result()
-            except BaseException:
-                self.aborted.set()
-                raise
-        if self.first_fault is not None and self.on_fault is None:
-            raise self.first_fault
-        return Records(self.store, [run_id for run_id in self.run_ids if run_id in self.done], self.not_stored)
-
-    def _look_up(self, specs: Iterable[RunSpec], again: Collection[str]) -> Iterator[None]:
-        """Look the runs up, one a step: take what is stored, let the others wait to be made."""
+    def look_up(self, specs: Iterable[RunSpec], again: Collection[str]) -> None:
+        """Look the runs up: take what is stored, let the others wait to be made."""
         look_up, plan, run_ids = Resolver(), Plan(), set[str]()
         for spec in specs:
-            yield
             try:
                 run = look_up(spec)
             except (NetworkNotFetched, InfrastructureError):
@@ -435,10 +410,6 @@ class _Bench:
             self.waiting.append((run, stored))
         if plan.runs and self.on_plan is not None:
             self.on_plan(plan)
-        self.looked_up.set()
-
-    def _is_over(self) -> bool:
-        return self.aborted.is_set() or (self.looked_up.is_set() and not self.waiting)
 
     def _reuse(self, run: ResolvedRun, record: RunRecord) -> None:
         if run.spec.label not in ("", record.tracker.label):
@@ -448,12 +419,22 @@ class _Bench:
             record = self.store.rewrite(record, study="")
         self._take_in(run, record, "reused")
 
-    def _make_here(self) -> None:
-        """Make the waiting runs, or take what another process has made of them meanwhile.
+    def make_here(self) -> None:
+        """Make the waiting runs, so many at a time."""
+        with ThreadPoolExecutor(self.jobs, thread_name_prefix="dynslam-run") as pool:
+            try:
+                for maker in as_completed([pool.submit(self._make_waiting) for _ in range(self.jobs)]):
+                    maker.result()
+            except BaseException:
+                self.aborted.set()
+                raise
+
+    def _make_waiting(self) -> None:
+        """Make waiting runs, or take what another process has made of them meanwhile.
 
         While all that are left are claimed elsewhere it waits.
         """
-        while not self._is_over():
+        while self.waiting and not self.aborted.is_set():
             with ExitStack() as claims:
                 if (claimed := self._claim(claims)) is None:
                     time.sleep(_LOOK_AGAIN_S)
@@ -490,29 +471,23 @@ class _Bench:
             at_a_time=self.jobs,
         )
 
-    def _make_remotely(self, executor: Executor) -> None:
+    def make_remotely(self, executor: Executor) -> None:
+        """Have an executor make the waiting runs."""
         protocol = self.protocol.model_dump_json()
         sent: dict[Future[Any], ResolvedRun] = {}  # a future holds all bytes of its run, so few are kept
         try:
-            while sent or not self._is_over():
+            while sent or self.waiting:
                 for _ in range(min(_SENT - len(sent), len(self.waiting))):
                     run, _ = self.waiting.pop(0)
                     self._report("started", run)
                     spec = run.spec.model_copy(update={"device": run.device})
                     asked = (spec.model_dump_json(), protocol, json.dumps(run.identity, default=str))
                     sent[_asked(executor.submit, run_packed, *asked)] = run
-                if not sent:
-                    time.sleep(_LOOK_AGAIN_S)
-                for future in wait(sent, _LOOK_AGAIN_S, FIRST_COMPLETED).done:
-                    self._attempt(sent.pop(future), partial(self._take, future))
-                if self.aborted.is_set():
-                    return
+                for future in wait(sent, return_when=FIRST_COMPLETED).done:
+                    self._attempt(sent.pop(future), lambda _, future=future: unpack(_asked(future.result), self.store))
         finally:
             for future in sent:
                 future.cancel()
-
-    def _take(self, future: Future[Any], run: ResolvedRun) -> RunRecord:
-        return unpack(_asked(future.result), self.store)
 
     def _attempt(self, run: ResolvedRun, make: Callable[[ResolvedRun], RunRecord]) -> None:
         """Make a run; one that cannot be made although nothing is broken here is set aside."""
@@ -563,9 +538,14 @@ def _asked(ask: Callable[..., T], *arguments: object) -> T:
 
 def pictures_asked(spec: RunSpec) -> list[str]:
     """The files beside a run that it was asked for."""
-    asked = [(PICTURE.format(0), spec.snapshots), (VIDEO_FILE, spec.video), (SHEET_FILE, spec.sheet)]
-    asked += [(RECORDING_FILE, spec.rrd), (MAP_FILE, spec.save_map)]
-    return [name for name, wanted in asked if wanted]
+    asked = {
+        PICTURE.format(0): spec.snapshots,
+        VIDEO_FILE: spec.video,
+        SHEET_FILE: spec.sheet,
+        RECORDING_FILE: spec.rrd,
+        MAP_FILE: spec.save_map,
+    }
+    return [name for name, wanted in asked.items() if wanted]
 
 
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:

@@ -75,7 +75,7 @@ class RunSpec(Record):
     stride: int = Field(default=1, ge=1)
     seed: int = Field(default=0, ge=0, lt=2**63)
     device: str = "auto"
-    threads: int = Field(default=1, ge=1)
+    threads: int = Field(default=1, ge=1, le=1024)
     cache: bool = False
     realtime: bool = False
     drop_share: float = Field(default=0.0, ge=0, lt=1)
@@ -130,13 +130,12 @@ class RunSpec(Record):
 
 def absolute_target(tracker: str) -> str:
     """``file.py:Attr`` and ``id:FILE`` with the file's absolute path; other names as they are."""
-    head, separator, tail = tracker.rpartition(":")
-    if separator and head.endswith(".py"):
+    head, _, tail = tracker.rpartition(":")
+    if head.endswith(".py"):
         return f"{Path(head).expanduser().resolve()}:{tail}"
-    prefix, separator, value = tracker.partition(":")
-    if separator and value and Path(value).expanduser().is_file():
-        return f"{prefix}:{Path(value).expanduser().resolve()}"
-    return tracker
+    prefix, _, value = tracker.partition(":")
+    file = Path(value).expanduser()  # of no value the working folder
+    return f"{prefix}:{file.resolve()}" if file.is_file() else tracker
 
 
 def _absolute_folder(sequence: str) -> str:

@@ -62,6 +62,7 @@ _TABLE = (
     "CREATE TABLE IF NOT EXISTS computed "
     "(name TEXT, run_id TEXT, version TEXT, state TEXT, value TEXT, PRIMARY KEY (name, run_id))"
 )
+_KEEP = "INSERT OR REPLACE INTO computed (name, run_id, version, state, value) VALUES (?, ?, ?, ?, ?)"
 _VALUES = "SELECT run_id, state, value FROM computed WHERE name = ? AND version = ?"
 _LOCKED_S = 10.0
 Row = dict[str, Any]
@@ -133,30 +134,21 @@ class RunIndex:
             version: Digest of the code that computed them.
             entries: Run, its state before it was read, and the value.
         """
-        rows: list[tuple[str, ...]] = [(name, run_id, version, state, value) for run_id, state, value in entries]
-        command = "INSERT OR REPLACE INTO computed (name, run_id, version, state, value) VALUES (?, ?, ?, ?, ?)"
-        self._change(command, rows)
-
-    def forget(self, run_id: str) -> None:
-        """Remove the values of a run."""
-        if self.path.exists():
-            self._change("DELETE FROM computed WHERE run_id = ?", [(run_id,)])
-
-    def names(self) -> set[str]:
-        """Names of the values that are kept."""
-        return {str(name) for (name,) in self._query("SELECT DISTINCT name FROM computed")}
-
-    def _change(self, command: str, rows: Sequence[tuple[str, ...]]) -> None:
+        rows = [(name, run_id, version, state, value) for run_id, state, value in entries]
         for _ in range(2):
             try:
                 with self._opened(create=True) as connection, connection:
-                    connection.executemany(command, rows)
+                    connection.executemany(_KEEP, rows)
                 return
             except (sqlite3.OperationalError, UnicodeEncodeError):  # it cannot be written, or a value not be encoded
                 return
             except sqlite3.DatabaseError:  # it is damaged, or no database
                 with contextlib.suppress(OSError):
                     self.path.unlink()
+
+    def names(self) -> set[str]:
+        """Names of the values that are kept."""
+        return {str(name) for (name,) in self._query("SELECT DISTINCT name FROM computed")}
 
     @contextlib.contextmanager
     def _opened(self, *, create: bool) -> Iterator[sqlite3.Connection]:
@@ -165,8 +157,8 @@ class RunIndex:
         Raises:
             sqlite3.OperationalError: It is not there, or cannot be opened.
         """
-        is_there = self.path.exists() or self.path.is_symlink()
-        if (is_there and (self.path.is_symlink() or not self.path.is_file())) or not (is_there or create):
+        is_free = create and not self.path.exists()
+        if self.path.is_symlink() or not (is_free or self.path.is_file()):
             raise sqlite3.OperationalError(f"{self.path} is no database")
         with contextlib.closing(sqlite3.connect(self.path, timeout=_LOCKED_S)) as connection:
             connection.execute("PRAGMA synchronous = OFF")  # a power cut costs an index, which is made again
@@ -236,7 +228,6 @@ class RunStore:
         self.root = self.source = Path(root).expanduser().absolute()
         self.runs = self.root / "runs"
         self.index = RunIndex(self.root)
-        self._swept = False
 
     def folder(self, run_id: str) -> Path:
         """Folder of one run, whether it exists or not.
@@ -264,14 +255,12 @@ class RunStore:
         """
         with temporary_folder(self.runs / "probe"):
             pass
-        if not self._swept:
-            self._swept = True
-            for pattern in (".*", "runs/.*", "sequences/*/.*"):
-                sweep_temporary(self.root, pattern)
-            for left in self.runs.glob(".*.claim"):
-                with claimed(left):  # if no process holds it, it is removed
-                    pass
-            self._unlink_dangling()
+        for pattern in (".*", "runs/.*", "sequences/*/.*"):
+            sweep_temporary(self.root, pattern)
+        for left in self.runs.glob(".*.claim"):
+            with claimed(left):  # if no process holds it, it is removed
+                pass
+        self._unlink_dangling()
 
     def work_folder(self, run_id: str) -> AbstractContextManager[Path]:
         """A hidden folder to make a run in; it vanishes unless `publish` moved it into place.
@@ -313,9 +302,13 @@ class RunStore:
     def _with_alarm(self, record: RunRecord, work: Path) -> RunRecord:
         """The record, with a note where an earlier run of its id, which should be equal, gave another trajectory."""
         earlier = self.get(record.run_id)
-        if earlier is None or not record.tracker.deterministic or record.realtime or earlier.status != "ok":
-            return record
-        if record.status != "ok" or _content(work / ONLINE) == _content(self.folder(record.run_id) / ONLINE):
+        if (
+            earlier is None
+            or not record.tracker.deterministic
+            or record.realtime
+            or not earlier.status == record.status == "ok"
+            or _equal(work, self.folder(record.run_id), ONLINE)
+        ):
             return record
         note = (
             f"an earlier run with this id, started {earlier.started}, gave another trajectory, although tracker "
@@ -362,7 +355,7 @@ class RunStore:
         return changed
 
     def remove(self, run_id: str) -> None:
-        """Delete a run and its metrics.
+        """Delete a run; its values in the index hold no more.
 
         Raises:
             RunError: There is no such run, or it cannot be deleted.
@@ -370,7 +363,6 @@ class RunStore:
         run_id = self.find(run_id)
         with raising(RunError, f"cannot remove run {run_id}"), self.work_folder(run_id) as removed:
             self.folder(run_id).rename(removed / run_id)
-        self.index.forget(run_id)
         self._unlink_dangling()
 
     def _unlink_dangling(self) -> None:
@@ -398,9 +390,9 @@ class RunStore:
 
     def get(self, run_id: str) -> RunRecord | None:
         """The record of a run by its full id, None if it is not stored or damaged."""
-        is_stored = (self.folder(run_id) / RUN_FILE).is_file()
+        folder = self.folder(run_id)
         with contextlib.suppress(DynslamError):
-            return self.read_whole(run_id) if is_stored else None
+            return self.read_whole(folder.name)
         return None
 
     def read_whole(self, run_id: str) -> RunRecord:
@@ -446,7 +438,7 @@ class RunStore:
             return matching[0]
         if matching:
             raise RunError(f"{len(matching)} runs begin with '{prefix}'", ", ".join(matching[:5]))
-        hint = did_you_mean(prefix, run_ids) if run_ids else f"there are no runs in {self.source}"
+        hint = did_you_mean(prefix, run_ids) or f"there are no runs in {self.source}"
         raise RunError(f"there is no run '{prefix}'", hint)
 
     def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
@@ -519,8 +511,7 @@ class RunStore:
             return stored
         state = self.index.state(record.run_id, record.sequence.part)  # before the files are read
         evaluations: dict[Which, Evaluation | None] = {"online": None, "final": None}
-        reasons: dict[str, str] = {}
-        lines: list[str] = []
+        reasons, lines = dict[str, str](), list[str]()
         for which in evaluations:
             try:
                 trajectory, truth, stamps = self._inputs(record, protocol, which)
@@ -530,11 +521,9 @@ class RunStore:
                 continue
             if which == protocol.trajectory or not evaluations[protocol.trajectory]:
                 lines = [str(hint) for hint in hints(trajectory, truth, protocol)]
-        asked: Which = protocol.trajectory
+        asked: Which = protocol.trajectory if record.tracker.online else "final"
         if record.kind == "imported":  # it has only one trajectory
             asked = "online" if (self.folder(record.run_id) / ONLINE).is_file() else "final"
-        elif not record.tracker.online:
-            asked = "final"
         metrics = MetricRecord(
             run_id=record.run_id,
             protocol_id=protocol.id,
@@ -657,10 +646,6 @@ def _metrics_of(protocol: Protocol) -> str:
     return f"metrics {protocol.digest()}"
 
 
-def _content(file: Path) -> bytes:
-    return file.read_bytes() if file.is_file() else b""
-
-
 def _checked(name: str, what: str) -> str:
     """A name that data gives to a folder of the store, if it is one that this package makes."""
     if not _RUN_ID.fullmatch(name):
@@ -744,17 +729,21 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
         return str(error)
     if not (part / "timestamps.txt").is_file():
         return f"{source.source} has lost the stamps of its sequence"
-    if (there / "timestamps.txt").is_file() and not _equal(part, there, ("timestamps.txt", "groundtruth.txt")):
+    if (there / "timestamps.txt").is_file() and not _equal(part, there, "timestamps.txt", "groundtruth.txt"):
         return f"{store.source} holds other stamps or truth of its sequence"
     earlier, folders = store.get(record.run_id), (source.folder(record.run_id), store.folder(record.run_id))
-    if earlier is not None and (earlier.status != record.status or not _equal(*folders, (ONLINE, FINAL))):
+    if earlier is not None and (earlier.status != record.status or not _equal(*folders, ONLINE, FINAL)):
         return f"{store.source} holds another result of this run"
     return ""
 
 
-def _equal(one: Path, other: Path, names: Iterable[str]) -> bool:
+def _equal(one: Path, other: Path, *names: str) -> bool:
     """Whether files of two folders have the same content; a missing file is an empty one."""
-    return all(_content(one / name) == _content(other / name) for name in names)
+
+    def content(file: Path) -> bytes:
+        return file.read_bytes() if file.is_file() else b""
+
+    return all(content(one / name) == content(other / name) for name in names)
 
 
 def list_runs(

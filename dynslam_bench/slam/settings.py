@@ -11,7 +11,7 @@ from typing import Literal
 from pydantic import Field
 
 from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import Settings, names, online_choice, tunable
+from dynslam_bench.core.settings import Settings, names, tunable
 
 NO_DEPTH = "no effect: there is no depth"
 
@@ -58,7 +58,9 @@ class TrackingSettings(Settings):
 class KeyframeSettings(Settings):
     """When a frame becomes a keyframe, and when a keyframe is redundant."""
 
-    schedule: Literal["rule", "every", "none"] = online_choice("rule", meaning="tracked frames that become keyframes")
+    schedule: Literal["rule", "every", "none"] = tunable(
+        "rule", online=True, tuned=False, meaning="tracked frames that become keyframes"
+    )
     max_gap: int = tunable(
         30,
         low=10,

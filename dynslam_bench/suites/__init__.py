@@ -85,7 +85,7 @@ class Suite(Record):
     offsets: tuple[Offset, ...] = Field(default=(0,), min_length=1)
     frames: tuple[int, int | None] | None = None
     stride: int = Field(default=1, ge=1)
-    threads: int = Field(default=1, ge=1)
+    threads: int = Field(default=1, ge=1, le=1024)
     cache: bool = False
     settings: dict[str, Any] = Field(default_factory=dict)
     tracker_settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
@@ -154,14 +154,12 @@ class Suite(Record):
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
         chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
-        trackers_named = {*chosen, *self.trackers, *self.optional}
-        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in trackers_named}
-        named = {*self.tracker_settings, *(row.tracker for row in self.rows)}
-        strangers = sorted(named - {*self.trackers, *self.optional})
-        if strangers:
+        own = {*self.trackers, *self.optional}
+        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in {*chosen, *own}}
+        if strangers := sorted({*self.tracker_settings, *(row.tracker for row in self.rows)} - own):
             raise RunError(
                 f"suite '{self.name}' has settings for '{strangers[0]}', which is none of its trackers",
-                did_you_mean(strangers[0], {*self.trackers, *self.optional}),
+                did_you_mean(strangers[0], own),
             )
         settable = set().union(*field_sets.values())
         if unknown := sorted(self.settings.keys() - settable):

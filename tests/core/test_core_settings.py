@@ -1,5 +1,6 @@
 """Settings: one annotation gives validation, overrides, search space and table; errors name what is wrong."""
 
+import pickle
 import sys
 from dataclasses import dataclass
 from importlib import metadata
@@ -12,12 +13,11 @@ import numpy as np
 import pytest
 
 import dynslam_bench
-from dynslam_bench.core import compiled, fingerprint, folders
+from dynslam_bench.core import DynslamError, PluginError, SettingsError, compiled, did_you_mean, fingerprint, folders
 from dynslam_bench.core import plugins as plugin_probe
 from dynslam_bench.core import version as versions
-from dynslam_bench.core.errors import DynslamError, PluginError, SettingsError, did_you_mean
+from dynslam_bench.core.code_files import files_below
 from dynslam_bench.core.fingerprint import (
-    code_digest,
     content_digest,
     machine_digest,
     named_digests,
@@ -28,11 +28,9 @@ from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, Registry, load_obje
 from dynslam_bench.core.settings import (
     Settings,
     apply_overrides,
-    build,
     field_names,
     flatten,
     names,
-    online_choice,
     parameters,
     parse_assignments,
     settings_table,
@@ -50,17 +48,9 @@ class Root(Settings):
     epipolar: Epipolar = Epipolar()
     features: int = tunable(1000, low=200, high=4000, meaning="keypoints")
     method: Literal["orb", "fast"] = tunable("orb", meaning="detector")
-    when: Literal["rule", "now"] = online_choice("rule", meaning="keyframes")
+    when: Literal["rule", "now"] = tunable("rule", online=True, tuned=False, meaning="keyframes")
     name: str = "plain"
     maybe: float | None = None
-
-
-def test_defaults_and_names():
-    assert field_names(Root) == [
-        "epipolar.enabled", "epipolar.threshold_px", "epipolar.wide", "features", "method", "when", "name", "maybe",
-    ]  # fmt: skip
-    assert flatten(Root())["epipolar.threshold_px"] == 1.0
-    assert build(Root, {"epipolar": {"threshold_px": 2}}).epipolar.threshold_px == 2.0
 
 
 def test_parameters_describe_the_search_space():
@@ -91,9 +81,7 @@ def test_parameters_describe_the_search_space():
 )
 def test_assignments_of_the_command_line(assignment, name, value):
     settings = apply_overrides(Root(), parse_assignments([assignment]))
-    assert flatten(settings)[name] == value
-    untouched = {k: v for k, v in flatten(Root()).items() if k != name}
-    assert {k: v for k, v in flatten(settings).items() if k != name} == untouched
+    assert flatten(settings) == flatten(Root()) | {name: value}
 
 
 @pytest.mark.parametrize(
@@ -143,26 +131,23 @@ def test_settings_are_frozen_and_tables_hold_every_leaf():
     assert '| `method` | `"orb"` | `orb`, `fast` |' in table
 
 
-def test_bad_annotations_are_bugs_of_the_author():
-    with pytest.raises(ValueError, match="log scale needs low > 0"):
-        tunable(1.0, low=0.0, high=1.0, scale="log", meaning="")
+@pytest.mark.parametrize(
+    ("kind", "default", "limits", "error", "words"),
+    [
+        (float, 1.0, {"low": 0.0, "high": 1.0, "scale": "log"}, ValueError, "log scale needs low > 0"),
+        (float, 1.0, {}, TypeError, r"'value'.*needs low and high"),
+        (
+            float, 1000.0, {"low": 0.2, "high": 10.0, "limits": (0.0, 1e4)}, TypeError,
+            r"Bad: the default of 'value' is 1000.0, outside its range 0.2 to 10",
+        ),
+        (Epipolar, Epipolar(wide=9.0), None, TypeError, "Bad: the default of 'value.wide' is 9.0, outside its"),
+    ],
+)  # fmt: skip
+def test_bad_annotations_are_bugs_of_the_author(kind, default, limits, error, words):
+    with pytest.raises(error, match=words):
 
-    with pytest.raises(TypeError, match=r"'value'.*needs low and high"):
-
-        class NoRange(Settings):
-            value: float = tunable(1.0, meaning="no range")
-
-
-def test_a_default_outside_its_range_is_a_bug_of_the_author():
-    with pytest.raises(TypeError, match=r"Outside: the default of 'value' is 1000.0, outside its range 0.2 to 10"):
-
-        class Outside(Settings):
-            value: float = tunable(1000.0, low=0.2, high=10.0, limits=(0.0, 1e4), meaning="x")
-
-    with pytest.raises(TypeError, match=r"Other: the default of 'epipolar.wide' is 9.0, outside its range 0.5 to 2"):
-
-        class Other(Root):
-            epipolar: Epipolar = Epipolar(wide=9.0)
+        class Bad(Settings):
+            value: kind = default if limits is None else tunable(default, meaning="x", **limits)
 
 
 def test_a_group_with_other_defaults_is_described_with_them():
@@ -183,13 +168,8 @@ def test_did_you_mean():
 
 
 def test_errors_survive_a_process_border():
-    import pickle
-
-    error = SettingsError("what", "how")
-    again = pickle.loads(pickle.dumps(error))
-    assert type(again) is SettingsError
-    assert str(again) == str(error) == "what (how)"
-    assert str(DynslamError("only")) == "only"
+    again = pickle.loads(pickle.dumps(SettingsError("what", "how")))
+    assert type(again) is SettingsError and str(again) == "what (how)" and str(DynslamError("only")) == "only"
 
 
 @pytest.mark.parametrize("compile_", [compiled.kernel, compiled.dividing_kernel, compiled.spliced])
@@ -268,12 +248,6 @@ def test_packages_with_and_without_init_count_whole(tmp_path: Path, monkeypatch:
         plugin_digest("fp_nowhere.module:SPEC")
 
 
-def test_own_rooms_count_each_by_itself() -> None:
-    orb = "dynslam_bench.features.orb:OrbExtractor"
-    assert code_digest(orb, ("core", "features")) == code_digest(orb, ("core", "features"))
-    assert code_digest(orb, ("core", "features")) != code_digest(orb, ("core", "segmentation"))
-
-
 class Inner(Settings):
     source: str = "auto"
     options: dict[str, object] = {}  # noqa: RUF012
@@ -337,13 +311,9 @@ def test_every_distribution_of_opencv_is_versioned(name: str, monkeypatch: pytes
 
 
 def test_a_link_to_a_folder_above_it_is_not_followed(tmp_path):
-    from dynslam_bench.core.code_files import files_below
-
-    inner = tmp_path / "inner"
-    inner.mkdir()
-    (inner / "code.py").touch()
-    (inner / "up").symlink_to(tmp_path)
-    assert list(files_below(tmp_path)) == [inner / "code.py"]
+    code = write(tmp_path / "inner" / "code.py", "")
+    (tmp_path / "inner" / "up").symlink_to(tmp_path)
+    assert list(files_below(tmp_path)) == [code]
 
 
 # Where data, stages, weights and vocabularies lie, and the version of the package.
@@ -462,7 +432,10 @@ def test_file_and_module_targets(tmp_path, monkeypatch):
     ("target", "expected"),
     [
         ("nowhere.at.all:SPEC", "cannot import nowhere.at.all: ModuleNotFoundError"),
-        ("/nowhere/file.py:SPEC", "cannot import /nowhere/file.py: FileNotFoundError: no file /nowhere/file.py"),
+        (
+            "/nowhere/file.py:SPEC",
+            "cannot import /nowhere/file.py: FileNotFoundError: .*No such file.*",
+        ),
         ("nocolon", "is not module:Attr"),
         (":SPEC", "is not module:Attr"),
         ("module:", "is not module:Attr"),
@@ -523,13 +496,13 @@ def test_environment_variable(tmp_path, monkeypatch):
     (failure,) = trackers.failures()
     assert str(broken) in failure.source
     assert "ModuleNotFoundError: No module named 'nothing_of_that_name'" in failure.reason
-    assert "from-env" in {found.spec.id for found in registry("flow").all()}
-    assert "from-env" not in {found.spec.id for found in registry("filters").all()}
+    assert [len(registry(kind).all()) for kind in ("flow", "filters")] == [3, 2]
+    with pytest.raises(PluginError, match=r"unknown tracker 'brokn'.*broken\.py:SPEC failed to load: cannot import"):
+        trackers.get("brokn")
     monkeypatch.delenv(ENVIRONMENT_VARIABLE)
-    assert len(trackers.all()) == 3  # found once
+    assert len(trackers.all()) == 3  # discovered once
     trackers.refresh()
-    assert len(trackers.all()) == 2
-    assert trackers.failures() == []
+    assert len(trackers.all()) == 2 and trackers.failures() == []
 
 
 def test_entry_points_of_installed_distributions_come_after_the_environment_and_what_is_built_in(tmp_path, monkeypatch):

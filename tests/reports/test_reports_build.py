@@ -488,7 +488,6 @@ CHANGES = {
     "true otherwise": lambda store, run: write_tum(
         store.root / "sequences" / store.read_whole(run).sequence.part / "groundtruth.txt", truth_of("another")
     ),
-    "forgotten": lambda store, run: store.index.forget(run),
     "removed": lambda store, run: store.remove(run),
     "linked": lambda store, run: (store.folder(run) / "frames.csv").symlink_to(store.root.parent),
     "added": lambda store, run: add_run(store, "new", "s/a", n=60),

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from envs_toys import TARGET, write_folder
 
-from dynslam_bench.core import fingerprint
-from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core import PluginError, RunError, fingerprint
 from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, run_one
 
 PLUGIN = """
@@ -112,7 +111,10 @@ def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
 )
 def test_a_changed_plug_in_is_another_run(file: str, old: str, new: str, tmp_path: Path) -> None:
     spec, folder = plugin(tmp_path)
+    asked = resolve(spec)
     assert makes_another_run(spec, edit(folder / file, old, new))
+    with pytest.raises(RunError, match="code of tracker 'mine' has changed since"):
+        identity.check_unchanged(asked)
 
 
 def test_code_of_this_package_that_changes_meanwhile_is_noticed(tmp_path: Path, monkeypatch) -> None:
@@ -266,22 +268,18 @@ def test_no_plug_in_takes_the_id_of_a_built_in_tracker(tmp_path: Path) -> None:
         resolve(RunSpec(tracker=f"{file}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))))
 
 
-def test_one_run_id_with_two_results_is_said(
+def test_one_run_id_with_two_results_is_said_and_another_scheme_is_unverified(
     store: RunStore, toy_folder: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 6))
     record = run_one(spec, store)
     assert run_one(spec, store).notes == record.notes
+    assert record.verified and "identity" not in record.program
+    old = record.model_copy(update={"identity": record.identity | {"scheme": 0}})
+    assert not old.verified and old.program["identity"] == "unverified"
     trajectory = store.folder(record.run_id) / "trajectory_online.txt"
     trajectory.write_text(trajectory.read_text().replace("0.0", "0.1"))
     (again,) = run_many([spec], results=store, retry=["ok"])
     assert again.run_id == record.run_id
     assert any("another trajectory" in note for note in again.notes)
     assert any(record.run_id in message for message in caplog.messages)
-
-
-def test_runs_of_another_scheme_are_unverified(store: RunStore, toy_folder: str) -> None:
-    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 6)), store)
-    assert record.verified and "identity" not in record.program
-    old = record.model_copy(update={"identity": {k: v for k, v in record.identity.items() if k != "scheme"}})
-    assert not old.verified and old.program["identity"] == "unverified"

@@ -11,21 +11,19 @@ import pytest
 from envs_play import play
 from envs_toys import TARGET, ToySequence, write_folder
 
-from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
-from dynslam_bench.core.errors import DynslamError, RunError, SettingsError, TrackerError
-from dynslam_bench.core.folders import WEIGHTS_VARIABLE
+from dynslam_bench.contracts import KeyframeRecord, MapOutputs
+from dynslam_bench.core import WEIGHTS_VARIABLE, DynslamError, RunError, SettingsError, TrackerError
 from dynslam_bench.envs import SlamEnv
-from dynslam_bench.evaluation.protocol import get_protocol
-from dynslam_bench.geometry.stamps import format_ns, from_seconds
-from dynslam_bench.geometry.trajectory_files import read_tum
-from dynslam_bench.reports.model.board import make_board
+from dynslam_bench.evaluation import get_protocol
+from dynslam_bench.geometry import format_ns, from_seconds, read_tum
+from dynslam_bench.reports import make_board
 from dynslam_bench.reports.model.names import make_labels
 from dynslam_bench.reports.model.row import make_row, run_command
-from dynslam_bench.runs import RunRecord, RunSpec, RunStore, resolve, run_many, run_one, score
+from dynslam_bench.runs import RunRecord, RunSpec, RunStore, resolve, run_many, run_one, run_row, score
 from dynslam_bench.runs.artifacts import keep_map
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
 from dynslam_bench.runs.identity import check_unchanged, start_map_of
-from dynslam_bench.runs.store import run_row, runs_frame
+from dynslam_bench.runs.store import runs_frame
 from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 

@@ -51,10 +51,8 @@ def _whole(trajectory: Trajectory) -> TumFile:
 def _stamps_by_name(path: Path) -> dict[str, float]:
     """The stamp of each image of a list, by the name that the list gives and by the file's own."""
     images = read_image_list(path.expanduser())
-    stamps = images.stamps.tolist()
-    return {Path(file).name: stamp for file, stamp in zip(images.files, stamps, strict=True)} | dict(
-        zip(images.files, stamps, strict=True)
-    )
+    stamps = dict(zip(images.files, images.stamps.tolist(), strict=True))
+    return {Path(file).name: stamp for file, stamp in stamps.items()} | stamps
 
 
 def is_pose_table(path: Path) -> bool:

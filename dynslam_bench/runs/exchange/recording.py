@@ -193,7 +193,9 @@ def write_stored(
     folder = store.folder(record.run_id)
     (height, width), snapshots = read_snapshots(folder)
     scale = np.array([sequence.camera.width / max(width, 1), sequence.camera.height / max(height, 1)])
-    shots = {shot.index: _scaled(shot, scale) for shot in snapshots}
+    # in pixels of the sequence's images, which the tracker's preprocessing may have resized
+    scaled = [((shot.points + 0.5) * scale - 0.5).round().astype(np.int16) for shot in snapshots]
+    shots = {shot.index: replace(shot, points=points) for shot, points in zip(snapshots, scaled, strict=True)}
     online = store.trajectory(record.run_id, "online") or trajectory
     tracked, rows_of_poses = associate(sequence.timestamps, online.timestamps, _TOLERANCE_S, strict=False)
     poses = dict(zip(tracked.tolist(), online.T_world_cam[rows_of_poses], strict=True))
@@ -213,8 +215,3 @@ def write_stored(
     if len(shots) == len(sequence):
         return []
     return [f"features and masks are known of {len(shots)} of {len(sequence)} frames; `run --rrd` records all"]
-
-
-def _scaled(shot: Snapshot, scale: NDArray[np.float64]) -> Snapshot:
-    """A snapshot of an image that the tracker's preprocessing had resized, in pixels of the sequence's."""
-    return replace(shot, points=((shot.points + 0.5) * scale - 0.5).round().astype(np.int16))

@@ -1,5 +1,6 @@
 """Stored runs as files of other tools with ``provenance.json`` beside them, and their trajectories as stored runs."""
 
+import contextlib
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-import dynslam_bench
 from dynslam_bench.contracts import Sequence, timestamps_ns
 from dynslam_bench.core import DynslamError, RunError, atomic_folder, did_you_mean, write_atomic
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
+from dynslam_bench.core.version import version
 from dynslam_bench.envs.arguments import Frames, open_frames
 from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE
 from dynslam_bench.geometry import (
@@ -58,18 +59,6 @@ class Exported:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Job:
-    """One run on its way out."""
-
-    store: RunStore
-    record: RunRecord
-    which: Which
-    trajectory: Trajectory
-    data_root: str | Path | None
-    camera: str | Path | None
-
-
 def export_run(
     run: RunRecord | str,
     form: str,
@@ -108,10 +97,9 @@ def export_run(
     if target.exists() and not is_free:  # only a folder that an export made, or an empty one, is replaced
         raise RunError(f"{target} exists and is no export", "name a folder that does not exist, with -o")
     with atomic_folder(target) as work:
-        notes = FORMATS[form](_Job(store, record, chosen, trajectory, data_root, camera), work)
+        notes = _write(form, work, store, record, chosen, trajectory, lambda: open_stored(record, data_root, camera))
         digests = {path.name: digest_of(path) for path in sorted(work.iterdir()) if path.is_file()}
-        written_by = dynslam_bench.__version__
-        provenance = Provenance(format=form, files=digests, which=chosen, run=record.public(), written_by=written_by)
+        provenance = Provenance(format=form, files=digests, which=chosen, run=record.public(), written_by=version())
         write_atomic(work / PROVENANCE_FILE, provenance.to_json())
     return Exported(target, (*digests, PROVENANCE_FILE), chosen, tuple(notes))
 
@@ -119,84 +107,65 @@ def export_run(
 def _trajectory(store: RunStore, record: RunRecord, which: Which | None) -> tuple[Which, Trajectory]:
     wanted: tuple[Which, ...] = ("final", "online") if which is None else (which,)
     for kind in wanted:
-        trajectory = store.trajectory(record.run_id, kind)
-        if trajectory is not None:
+        if trajectory := store.trajectory(record.run_id, kind):
             return kind, trajectory
     raise RunError(f"run {record.run_id} has no {' and no '.join(wanted)} trajectory", record.describe())
 
 
-def _tum(job: _Job, work: Path) -> list[str]:
-    comment = f"{job.record.tracker.id} on {job.record.sequence.id}, {job.which}, run {job.record.run_id}"
-    write_tum(work / "trajectory.txt", job.trajectory, comment=comment)
+FORMATS = ("tum", "kitti", "euroc", "vslam-lab", "colmap", "mcap", "rrd")
+"""Names of the formats."""
+
+
+def _write(
+    form: str,
+    work: Path,
+    store: RunStore,
+    record: RunRecord,
+    which: Which,
+    trajectory: Trajectory,
+    reopened: Callable[[], Sequence],
+) -> list[str]:
+    """Write the files of a format into a folder, and give notes; `reopened` gives the frames of the run."""
+    match form:
+        case "tum":
+            comment = f"{record.tracker.id} on {record.sequence.id}, {which}, run {record.run_id}"
+            write_tum(work / "trajectory.txt", trajectory, comment=comment)
+        case "kitti":
+            write_kitti(work / "poses.txt", trajectory, work / "times.txt")
+            if (missing := record.n_frames - len(trajectory)) > 0:
+                return [f"{missing} frames have no pose: line N of poses.txt is that of line N of times.txt"]
+        case "euroc":
+            write_pose_table(work, form, trajectory)
+            return ["the poses are the camera's, not a body's"]
+        case "vslam-lab":
+            write_pose_table(work, form, trajectory)
+        case "mcap":
+            truth = store.ground_truth(record.sequence.part)
+            write_bag(work, {"estimate": trajectory} | ({} if truth is None else {"ground_truth": truth}))
+            if truth is not None:
+                return ["estimate and ground_truth are each in a world of their own, not aligned"]
+        case "colmap":
+            return _write_colmap(work, reopened(), trajectory, store.folder(record.run_id) / "map.ply")
+        case "rrd":
+            recorded = store.folder(record.run_id) / RECORDING_FILE
+            if not recorded.is_file():
+                return write_stored(work / RECORDING_FILE, store, record, reopened(), trajectory)
+            shutil.copyfile(recorded, work / RECORDING_FILE)  # `run --rrd` has seen every frame's features
     return []
 
 
-def _kitti(job: _Job, work: Path) -> list[str]:
-    write_kitti(work / "poses.txt", job.trajectory, work / "times.txt")
-    missing = job.record.n_frames - len(job.trajectory)
-    return [f"{missing} frames have no pose: line N of poses.txt is that of line N of times.txt"] * (missing > 0)
-
-
-def _euroc(job: _Job, work: Path) -> list[str]:
-    write_pose_table(work, "euroc", job.trajectory)
-    return ["the poses are the camera's, not a body's"]
-
-
-def _vslam_lab(job: _Job, work: Path) -> list[str]:
-    write_pose_table(work, "vslam-lab", job.trajectory)
-    return []
-
-
-def _mcap(job: _Job, work: Path) -> list[str]:
-    trajectories = {"estimate": job.trajectory}
-    truth = job.store.ground_truth(job.record.sequence.part)
-    if truth is not None:
-        trajectories["ground_truth"] = truth
-    write_bag(work, trajectories)
-    return ["estimate and ground_truth are each in a world of their own, not aligned"] * (truth is not None)
-
-
-def _colmap(job: _Job, work: Path) -> list[str]:
-    sequence = open_stored(job.record, job.data_root, job.camera)
-    at, poses = associate(sequence.timestamps, job.trajectory.timestamps, _STAMP_TOLERANCE_S)
+def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud: Path) -> list[str]:
+    at, poses = associate(sequence.timestamps, trajectory.timestamps, _STAMP_TOLERANCE_S)
     files: dict[float, str] = getattr(sequence, "colour_files", {})  # without files they are named as TUM names them
-    names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps.tolist()]
-    cloud = job.store.folder(job.record.run_id) / "map.ply"
-    write_colmap(
-        work,
-        job.trajectory.select(np.asarray(poses)),
-        sequence.camera,
-        [names[index] for index in at],
-        read_ply(cloud) if cloud.is_file() else None,
-    )
-    odd = len(job.trajectory) - len(poses)
+    names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps[at].tolist()]
+    points = read_ply(cloud) if cloud.is_file() else None
+    write_colmap(work, trajectory.select(np.asarray(poses)), sequence.camera, names, points)
+    odd = len(trajectory) - len(poses)
     notes = ["the points have no tracks: a map of this package keeps positions, colours and counts"] * cloud.is_file()
     return notes + [f"{odd} poses carry stamps of no image and were left out"] * (odd > 0)
 
 
-def _rrd(job: _Job, work: Path) -> list[str]:
-    recorded = job.store.folder(job.record.run_id) / RECORDING_FILE
-    if recorded.is_file():  # `run --rrd` has seen every frame's features
-        shutil.copyfile(recorded, work / RECORDING_FILE)
-        return []
-    sequence = open_stored(job.record, job.data_root, job.camera)
-    return write_stored(work / RECORDING_FILE, job.store, job.record, sequence, job.trajectory)
-
-
-FORMATS: dict[str, Callable[[_Job, Path], list[str]]] = {
-    "tum": _tum,
-    "kitti": _kitti,
-    "euroc": _euroc,
-    "vslam-lab": _vslam_lab,
-    "colmap": _colmap,
-    "mcap": _mcap,
-    "rrd": _rrd,
-}
-"""Formats by name; each writes its files into a folder and gives notes."""
-
-
 PROVENANCE_FILE = "provenance.json"
-PROVENANCE_SCHEMA = 1
 
 
 class Provenance(Record):
@@ -211,7 +180,7 @@ class Provenance(Record):
         written_by: Version of this package.
     """
 
-    schema_version: int = PROVENANCE_SCHEMA
+    schema_version: int = 1
     format: str
     files: dict[str, str]
     which: Which
@@ -233,16 +202,12 @@ def stated_provenance(file: Path) -> str:
     Args:
         file: The trajectory, or the folder that holds it.
     """
-    beside = (file if file.is_dir() else file.parent) / PROVENANCE_FILE
-    if not beside.is_file():
-        return ""
-    try:
-        provenance = Provenance.read(beside)
+    with contextlib.suppress(DynslamError, OSError, ValueError):  # ValueError: a name with a null byte
+        provenance = Provenance.read((file if file.is_dir() else file.parent) / PROVENANCE_FILE)
         files = [file] if file.is_file() else [file / name for name in provenance.files if Path(name).name == name]
-        intact = bool(files) and all(provenance.files.get(path.name) == digest_of(path) for path in files)
-    except (DynslamError, OSError, ValueError):  # ValueError: a name with a null byte
-        return ""
-    return provenance.describe() if intact else ""
+        if files and all(provenance.files.get(path.name) == digest_of(path) for path in files):
+            return provenance.describe()
+    return ""
 
 
 def digest_of(path: Path) -> str:
@@ -252,10 +217,7 @@ def digest_of(path: Path) -> str:
         OSError: One cannot be read.
     """
     files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
-    whole = sha256()
-    for file in files:
-        whole.update(file.read_bytes())
-    return whole.hexdigest()
+    return sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def open_stored(record: RunRecord, data_root: str | Path | None = None, camera: str | Path | None = None) -> Sequence:

@@ -39,7 +39,7 @@ from dynslam_bench.core import (
     TrajectoryError,
 )
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
-from dynslam_bench.runs.process.fork_server import THREAD_VARIABLES, adopt_orphans, die_with_parent
+from dynslam_bench.runs.process.fork_server import THREAD_VARIABLES, adopt_orphans
 
 LOG_FILE = "log.txt"
 _LONGEST = 400
@@ -62,8 +62,7 @@ def main(connection: Connection) -> int:
     """
     with contextlib.suppress(OSError):
         os.setsid()  # so that the parent can end this process together with what a tracker starts
-    die_with_parent()
-    adopt_orphans()  # so that what a tracker starts and forgets stays below this process
+    adopt_orphans(die_with_parent=True)  # so that what a tracker starts and forgets stays below this process
     try:
         job = json.loads(connection.recv_bytes())
     except EOFError:
@@ -95,14 +94,10 @@ def peak_memory_mb() -> float:
 
 def _listen(connection: Connection, stop: threading.Event) -> None:
     """Wait for ``stop``; when the parent closes the connection, this process ends with its group."""
-    while True:
-        try:
-            message = connection.recv_bytes()
-        except (EOFError, OSError):
-            os.killpg(0, signal.SIGKILL)
-            return
-        if message == b"stop":
+    with contextlib.suppress(EOFError, OSError):
+        while connection.recv_bytes() == b"stop":
             stop.set()
+    os.killpg(0, signal.SIGKILL)
 
 
 def _send(connection: Connection, message: dict[str, Any]) -> None:
@@ -114,13 +109,12 @@ def _send(connection: Connection, message: dict[str, Any]) -> None:
 
 def _redirect(log: Path) -> None:
     """Send everything that is printed, by whatever library, to the log, and the stack of a fatal signal."""
-    handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
-        stream.flush()
-        os.dup2(handle, number)
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(line_buffering=True)
-    os.close(handle)
+    with log.open("ab") as file:
+        for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+            stream.flush()
+            os.dup2(file.fileno(), number)
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(line_buffering=True)
     faulthandler.enable(file=2, all_threads=False)
     programs = logging.getLogger("dynslam_bench.trackers.adapters.subprocess_tracker")
     programs.setLevel(logging.INFO)
@@ -194,8 +188,7 @@ def describe_failure(error: BaseException) -> dict[str, Any]:
         return message("crashed", broken, infrastructure=broken)
     if isinstance(cause, TrackerContractError):
         return message("invalid", text)
-    exited = f"sys.exit({cause.code!r}) was called" if isinstance(cause, SystemExit) else ""
-    named = exited or f"{kind}: {text}".rstrip(": ")
+    named = f"sys.exit({cause.code!r}) was called" if isinstance(cause, SystemExit) else f"{kind}: {text}".rstrip(": ")
     if isinstance(cause, MemoryError) or "out of memory" in text.lower() or kind == "OutOfMemoryError":
         return message("out-of-memory", named, line=True)
     data = {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
@@ -222,15 +215,15 @@ def _broken_infrastructure(error: BaseException | None) -> str:
 def source_line(error: BaseException) -> str:
     """``file.py:31``: the innermost line of an exception's traceback outside of libraries, else the innermost."""
     lines = traceback.extract_tb(error.__traceback__)
-    if not lines:
-        return ""
     libraries = (*map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")), "<", sys.base_prefix)
     outside = [
         line for line in lines if "site-packages" not in line.filename and not line.filename.startswith(libraries)
     ]
-    line = (outside or lines)[-1]
-    return f"{Path(line.filename).name}:{line.lineno}"
+    return "".join(f"{Path(line.filename).name}:{line.lineno}" for line in (outside or lines)[-1:])
 
 
 if __name__ == "__main__":
-    os._exit(main(Connection(int(sys.argv[1]))))  # threads that a tracker left running must not hold it up
+    # from the module, not from here: the loop raises the module's `FailedAt`
+    from dynslam_bench.runs.process.child import main as make_run
+
+    os._exit(make_run(Connection(int(sys.argv[1]))))  # threads that a tracker left running must not hold it up

@@ -45,8 +45,6 @@ PRELOADED = (
     *("dynslam_bench.flow.moth_flame", "dynslam_bench.segmentation.schedule", _CHILD),
     *("dynslam_bench.runs.loop", "dynslam_bench.trackers.registry", "dynslam_bench.sequences.synthetic.sequence"),
 )
-CACHED_PACKAGES = ("core", "geometry", "contracts", "sequences", "features", "segmentation")
-"""The packages of this package whose code is part of the keys of the stage caches."""
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
@@ -67,9 +65,9 @@ class ForkServer:
     def __init__(self, start: str) -> None:
         self._start = start
         self._lock = threading.Lock()
-        self._socket: socket.socket | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._running: tuple[socket.socket, subprocess.Popen[bytes]] | None = None
         self._owner = 0
+        atexit.register(self.close)
 
     def spawn(self, child_fd: int) -> int:
         """Start a child that makes a run over a connection.
@@ -104,36 +102,34 @@ class ForkServer:
             self._close()
 
     def _connected(self) -> socket.socket:
-        if self._owner != os.getpid():  # after a fork the parent's server is not ours
-            self._socket, self._process = None, None
-        if self._socket is not None and self._process is not None and self._process.poll() is None:
-            return self._socket
+        is_ours = self._owner == os.getpid()  # after a fork the parent's server is not
+        if self._running is not None and is_ours and self._running[1].poll() is None:
+            return self._running[0]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         with theirs:
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 [*module_command(__name__), str(theirs.fileno()), self._start],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1"),
                 start_new_session=True,
             )
-        self._socket, self._owner = ours, os.getpid()
+        self._running, self._owner = (ours, process), os.getpid()
         return ours
 
     def _close(self) -> None:
-        if self._socket is not None and self._process is not None and self._owner == os.getpid():
-            self._socket.close()
+        if self._running is not None and self._owner == os.getpid():
+            control, process = self._running
+            control.close()
             try:
-                self._process.wait(timeout=1)
+                process.wait(timeout=1)
             except subprocess.TimeoutExpired:  # still importing
-                self._process.kill()
-                self._process.wait()
-        self._socket, self._process = None, None
+                process.kill()
+                process.wait()
+        self._running = None
 
 
 SERVERS = {start: ForkServer(start) for start in ("fork", "fresh")}
-for _server in SERVERS.values():
-    atexit.register(_server.close)
 
 
 class Child:
@@ -278,11 +274,8 @@ class _Server:
 
     def _reap(self) -> None:
         """Reap the runs that have ended, end what they have left behind, then report them."""
-        ended: list[tuple[int, int]] = []
-        for pid in list(self.runs):
-            reaped, status = os.waitpid(pid, os.WNOHANG)
-            if reaped:
-                ended.append((self.runs.pop(pid), status))
+        waited = [os.waitpid(pid, os.WNOHANG) for pid in self.runs]
+        ended = [(self.runs.pop(pid), status) for pid, status in waited if pid]
         if ended:
             end_children({*self.runs, *self.own})
             sweep()
@@ -314,7 +307,8 @@ def serve(fd: int, start: str) -> None:
     if start == "fork":
         with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
             importlib.import_module("dynslam_bench.core.compiled").load_kernels()
-        package_digest(CACHED_PACKAGES)  # remembered: the children's cache keys are of the code that is loaded here
+            # remembered: the keys of the children's stage caches are of the code that is loaded here
+            package_digest(importlib.import_module("dynslam_bench.runs.identity").CODE_PACKAGES)
     adopt_orphans()
     _Server(control, start).run()
 
@@ -322,20 +316,18 @@ def serve(fd: int, start: str) -> None:
 # -- process trees -----------------------------------------------------------------------------------------------------
 
 
-def die_with_parent() -> None:
-    """Ask Linux to kill this process when the thread that forked it ends; elsewhere the closed connection has to do."""
-    _prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+def adopt_orphans(*, die_with_parent: bool = False) -> None:
+    """On Linux become the parent of every descendant whose own parent ends.
 
-
-def adopt_orphans() -> None:
-    """Become the parent of every descendant whose own parent ends, on Linux."""
-    _prctl(_SET_CHILD_SUBREAPER, 1)
-
-
-def _prctl(option: int, value: int) -> None:
+    Args:
+        die_with_parent: Whether this process is killed when the thread that forked it ends; elsewhere than on Linux the
+            closed connection has to do.
+    """
     if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+        prctl = ctypes.CDLL(None).prctl
+        prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        if die_with_parent:
+            prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
 
 
 def process_tree(pid: int) -> list[psutil.Process]:

@@ -122,8 +122,7 @@ class _Supervisor:
                 while is_open and connection.poll(0):
                     is_open = self._receive()
                 return self.verdict_of_end()
-            verdict = self._over_limit()
-            if verdict is not None:
+            if verdict := self._over_limit():
                 self.child.kill()
                 return verdict
 
@@ -207,9 +206,8 @@ class _Supervisor:
         used_mb = memory_mb(self.child.members)
         self.peak_mb = max(self.peak_mb, used_mb)
         if self.memory_mb is not None and used_mb > self.memory_mb:
-            source = f" ({self.memory_source})" if self.memory_source else ""
-            reason = f"{used_mb:.0f} MB resident, the limit is {self.memory_mb:.0f} MB{source}{self._where()}"
-            return self._verdict("out-of-memory", reason)
+            limit = f"the limit is {self.memory_mb:.0f} MB{self.memory_source}"
+            return self._verdict("out-of-memory", f"{used_mb:.0f} MB resident, {limit}{self._where()}")
         return None
 
     def _where(self) -> str:
@@ -250,11 +248,8 @@ def memory_mb(members: list[psutil.Process]) -> float:
 
 def machine_memory_mb() -> float:
     """Main memory in MB: the machine's, or the container's if that is less."""
-    amounts = [float(psutil.virtual_memory().total)]
-    for file in _CGROUP_LIMITS:
-        with contextlib.suppress(OSError, ValueError):  # there is none, or it says "max"
-            amounts.append(float(file.read_text()))
-    return min(amounts) / 1e6
+    limits = [file.read_text().strip() for file in _CGROUP_LIMITS if file.is_file()]
+    return min([psutil.virtual_memory().total, *(int(limit) for limit in limits if limit != "max")]) / 1e6
 
 
 def memory_limit(asked_mb: float | None, at_a_time: int = 1) -> tuple[float | None, str]:
@@ -265,13 +260,13 @@ def memory_limit(asked_mb: float | None, at_a_time: int = 1) -> tuple[float | No
         at_a_time: Runs that share the machine, for the default.
 
     Returns:
-        None and "" without a limit.
+        None and "" without a limit; "" for one that was asked for.
     """
     if asked_mb is not None:
         return (asked_mb or None), ""
     machine_mb = machine_memory_mb()
     shared = f", shared by {at_a_time} runs at a time" if at_a_time > 1 else ""
-    source = f"by default {100 * DEFAULT_SHARE:.0f} % of this machine's {machine_mb:.0f} MB{shared}"
+    source = f" (by default {100 * DEFAULT_SHARE:.0f} % of this machine's {machine_mb:.0f} MB{shared})"
     return DEFAULT_SHARE * machine_mb / at_a_time, source
 
 
